@@ -52,7 +52,7 @@ def test_clusters_are_connected_components(nominated: list[int], gap: int) -> No
 
 
 def nominating(wanted: Any) -> Keyframes:
-    """Return a mechanism whose high level nominates by ``wanted(recent steps)``, told to `write`'s own by the frames."""
+    """Return a mechanism whose high level nominates the recent frames (R, RECENT) of which ``wanted`` is true."""
     mechanism = made("keyframes", stride=STRIDE)
     assert isinstance(mechanism, Keyframes)
     mechanism.seen = []  # type: ignore[assignment]
@@ -149,7 +149,7 @@ def test_the_high_level_learns_what_comes_next_and_the_low_level_is_told_it() ->
 
 
 def test_it_learns_to_nominate_and_to_say_in_a_rollout() -> None:
-    """Trained by true keyframes alone, it acts by its own: after 150 updates it says what is next and keeps the ends."""
+    """Trained by true keyframes alone, it acts by its own, says what is next and keeps the segments' ends."""
     mechanism = made("keyframes", stride=STRIDE).train()
     labels = [0] * 12 + [1] * 10 + [2] * 12
     slots = [*range(len(labels))]

@@ -18,7 +18,8 @@ from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IM
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.tasks.catalogue import get_task
 
-TASK = "put_the_milk_picked_up_in_the_prompt_video_on_the_plate"
+TASK = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"
+"""It has three checkpoints, among which a memory that is privileged in training can choose."""
 PROMPTS = (8, 11, 14)
 """Frames of the episodes' prompts: they differ, so rows of a batch begin to act at different calls."""
 EXECUTION_FRAMES = 27
@@ -38,6 +39,8 @@ def write_streams(folder: Path, pictures: bool = True, frames: int = EXECUTION_F
 def _episode(seed: int, prompt: int, pictures: bool, frames: int) -> Demonstration:
     """An episode in which an arm and some things move smoothly, by numbers that the seed decides."""
     task, rng, length = get_task(TASK), np.random.default_rng(seed), prompt + frames
+    count = len(task.checkpoints)
+    completed = prompt + frames * np.arange(1, count + 1) // (count + 1)
     times = np.arange(length)[:, None] / 2
 
     def moving(width: int) -> NDArray[np.float32]:
@@ -60,7 +63,7 @@ def _episode(seed: int, prompt: int, pictures: bool, frames: int) -> Demonstrati
         proprio=np.array([0, 0, 1.1, 3.1, 0, 0, 0, 0], np.float32) + 0.1 * moving(PROPRIO_DIM),
         images={name: _pictures(rng, moving(2)) for name in CAMERAS} if pictures else None,
         exec_start=prompt,
-        satisfied=np.zeros((length, len(task.checkpoints)), np.bool_),
+        satisfied=np.arange(length)[:, None] >= completed,
         success=True,
         objects=slots.reshape(length, -1),
     )
