@@ -75,7 +75,12 @@ def test_nominations_are_kept_counted_and_shown_as_in_the_source() -> None:
         return chosen[frames.long()] & (torch.rand(frames.shape, generator=chance) < 0.5)
 
     asked: list[Tensor] = []
-    mechanism = nominating(lambda frames: asked.append(wanted(frames)) or asked[-1])
+
+    def noted(frames: Tensor) -> Tensor:
+        asked.append(wanted(frames))
+        return asked[-1]
+
+    mechanism = nominating(noted)
     state, nominated = mechanism.init(1), list[int]()
     for number in range(400):
         tokens = torch.full((1, mechanism.spec.tokens, mechanism.spec.dim), float(number))
@@ -118,6 +123,7 @@ def test_true_keyframes_are_the_last_frames_of_segments() -> None:
     assert isinstance(mechanism, Keyframes)
     labels = [0] * 7 + [1] * 3 + [-1] * 2 + [2] * 20
     histories = labelled(labels, [3, 8, 31])
+    assert histories.subgoals is not None
     rows = torch.nn.functional.pad(histories.subgoals, (0, 1), value=-1)[histories.places]
     slots, keyframe = mechanism._true_frames(rows, torch.tensor([4, 9, 32]))
     none = [-1] * SHOWN
@@ -133,6 +139,7 @@ def test_true_keyframes_are_the_last_frames_of_segments() -> None:
 
 def test_the_high_level_learns_what_comes_next_and_the_low_level_is_told_it() -> None:
     mechanism = made("keyframes", stride=STRIDE)
+    assert isinstance(mechanism, Keyframes)
     query = Query(choices=torch.ones(3, TEXTS, dtype=torch.bool), subgoal=torch.tensor([0, 1, 2]))
     histories = labelled([0] * 5 + [1] * 8 + [2] * 8, [4, 8, 20])
     read = mechanism.replay(histories, query)

@@ -77,7 +77,7 @@ class Keyframes(MemoryMechanism):
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:
         super().__init__(spec, pool, settings)
         width, self.count = spec.width, len(spec.subgoals)
-        self.project = nn.Linear(spec.dim, width)
+        self.embed = nn.Linear(spec.dim, width)
         self.place = nn.Parameter(0.02 * torch.randn(SHOWN + RECENT, 1, width))
         self.spot = nn.Parameter(0.02 * torch.randn(spec.tokens, width))
         self.ask = nn.Parameter(0.02 * torch.randn(1, 1, width))
@@ -98,7 +98,7 @@ class Keyframes(MemoryMechanism):
             frames: (B, SHOWN + RECENT, P, D) keyframes and recent frames, each the latest last. real: (B, SHOWN +
                 RECENT) which there are. choices: (B, S) which texts are the task's.
         """
-        tokens = self.project(frames.to(self.project.weight.dtype)) + self.place + self.spot
+        tokens = self.embed(frames.to(self.embed.weight.dtype)) + self.place + self.spot
         task = self.task(choices.to(tokens.dtype)).unsqueeze(1)
         sequence = torch.cat([tokens.flatten(1, 2), task, self.ask.expand(len(task), -1, -1)], dim=1)
         padding = F.pad(~real.repeat_interleave(self.spec.tokens, dim=1), (0, 2))
