@@ -1,0 +1,1 @@
+"""The memory study: every mechanism on one backbone, with the same demonstrations, updates and scenes."""

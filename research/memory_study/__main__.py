@@ -1,0 +1,88 @@
+"""``python -m research.memory_study``: the grid of the memory study, planned, run, resumed and told."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from datetime import timedelta
+from pathlib import Path
+from statistics import mean
+from typing import Annotated
+
+import typer
+
+from lerobot_memobench.cli.console import console, counting, say
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import write_file
+from lerobot_memobench.jobs.executors import read_options, run_jobs
+from lerobot_memobench.jobs.processes import Advance, Job
+from research.command import run
+from research.memory_study.cells import Cell, Demonstrations, choose_rates, tuning
+from research.memory_study.grid import chosen, read_grid
+from research.memory_study.tables import tables
+
+GRID = Path(__file__).with_name("grid.yaml")
+
+
+def study(
+    out: Annotated[Path, typer.Option(help="Folder of everything; the same command goes on.")],
+    grid: Annotated[Path, typer.Option(help="The study's file.")] = GRID,
+    only: Annotated[
+        list[str] | None, typer.Option(help="A suite, a row or seed=N; repeatable. The others are left as they are.")
+    ] = None,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Say what would be run, and about how long; run nothing.")
+    ] = False,
+    tune: Annotated[bool, typer.Option("--tune", help="Choose learning rates first, by short trainings.")] = False,
+    workers: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
+    executor: Annotated[str, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")] = "processes",
+    executor_option: Annotated[list[str] | None, typer.Option(help="key=value for datatrove's; repeatable.")] = None,
+) -> None:
+    """Train and evaluate every cell that is not done, then print and keep the tables."""
+    read = read_grid(grid)
+    places = chosen(read, only or [])
+    if not places:
+        raise MemobenchError(f"--only {' '.join(only or [])} leaves no cell; a row has fewer training seeds, perhaps")
+    data = [Demonstrations(read, suite, out, workers) for suite in dict.fromkeys(suite for suite, _, _ in places)]
+    cells = [Cell(read, out, *place) for place in places]
+    tried = tuning(read, out, places) if tune else []
+    if plan:
+        say(planned(data, tried, cells, workers))
+        return
+    how = {"executor": executor, "options": read_options(executor_option or []), "logs": out / "logs"}
+    for what, jobs, at_once in (("demonstrations", data, 1), ("tuning", tried, workers), ("cells", cells, workers)):
+        with counting(console(), what, len(jobs)) as count:
+
+            def advance(news: Advance, count=count) -> None:  # type: ignore[no-untyped-def]
+                count(news.done, news.total, f"{news.task_name}, seed {news.seed}", found=news.found)
+
+            done = run_jobs(jobs, workers=at_once, progress=advance, jobs_per_rank=1, **how)  # type: ignore[arg-type]
+        if not done:
+            say(f"{what} are submitted; give the command again when they are through")
+            return
+        if what == "tuning" and tried:
+            rates = choose_rates(tried)
+            say("; ".join(f"{suite}, {row}: learning rate {rate:g}" for (suite, row), rate in rates.items()))
+    text = "\n\n".join(filter(None, (tables(read, out, suite) for suite in read.suites)))
+    write_file(out / "study.md", text + "\n")
+    say(text)
+
+
+def planned(data: Sequence[Demonstrations], tried: Sequence[Cell], cells: Sequence[Cell], workers: int) -> str:
+    """Return what is left to do, a line each, and about how long it takes by what has been done."""
+    jobs: list[Job] = [*data, *tried, *cells]
+    left = [job for job in jobs if not job.finished()]
+    lines = [f"{job.task_name}, seed {job.seed}" for job in left]
+    took = [sum(cost.wall_s for cost in cell.costs().values()) for cell in cells if cell.finished()]
+    ahead = sum(isinstance(job, Cell) and job.tuned is None for job in left)
+    told = f", about {timedelta(seconds=round(mean(took) * ahead / workers))} of cells" if took and ahead else ""
+    return "\n".join([*lines, f"{len(left)} of {len(jobs)} are left{told}"])
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return the exit status."""
+    return run("memory_study", study, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,219 @@
+"""A cell of the study: a training, its evaluation and its controls, each a command of the product, each done once.
+
+Whatever kills a cell, the same call goes on with it: a training from its last checkpoint, an evaluation from its log.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import read_json, write_file
+from research.learning.stages import Cost, run_once
+from research.memory_study.grid import Grid, folder_name
+
+ROLLOUTS = "rollouts"
+"""The evaluation itself, beside a cell's controls."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Those of a suite."""
+
+    grid: Grid
+    suite: str
+    out: Path
+    workers: int = 1
+    seed: int = 0
+
+    @property
+    def task_name(self) -> str:
+        """What it is called when its end is told."""
+        return f"demonstrations, {self.suite}"
+
+    @property
+    def folder(self) -> Path:
+        """The dataset's."""
+        return self.out / "demonstrations" / self.suite
+
+    @property
+    def _log(self) -> Path:
+        return self.out / "demonstrations" / f"{self.suite}.log"
+
+    def run(self) -> None:
+        """Generate them."""
+        words = ["memobench", "generate", *self.grid.suites[self.suite].demonstrations, "--out", str(self.folder)]
+        run_once(words, self._log, how=["--workers", str(self.workers)], accept=(0, 1))
+
+    def finished(self) -> bool:
+        """Whether they are all there."""
+        return ended(self._log)
+
+    def failure(self) -> str | None:
+        """Nothing: a scene that the expert does not solve is told by its own log."""
+        return None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A row, in a suite, of a training seed.
+
+    Attributes:
+        out: the study's folder. tuned: a learning rate that is tried, for a short training; None: the row's own.
+    """
+
+    grid: Grid
+    out: Path
+    suite: str
+    row: str
+    seed: int
+    tuned: float | None = None
+
+    @property
+    def task_name(self) -> str:
+        """What it is called when its end is told."""
+        return f"{self.suite}, {self.row}" + ("" if self.tuned is None else f", learning rate {self.tuned:g}")
+
+    @property
+    def folder(self) -> Path:
+        """Where everything of the cell is."""
+        part = "cells" if self.tuned is None else f"tuning/{self.tuned:g}"
+        return self.out / part / self.suite / f"{folder_name(self.row)}-{self.seed}"
+
+    @property
+    def policy(self) -> Path:
+        """The training run's folder."""
+        return self.folder / "policy"
+
+    @property
+    def parts(self) -> list[str]:
+        """The evaluation, and the controls that are run of this row."""
+        return [ROLLOUTS, *(self.grid.rows[self.row].controls if self.tuned is None else ())]
+
+    def evaluation(self, part: str) -> Path:
+        """The folder of the evaluation or of a control."""
+        return self.folder / part
+
+    def run(self) -> None:
+        """Train, then evaluate, whatever of this is left to do."""
+        begun = self.policy / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+        going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
+        log = self.folder / "training.log"
+        if going_on is None and not log.with_suffix(".json").is_file():
+            shutil.rmtree(self.policy, ignore_errors=True)  # of an attempt that was killed before its first checkpoint
+        run_once(self.training_words(), log, going_on=going_on)
+        for part in self.parts:
+            run_once(self.evaluation_words(part), self.folder / f"{part}.log", how=["resume=true"])
+
+    def finished(self) -> bool:
+        """Whether nothing is left to do."""
+        return all(ended(self.folder / f"{name}.log") for name in ("training", *self.parts))
+
+    def failure(self) -> str | None:
+        """Nothing: what fails ends the study, and says why."""
+        return None
+
+    def training_words(self) -> list[str]:
+        """Return the command that trains its policy."""
+        row, data = self.grid.rows[self.row], Demonstrations(self.grid, self.suite, self.out).folder
+        words = ["lerobot", "train", *self.grid.training, *row.training]
+        rate = self.tuned or chosen_rate(self.out, self.suite, self.row)
+        if self.tuned is not None:
+            words = [*(word for word in words if not word.startswith("steps=")), f"steps={self.grid.tuning.steps}"]
+        words += [] if rate is None else [f"policy.optimizer_lr={rate:g}"]
+        return [*words, f"dataset={data}", f"seed={self.seed}", f"output_dir={self.policy}"]
+
+    def evaluation_words(self, part: str) -> list[str]:
+        """Return the command that rolls its policy out; a later word takes the place of an earlier one of its name."""
+        row = self.grid.rows[self.row]
+        own = [] if part == ROLLOUTS else self.grid.controls[part]
+        short = [] if self.tuned is None else [f"episodes={self.grid.tuning.episodes}"]
+        told = [*self.grid.evaluation, *self.grid.suites[self.suite].evaluation, *row.evaluation, *own, *short]
+        words = {word.partition("=")[0]: word for word in told}
+        return [
+            *("lerobot", "eval", "env=memobench", f"policy={self.policy}"),
+            *words.values(),
+            f"output_dir={self.evaluation(part)}",
+        ]
+
+    def costs(self) -> dict[str, Cost]:
+        """Return what each part has taken so far."""
+        found = {name: _told(self.folder / f"{name}.log") for name in ("training", *self.parts)}
+        return {
+            name: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for name, told in found.items() if told
+        }
+
+
+def ended(log: Path) -> bool:
+    """Return whether the command of a log has ended well."""
+    return bool(_told(log).get("ended"))
+
+
+def _told(log: Path) -> dict[str, object]:
+    try:
+        return read_json(log.with_suffix(".json"), dict[str, object], "remove it, and the command is run again")
+    except FileNotFoundError:
+        return {}
+
+
+# -- learning rates ---------------------------------------------------------------------------------------------------
+
+
+def tuning(grid: Grid, out: Path, cells: Sequence[tuple[str, str, int]]) -> list[Cell]:
+    """Return the short trainings by which the learning rates of some cells' rows are chosen."""
+    rows = dict.fromkeys((suite, row) for suite, row, _ in cells)
+    return [Cell(grid, out, suite, row, 0, rate) for suite, row in rows for rate in grid.learning_rates]
+
+
+def choose_rates(cells: Sequence[Cell]) -> dict[tuple[str, str], float]:
+    """Choose the rate of each suite's rows whose average success on validation scenes is the highest; keep it.
+
+    Of equal ones the middle of the list counts first, then what stands before it.
+
+    Raises:
+        MemobenchError: a cell was trained by another rate already.
+    """
+    grid, found = cells[0].grid, dict[tuple[str, str], dict[float, float]]()
+    for cell in cells:
+        report = read_json(cell.evaluation(ROLLOUTS) / "report.json", dict[str, object], "run the cell again")
+        assert cell.tuned is not None
+        found.setdefault((cell.suite, cell.row), {})[cell.tuned] = success_of(report)
+    middle = grid.learning_rates[len(grid.learning_rates) // 2]
+    rates = {}
+    for (suite, row), of_rates in found.items():
+        best = max(of_rates, key=lambda rate: (of_rates[rate], rate == middle))
+        path, before = _rate_file(cells[0].out, suite, row), chosen_rate(cells[0].out, suite, row)
+        trained = any((cells[0].out / "cells" / suite).glob(f"{folder_name(row)}-*/training.json"))
+        if trained and before != best:
+            raise MemobenchError(
+                f"{suite}, {row} was trained with the learning rate {before}, and tuning chooses {best:g}; remove its "
+                "cells, or the tuning's"
+            )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, json.dumps({"chosen": best, "success": {f"{k:g}": v for k, v in of_rates.items()}}, indent=1))
+        rates[suite, row] = best
+    return rates
+
+
+def success_of(report: dict[str, object]) -> float:
+    """Return the average success of an evaluation's report, per cent."""
+    average = report["average"]
+    assert isinstance(average, dict)
+    return float(average["SR"])
+
+
+def chosen_rate(out: Path, suite: str, row: str) -> float | None:
+    """Return the learning rate that tuning chose; None where none was done."""
+    try:
+        told = read_json(_rate_file(out, suite, row), dict[str, object], "remove it, and tune again")
+    except FileNotFoundError:
+        return None
+    return float(str(told["chosen"]))
+
+
+def _rate_file(out: Path, suite: str, row: str) -> Path:
+    return out / "rates" / suite / f"{folder_name(row)}.json"

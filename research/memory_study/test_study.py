@@ -1,0 +1,138 @@
+"""The grid is read and refused, cells know what is left of them after any kill, and their commands are understood."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.memory import OURS
+from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.run.plan import take_run_options
+from lerobot_memobench.run.training import take_training_options
+from research.learning import stages
+from research.learning.stages import Cost
+from research.memory_study.__main__ import GRID, planned
+from research.memory_study.cells import ROLLOUTS, Cell, Demonstrations, choose_rates, chosen_rate, tuning
+from research.memory_study.grid import Grid, chosen, read_grid
+from research.memory_study.tables import tables
+
+SMALL = """
+training: [policy=memobench_mem, size=small, perception=objects, steps=4]
+evaluation: [split=validation, episodes=2, videos=0]
+suites: {strict: {demonstrations: [--suite, strict], evaluation: [suite=strict]}}
+controls: {evidence: [evidence=true, episodes=12]}
+learning_rates: [0.0005, 0.001, 0.002]
+rows:
+  no memory: {training: [policy.memory=none], seeds: 2}
+  frames, no time: {training: [], seeds: 1, controls: [evidence]}
+"""
+
+
+@pytest.fixture
+def grid(tmp_path: Path) -> Grid:
+    (tmp_path / "grid.yaml").write_text(SMALL)
+    return read_grid(tmp_path / "grid.yaml")
+
+
+def test_the_study_has_every_mechanism_and_its_commands_are_understood(tmp_path: Path) -> None:
+    grid = read_grid(GRID)
+    words = [word for row in grid.rows.values() for word in row.training]
+    assert {word.removeprefix("policy.memory=") for word in words if word.startswith("policy.memory=")} == {
+        *(set(OURS) - {"frames"}),
+        "none",
+    }
+    for place in chosen(grid, ["seed=0"]):
+        cell = Cell(grid, tmp_path, *place)
+        told = [word for word in cell.training_words()[2:] if not word.startswith("dataset=")]
+        *_, rest = take_training_options(split_arguments(told))
+        read_arguments("train", rest)
+        for part in cell.parts:
+            take_run_options(
+                split_arguments([w for w in cell.evaluation_words(part)[2:] if not w.startswith("policy=")])
+            )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("controls: [evidence]", "controls: [evidenec]", "'evidenec'; did you mean 'evidence'"),
+        ("rows:", "row:", "no study's file"),
+        ("frames, no time", "no_memory", "have one folder"),
+    ],
+)
+def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, old: str, new: str, told: str) -> None:
+    (tmp_path / "grid.yaml").write_text(SMALL.replace(old, new))
+    with pytest.raises(MemobenchError, match=told):
+        read_grid(tmp_path / "grid.yaml")
+
+
+def test_words_choose_cells(grid: Grid) -> None:
+    assert chosen(grid, []) == [
+        ("strict", "no memory", 0),
+        ("strict", "frames, no time", 0),
+        ("strict", "no memory", 1),
+    ]
+    assert chosen(grid, ["no memory", "seed=1"]) == [("strict", "no memory", 1)]
+    with pytest.raises(MemobenchError, match="did you mean 'strict'"):
+        chosen(grid, ["stricd"])
+
+
+def test_a_killed_cell_goes_on_where_it_was(grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that die at every moment in turn; what has ended well is never run again."""
+    cell, ran, dies = Cell(grid, tmp_path, "strict", "frames, no time", 0), list[str](), [True] * 3
+
+    def fake(words: list[str], log: Path, environment: object) -> tuple[int, Cost]:
+        ran.append(words[1] if words[1] == "eval" else "resume" if "resume=true" in words else "train")
+        log.write_text("…")
+        if dies and dies.pop():
+            if words[1] == "train":
+                kept = cell.policy / "checkpoints" / "last" / "pretrained_model"
+                kept.mkdir(parents=True, exist_ok=True)
+                (kept / "train_config.json").write_text("{}")
+            return 1, Cost(1.0, 1.0)
+        return 0, Cost(1.0, 1.0)
+
+    monkeypatch.setattr(stages, "_run", fake)
+    for _ in range(3):
+        assert not cell.finished()
+        with pytest.raises(MemobenchError, match="ended with status 1"):
+            cell.run()
+    assert planned([], [], [cell], 1).endswith("1 of 1 are left")
+    cell.run()
+    assert cell.finished()
+    assert ran == ["train", "resume", "resume", "resume", "eval", "eval"]
+    cell.run()
+    assert len(ran) == 6
+    assert cell.costs()["training"] == Cost(4.0, 4.0)
+    assert planned([], [], [cell], 1) == "0 of 1 are left"
+
+
+def test_a_learning_rate_is_chosen_once_and_then_used(grid: Grid, tmp_path: Path) -> None:
+    tried = tuning(grid, tmp_path, chosen(grid, ["no memory"]))
+    assert [cell.tuned for cell in tried] == [0.0005, 0.001, 0.002]
+    assert "steps=3000" in tried[0].training_words()
+    assert "episodes=3" in tried[0].evaluation_words(ROLLOUTS)
+    for cell, success in zip(tried, (40.0, 50.0, 50.0), strict=True):
+        folder = cell.evaluation(ROLLOUTS)
+        folder.mkdir(parents=True)
+        (folder / "report.json").write_text(json.dumps({"average": {"SR": success}}))
+    assert choose_rates(tried) == {("strict", "no memory"): 0.001}
+    assert chosen_rate(tmp_path, "strict", "no memory") == 0.001
+    cell = Cell(grid, tmp_path, "strict", "no memory", 1)
+    assert "policy.optimizer_lr=0.001" in cell.training_words()
+    assert not any("optimizer_lr" in w for w in Cell(grid, tmp_path, "strict", "frames, no time", 0).training_words())
+    cell.folder.mkdir(parents=True)
+    (cell.folder / "training.json").write_text("{}")
+    (tried[2].evaluation(ROLLOUTS) / "report.json").write_text(json.dumps({"average": {"SR": 90.0}}))
+    with pytest.raises(MemobenchError, match=r"was trained with the learning rate 0.001, and tuning chooses 0.002"):
+        choose_rates(tried)
+
+
+def test_demonstrations_are_made_once_for_a_suite(grid: Grid, tmp_path: Path) -> None:
+    data = Demonstrations(grid, "strict", tmp_path)
+    assert not data.finished()
+    assert f"dataset={data.folder}" in Cell(grid, tmp_path, "strict", "no memory", 0).training_words()
+    assert tables(grid, tmp_path, "strict") == ""
