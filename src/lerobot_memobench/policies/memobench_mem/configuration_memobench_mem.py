@@ -401,8 +401,8 @@ class MemobenchMemConfig(PI05Config):
         if self.memory_fusion == NONE or (OWN in (fusion, self.memory_fusion) and self.memory_fusion != fusion):
             fitting = OWN if fusion == OWN else f"{MODULATION} or {CONTEXT}"
             raise MemobenchError(
-                f"--policy.memory={self.memory} cannot be read by memory_fusion={self.memory_fusion}; leave it out, or "
-                f"pass {fitting}; policy.memory=none is the baseline without a memory."
+                f"--policy.memory={self.memory} cannot be read by memory_fusion={self.memory_fusion}; pass "
+                f"--policy.memory_fusion={fitting}; policy.memory=none is the baseline without a memory."
             )
         if self.memory_frames != MEMORY_FRAMES and not issubclass(mechanism, find_mechanism("frames")):
             raise MemobenchError(
@@ -471,6 +471,13 @@ class MemobenchMemConfig(PI05Config):
             raise MemobenchError(
                 f"--policy.detection_noise={self.detection_noise} must not be negative, and is noise of objects: leave "
                 "it out, or use --policy.perception=objects."
+            )
+        if self.memory_phase and (
+            not self.uses_objects or self.memory == NONE or find_mechanism(self.memory).asks_motion
+        ):
+            raise MemobenchError(
+                f"--policy.memory_phase=true tells the phase of remembered objects, which perception={self.perception} "
+                f"memory={self.memory} does not remember; leave it out."
             )
         if self.full_chunk_when_stalled and not self.uses_objects:
             raise MemobenchError(

@@ -67,7 +67,7 @@ class MemoryFusion(ABC):
         """
         return mask
 
-    def read_out(self, states: Tensor) -> None:
+    def read_out(self, states: Tensor) -> None:  # noqa: B027 (most need nothing of it)
         """Take the last states of a prefix (B, N, D)."""
 
     def outputs(self) -> dict[str, Tensor]:
