@@ -14,6 +14,7 @@ from torch import Tensor
 from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FUSIONS, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frame, MemoryEncoder, sample_frames
@@ -251,6 +252,19 @@ def test_what_the_configuration_names_is_there() -> None:
 def test_a_memory_that_cannot_be_is_refused_in_a_sentence(asked_for: dict[str, Any], told: str) -> None:
     with pytest.raises(MemobenchError, match=told):
         MemobenchMemConfig(device="cpu", **asked_for)
+
+
+def test_settings_of_the_memory_that_a_checkpoint_had_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(configuration_memobench_mem.logger, "warning", lambda text, *of: told.append(text % of))
+    had = MemobenchMemConfig(device="cpu").memory_settings
+    for name in set(OURS) - {"frames", "subgoal"}:  # the latter's are the same
+        found = MemobenchMemConfig(device="cpu", memory=name, memory_settings=had).memory_settings
+        assert found == vars(read_settings(name, {}))
+        assert told.pop() == f"memory_settings are those of memory=frames; memory={name} begins with its own"
+    kept = {"time_codes": False, "content": True}
+    assert MemobenchMemConfig(device="cpu", memory="subgoal", memory_settings=kept).memory_settings == kept
+    assert not told
 
 
 def test_a_package_that_brings_no_memory_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

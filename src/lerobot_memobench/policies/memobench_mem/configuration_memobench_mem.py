@@ -25,7 +25,13 @@ from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
-from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_names, read_settings
+from lerobot_memobench.policies.memobench_mem.memory import (
+    NONE,
+    find_mechanism,
+    mechanism_names,
+    read_settings,
+    settings_of_another,
+)
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
 from lerobot_memobench.policies.memobench_mem.subgoals import texts_of
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
@@ -409,6 +415,10 @@ class MemobenchMemConfig(PI05Config):
                 f"--policy.memory_frames={self.memory_frames} is for memory=frames or subgoal, and does nothing with "
                 f"memory={self.memory}; leave it out, and see policy.memory_settings."
             )
+        other = settings_of_another(self.memory, self.memory_settings)
+        if other is not None:  # a checkpoint's, whose training this memory goes on from
+            logger.warning("memory_settings are those of memory=%s; memory=%s begins with its own", other, self.memory)
+            self.memory_settings = {}
         self.memory_settings = asdict(read_settings(self.memory, self.memory_settings))
         if self.memory_stride is None:
             stride = mechanism.stride

@@ -62,6 +62,17 @@ def find_mechanism(name: str) -> type[MemoryMechanism]:
     return made
 
 
+def settings_of_another(name: str, given: Mapping[str, Any]) -> str | None:
+    """Return one of our mechanisms whose settings, all of them, are ``given``, and do not fit this mechanism."""
+    if set(given) <= _settings(name):
+        return None
+    return next((other for other in OURS if _settings(other) == set(given)), None)
+
+
+def _settings(name: str) -> set[str]:
+    return {one.name for one in fields(find_mechanism(name).Settings)}
+
+
 def read_settings(name: str, given: Mapping[str, Any]) -> Any:
     """Return the settings of a mechanism, its defaults where nothing is ``given``.
 
