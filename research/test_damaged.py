@@ -29,8 +29,11 @@ SCENE = {
     "seed": 7,
     "solved": 1,
     "decisions": 3,
-    "aliased": {"at_home": 1, "pixel_exact": 0, "as_it_happens": 0},
-    "in_order": {"chance": 0.2, "deterministic": 0.0, "stochastic": 0.2, "pixel_exact": 1.0, "as_it_happens": 1.0},
+    "aliased": {"at_home": 1, "pixel_exact": 0, "as_it_happens": 0, "with_step": 0},
+    "in_order": {
+        **{"chance": 0.2, "deterministic": 0.0, "stochastic": 0.2, "pixel_exact": 1.0},
+        **{"as_it_happens": 1.0, "with_step": 1.0},
+    },
     "examples": [{"seed": 7, "a": SAID, "b": SAID, "difference": 0.0}],
     "largest_same": 0.1,
     "smallest_different": 0.5,
@@ -42,6 +45,7 @@ SEARCH = {
     "of": 1,
     "complete": True,
     "exhausted": True,
+    "unexplored": 0,
     "policy": [{"when": ["a"], "do": "b"}],
 }
 SCORES = {"all": 0.5, "own_task": 0.5}

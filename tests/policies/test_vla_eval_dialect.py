@@ -42,7 +42,7 @@ def test_an_episode_with_a_prompt() -> None:
     # The server asks for the third action by itself: it plans two at a time.
     assert [step for _, step, _ in server.heard] == [0, 2, 0]
     for later in (second, third):
-        assert set(later) == {"images", "states", "task_description"}
+        assert set(later) == {"images", "states", "task_description", "step"}
 
 
 def test_the_prompt_is_thinned_or_left_out() -> None:

@@ -276,7 +276,7 @@ def draws(first: int, history: int = 0, seed: int | None = 7, name: str = "diffu
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lerobot_eval, "rollout", rollout)
-        patch.setattr("lerobot_memobench.run.rollout.sparing", lambda theirs, _: theirs)
+        patch.setattr("lerobot_memobench.run.rollout.sparing", lambda theirs, *_: theirs)
         torch.manual_seed(7)
         torch.rand(history)
         with steered(seed):
@@ -300,7 +300,7 @@ def test_a_policy_that_seeds_its_noise_itself_keeps_the_runs_seed() -> None:
     kept: list[int] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lerobot_eval, "rollout", lambda env, policy, seeds: kept.append(torch.initial_seed()))
-        patch.setattr("lerobot_memobench.run.rollout.sparing", lambda theirs, _: theirs)
+        patch.setattr("lerobot_memobench.run.rollout.sparing", lambda theirs, *_: theirs)
         torch.manual_seed(7)
         with steered(7):
             lerobot_eval.rollout(env=Env(), policy=SimpleNamespace(name="memobench_mem"), seeds=[9])

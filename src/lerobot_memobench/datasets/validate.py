@@ -5,6 +5,7 @@ The folder may hold a LeRobotDataset, HDF5 files of this package in the publishe
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     is_dataset,
     read_info,
 )
-from lerobot_memobench.datasets.lerobot_format.reading import check_idling, read_episode
+from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace, check_idling, list_episodes, read_episode
 from lerobot_memobench.datasets.replay import Pictures, replay
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import refusing
@@ -164,7 +165,10 @@ def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
     checks: list[_Check] = []
     if is_dataset(folder):
         check_clock(read_info(folder)["features"], folder)
-        check_idling(folder)
+        places: Sequence[EpisodePlace] = ()
+        with contextlib.suppress(MemobenchError):  # a damaged file: each episode tells it below
+            places = list_episodes(folder)
+        check_idling(folder, places)
         total = range(episode_count(folder))
         checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in total]
     has_files = folder.is_file() or any(path.suffix in (".hdf5", ".h5") for path in folder.rglob("*"))

@@ -5,6 +5,7 @@ LeRobot's dataset tools may have edited it since; what they leave is read from t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
@@ -115,13 +116,16 @@ def check_suite_of(folder: Path, suite: str) -> None:
             )
 
 
-def check_idling(folder: Path) -> None:
+def check_idling(folder: Path, places: Iterable[EpisodePlace] | None = None) -> None:
     """Refuse a LeRobotDataset with demonstrations of strict tasks from before the robot idled: its steps tell the past.
+
+    Args:
+        places: its episodes; None: they are listed.
 
     Raises:
         MemobenchError: naming the first such episode.
     """
-    for place in list_episodes(folder):
+    for place in list_episodes(folder) if places is None else places:
         record = place.record
         if record is None or record.seed < 0 or suite_of(record.task_name) != STRICT:
             continue
