@@ -198,6 +198,7 @@ def test_a_detector_is_not_trained_on_the_evaluation(tmp_path: Path, capsys: pyt
     assert "30000 to 39999" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_package_detector_detects_and_its_tokens_are_white(gl: str, tmp_path: Path) -> None:
     detector = load_detector(SHIPPED)
     assert SHIPPED.stat().st_size <= 6_000_000

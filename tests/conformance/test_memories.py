@@ -10,10 +10,25 @@ from torch import Tensor
 
 from lerobot_memobench.conformance.checks import Outcome, run_checks
 from lerobot_memobench.conformance.subject import Subject, load_subject
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import OURS, mechanism_names
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 
-@pytest.mark.parametrize("memory", [*(pytest.param(name, marks=pytest.mark.slow) for name in OURS), "traces"])
+def test_a_memory_of_another_package_is_built_and_goes_through_an_episode(traces: None) -> None:
+    config = MemobenchMemConfig(device="cpu", size="tiny", perception="objects", memory="traces")
+    assert config.memory_settings == {"traces": 4}
+    memory = MemoryPI05(config).memory
+    assert memory is not None
+    state = memory.init(2)
+    for step in range(5):
+        tokens = torch.randn(2, memory.spec.tokens, memory.spec.dim)
+        state = memory.write(state, tokens, torch.tensor([step, step]))
+    assert memory.read(state).rows().shape == (2, 4 * memory.spec.tokens, memory.spec.width)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", [*OURS, "traces"])
 def test_it_conforms(memory: str, traces: None, objects: Path, tmp_path: Path) -> None:
     assert memory in mechanism_names()
     words = ["policy=memobench_mem", f"policy.memory={memory}", "size=tiny", "policy.perception=objects"]

@@ -182,6 +182,7 @@ def test_a_dataset_of_a_robot_that_does_not_idle_is_refused(tmp_path):
         validate(tmp_path / "before")
 
 
+@pytest.mark.slow
 def test_a_robot_that_idles_is_read_back_from_the_published_layout(tmp_path):
     demo = record_demonstration(get_task(HIGHLIGHT), SEED, referent="drawn", image_size=32)
     staged = stage_demonstration(replace(demo, model_xml="<mujoco/>"), tmp_path / "0", (HDF5,))
@@ -193,6 +194,7 @@ def test_a_robot_that_idles_is_read_back_from_the_published_layout(tmp_path):
     np.testing.assert_array_equal(labels(again).step, labels(demo).step)
 
 
+@pytest.mark.slow
 def test_replay_of_a_hiding_agrees():
     """What was hidden goes back to the bit, whether or not somebody has looked between the last step and that."""
     assert replay(record_demonstration(get_task(HIDDEN), SEED, images=False, referent="drawn")) is None
@@ -229,6 +231,7 @@ def test_the_expert_finds_back_and_says_how(moved):
     assert undisturbed.executed is None
 
 
+@pytest.mark.slow
 def test_an_arm_that_was_pushed_comes_to_rest_at_home():
     """Or no round of a counting task would begin there, and none would end."""
     counted = record_demonstration(get_task(COUNTING), SEED + 1, images=False, referent="random", perturb=True)
@@ -236,6 +239,7 @@ def test_an_arm_that_was_pushed_comes_to_rest_at_home():
     assert np.abs(counted.applied - counted.actions)[:, :6].max(axis=1).any(), "it was pushed"
 
 
+@pytest.mark.slow
 def test_expert_and_learner_act_in_turns(butter):
     small = str(checkpoint_folder("memobench_small"))
     demo = record_demonstration(get_task(BUTTER), SEED, images=False, policy=small)

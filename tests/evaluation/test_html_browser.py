@@ -505,6 +505,7 @@ def test_both_timelines_have_one_scale_and_seek_both(browser: Any, report: Path)
     assert frames(browser) == [30, 25]
 
 
+@pytest.mark.slow
 def test_both_play_in_step(browser: Any, report: Path) -> None:
     show(browser, report, PAIR)
     ready(browser)

@@ -58,7 +58,11 @@ def test_another_rollouts_file_is_left_out_and_told(tmp_path: Path, changes: dic
     assert told in note
 
 
-@pytest.mark.parametrize("content", [b"", b"no gzip", gzip.compress(b"{}")[:-4], gzip.compress(b"[1]")])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"no gzip", gzip.compress(b"{}")[:-4], gzip.compress(b"[1]")],
+    ids=["empty", "plain", "cut off", "a list"],
+)
 def test_a_damaged_file_is_left_out_and_told(tmp_path: Path, content: bytes) -> None:
     path = reads_file(tmp_path, "a_task", 0)
     path.parent.mkdir()

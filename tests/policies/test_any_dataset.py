@@ -141,7 +141,11 @@ TASKS = ("fold the towel", "fold the shirt twice", "put it away")
     ("robot", "size"),
     [
         (Foreign({"observation.image": (96, 96)}, state=2, action=2, fps=10), "tiny"),
-        (Foreign(THREE, "image", state=40, action=40, fps=50, episodes=3, tasks=TASKS), "tiny"),
+        pytest.param(
+            Foreign(THREE, "image", state=40, action=40, fps=50, episodes=3, tasks=TASKS),
+            "tiny",
+            marks=pytest.mark.slow,
+        ),
         (Foreign({IMAGES + "front": (240, 320), IMAGES + "phone": (120, 90)}, state=14, action=7), "small"),
     ],
     ids=["pusht", "humanoid", "two_cameras"],

@@ -110,6 +110,7 @@ def test_detections_are_kept_for_every_frame(
     assert len(batch[FRAMES]) < (batch[PLACES] >= 0).sum(), "moments of an episode share frames"
 
 
+@pytest.mark.slow
 def test_detections_are_of_the_cameras_by_their_names_in_the_dataset(
     root: Path, finding: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

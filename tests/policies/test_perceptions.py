@@ -209,6 +209,7 @@ def test_a_checkpoint_acts_as_its_policy(case: Case, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("case", ["detections"], indirect=True)
+@pytest.mark.slow
 def test_features_are_kept_elsewhere_on_demand(case: Case, tmp_path: Path) -> None:
     place = tmp_path / "caches"
     cache_dataset(case.root, small_config(**case.fields | {"feature_cache_dir": str(place), "memory_stride": 4}))

@@ -88,6 +88,7 @@ def test_training_saves_and_goes_on(
     assert _updates(checkpoints / "000003") == 3
 
 
+@pytest.mark.slow
 def test_the_loss_of_held_out_episodes_lies_beside_the_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logs: pytest.LogCaptureFixture
 ) -> None:

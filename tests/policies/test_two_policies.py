@@ -91,7 +91,7 @@ KINDS = {
 }
 
 
-QUICK = ("tokens and pictures", "memory text in the prompt")
+QUICK = ("memory text in the prompt",)
 
 
 @pytest.mark.parametrize(

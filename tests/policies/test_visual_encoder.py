@@ -231,6 +231,7 @@ def test_a_disk_without_room_for_all_is_told_before_any_is_made(
     assert not (root / FOLDER).exists()
 
 
+@pytest.mark.slow
 def test_caches_of_other_encoders_lie_beside_and_elsewhere(
     dataset_root: Path, tmp_path: Path, encoder_fields: dict[str, Any]
 ) -> None:

@@ -122,6 +122,7 @@ def test_lerobot_train_asks_by_the_gpu_and_the_launcher(monkeypatch: pytest.Monk
     gpu_memory.refuse_too_large(arguments)
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_count(capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
     monkeypatch.setenv("COLUMNS", "140")
     assert main(["fit", "config=train_paper", "size=tiny", "batch_size=16", "--gpus", "4", "--gpu-memory", "45"]) == 0
