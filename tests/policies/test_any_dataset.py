@@ -171,6 +171,7 @@ def test_every_dataset_is(
 
 
 @pytest.mark.parametrize("size", ["tiny", pytest.param("small", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_names_are_mapped_in_training_and_acting(size: str, tmp_path: Path) -> None:
     """A checkpoint goes on with data whose cameras have other names, and acts for a robot with names of its own."""
     first = Foreign({IMAGES + "front": (96, 96), IMAGES + "wrist": (96, 96)})
@@ -292,6 +293,7 @@ def test_what_is_trained_on_something_else_is_not_evaluated_here_between_updates
 # --- another environment of LeRobot's ---
 
 
+@pytest.mark.slow
 def test_pusht(tmp_path: Path) -> None:
     """A rollout in LeRobot's own environment, by its own command: no clock, no phases, one instruction for all."""
     pytest.importorskip("gym_pusht")

@@ -83,6 +83,7 @@ def go_on(dataset_root: Path, start: Path, tmp_path: Path, monkeypatch: pytest.M
     ],
     ids=" ".join,
 )
+@pytest.mark.slow
 def test_a_step_from_a_checkpoint_takes_the_new_settings(go_on: Any, dataset_root: Path, settings: list[str]) -> None:
     batch, written = go_on(*settings)
     config = PreTrainedConfig.from_pretrained(written)

@@ -144,6 +144,7 @@ def test_no_video_is_opened_where_features_are_kept(case: Case, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("case", ["visual encoder", "detection noise"], indirect=True)
+@pytest.mark.slow
 def test_it_learns(case: Case) -> None:
     policy, before, _, dataset = case.made(chunk_size=4, memory_frames=4)
     losses = losses_in_training(policy, before(batch_of(dataset, [*range(8, 38, 4)])), updates=30)

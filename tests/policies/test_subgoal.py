@@ -219,6 +219,7 @@ def test_it_is_built_at_full_size_and_has_no_tokens_of_single_frames() -> None:
 
 
 @pytest.mark.parametrize(("memory", "name"), [("subgoal", "subgoal"), ("keyframes", "subtask")])
+@pytest.mark.slow
 def test_it_learns_from_a_dataset_and_its_texts_lie_in_the_checkpoint(memory: str, name: str, tmp_path: Path) -> None:
     root = make_object_dataset(tmp_path / "objects")
     fields = {"size": "small", "perception": "objects", "memory_stride": 2, "memory_frames": 32}

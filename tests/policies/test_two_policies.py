@@ -139,6 +139,7 @@ def test_who_looks_at_pictures_gets_them_from_a_dataset_that_is_shared(root: Pat
     assert "observation.images.image" in other[45], "another dataset object is nobody's"
 
 
+@pytest.mark.slow
 def test_a_policy_that_is_loaded_to_act_changes_no_training(
     root: Path, encoders: tuple[Path, Path], tmp_path: Path
 ) -> None:

@@ -130,6 +130,7 @@ def test_a_file_that_holds_no_encoder_is_refused(root: Path, tmp_path: Path) -> 
 # -- caches --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_both_are_made_once_and_their_size_is_told_before(
     dataset_root: Path,
     tmp_path: Path,
@@ -183,6 +184,7 @@ def test_a_cache_that_was_killed_is_finished(
     assert all((killed / path).read_bytes() == (root / path).read_bytes() for path in made)
 
 
+@pytest.mark.slow
 def test_of_two_trainings_each_looks_at_one_camera(
     dataset_root: Path, tmp_path: Path, encoder_fields: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
