@@ -202,8 +202,7 @@ class Actor:
 def present(settings: MemobenchMemConfig, memory: MemoryMechanism) -> Query:
     """Return a present for a memory to write and read by."""
     spec = memory.spec
-    words, real = torch.randn(1, 8, spec.width), torch.ones(1, 8, dtype=torch.bool)
-    return Query(torch.randn(1, spec.tokens, spec.dim), words, real, choices(settings, 1).get(CHOICES))
+    return Query(torch.randn(1, spec.tokens, spec.dim), choices(settings, 1).get(CHOICES))
 
 
 def bytes_of(state: Any) -> int:

@@ -73,8 +73,6 @@ def asked(rows: int, seed: int = 1) -> Query:
     choices[:, 0] = True
     return Query(
         tokens=torch.randn(rows, P, D, generator=chance),
-        words=torch.randn(rows, 5, D, generator=chance),
-        real=torch.arange(5) < torch.randint(1, 6, (rows, 1), generator=chance),
         choices=choices,
     )
 
@@ -108,7 +106,7 @@ def test_training_reads_what_a_rollout_reads(name: str) -> None:
         places[number, : len(read)] = read
     steps = torch.cat([torch.arange(length) * stride for length in lengths])
     own = asked(len(lengths))
-    present = asked(len(samples), 2)  # its own of each sample; words and choices are the episode's
+    present = asked(len(samples), 2)  # its own of each sample; choices are the episode's
     of_episode = [episode for episode, _ in samples]
     query = own.rows(of_episode)._replace(tokens=present.tokens)
     with torch.no_grad():

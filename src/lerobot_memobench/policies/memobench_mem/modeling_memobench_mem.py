@@ -335,12 +335,6 @@ class MemobenchMemPolicy(PI05Policy):
         query, chosen = Query(), list(rows)
         if memory.asks_present and not writes:
             query = query._replace(tokens=memory.pool(self.perception.remember(batch, chosen).to(device)))
-        if memory.asks_words:
-            words, real = (
-                batch[name][chosen].to(device) for name in (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
-            )
-            embedded = self.model.paligemma_with_expert.embed_language_tokens(words)
-            query = query._replace(words=embedded, real=real.bool())
         if memory.privileged:
             labels = batch[SUBGOAL][chosen].to(device) if SUBGOAL in batch else None
             query = query._replace(choices=batch[CHOICES][chosen].to(device), subgoal=labels)

@@ -135,8 +135,11 @@ class MemoryPI05(PI05Pytorch):
     def memory_names(self) -> set[str]:
         """Return the names of the tensors of the memory and of its fusion."""
         fusion = self.fusion
-        own = (name for name in self.state_dict() if fusion is not None and fusion.owns(name))
-        return {*own, *(name for name in self.state_dict() if name.startswith("memory."))}
+        return {
+            name
+            for name in self.state_dict()
+            if name.startswith("memory.") or (fusion is not None and fusion.owns(name))
+        }
 
     def place_of(self, name: str) -> str:
         """Return the name in this model of a parameter of plain pi0.5."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -34,6 +35,7 @@ def mechanism_names() -> list[str]:
     return [*OURS, *sorted({point.name for point in entry_points(group=GROUP)} - {*OURS, NONE})]
 
 
+@cache
 def find_mechanism(name: str) -> type[MemoryMechanism]:
     """Return a mechanism by its name.
 
@@ -79,14 +81,13 @@ def read_settings(name: str, given: Mapping[str, Any]) -> Any:
     Raises:
         MemobenchError: a setting is unknown, or of another type.
     """
-    made: Any = find_mechanism(name).Settings
-    known = [one.name for one in fields(made)]
+    known = _settings(name)
     for key in given:
         if key not in known:
             told = nearest(key, known) if known else "it has none."
             raise MemobenchError(f"policy.memory_settings names '{key}', which is no setting of memory={name}; {told}")
     try:
-        return draccus.decode(made, dict(given))
+        return draccus.decode(find_mechanism(name).Settings, dict(given))
     except Exception as error:  # draccus answers by its own kinds of error
         raise MemobenchError(
             f"policy.memory_settings={dict(given)} of memory={name} cannot be read: {error.__cause__ or error}"

@@ -62,14 +62,11 @@ class Query(NamedTuple):
 
     Attributes:
         tokens: (R, P, D) of the present observation, as of a remembered frame; if a mechanism `asks_present`.
-        words: (R, n, D) embedded text prompt, if it `asks_words`. real: (R, n) bool, which are no padding.
         choices: (R, S) bool, which of the S subgoals are the task's; with `MemoryMechanism.privileged`.
         subgoal: (R,) which is the present one, -1: none; of training samples alone.
     """
 
     tokens: Tensor | None = None
-    words: Tensor | None = None
-    real: Tensor | None = None
     choices: Tensor | None = None
     subgoal: Tensor | None = None
 
@@ -151,7 +148,6 @@ class MemoryMechanism(nn.Module, ABC):
         stride: control steps from one written frame to the next where nobody says, perhaps by the perception; None: as
             `frames`.
         asks_present: whether it reads by tokens of the present observation.
-        asks_words: whether it writes or reads by the text prompt.
         asks_motion: whether it remembers what moves: its pool is a `motion_fields.MotionField`, and what is stored of a
             picture is a thumbnail.
         ahead: how many stored frames that follow are loaded in training, as labels.
@@ -166,7 +162,6 @@ class MemoryMechanism(nn.Module, ABC):
     Settings: ClassVar[type] = NoSettings
     stride: ClassVar[int | Mapping[str, int] | None] = None
     asks_present: ClassVar[bool] = False
-    asks_words: ClassVar[bool] = False
     asks_motion: ClassVar[bool] = False
     ahead: ClassVar[int] = 0
     privileged: ClassVar[bool] = False
@@ -197,7 +192,7 @@ class MemoryMechanism(nn.Module, ABC):
 
         Args:
             tokens: (R, P, D) of the frame, behind the pool. step: (R,) control step since the episode began.
-            query: words and choices of the rows.
+            query: choices of the rows.
         """
 
     @abstractmethod
