@@ -26,6 +26,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE
 from object_update import scene
 from policies import config, observation, updates
+from random_weights import materialise
 from torch import Tensor
 from turns import medians
 
@@ -221,7 +222,7 @@ def bytes_of(state: Any) -> int:
 
 @torch.no_grad()
 def full_size(settings: MemobenchMemConfig) -> list[str]:
-    """Count what a row costs; its memory writes one frame, of weights that say nothing.
+    """Count what a row costs; its memory writes one frame, of random weights.
 
     A state of tensors has its size from the beginning on; a list grows by a frame up to the mechanism's capacity.
     """
@@ -229,7 +230,8 @@ def full_size(settings: MemobenchMemConfig) -> list[str]:
         model = MemoryPI05(settings)
     if model.memory is None or settings.memory_stride is None:
         return [*costs(settings, model), "0", "0"]
-    memory = model.memory.to_empty(device="cpu")
+    memory = model.memory
+    materialise(memory, torch.device("cpu"), seed=0)
     tokens = THUMBNAIL**2 if find_mechanism(settings.memory or "").asks_motion else None
     shape = (1, memory.spec.tokens, memory.spec.dim) if tokens is None else (1, 1, tokens)
     query = present(settings, memory)

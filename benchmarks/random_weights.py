@@ -51,7 +51,8 @@ def fill_buffers(model: nn.Module, device: torch.device) -> None:
     """Give the buffers of a model on the meta device what their modules put there."""
     for module in model.modules():
         for key, buffer in module.named_buffers(recurse=False):
-            setattr(module, key, _buffer(module, key).to(device, buffer.dtype))
+            content = _buffer(module, key) if buffer.is_meta else buffer
+            setattr(module, key, content.to(device, buffer.dtype))
 
 
 def _buffer(module: Any, name: str) -> Tensor:

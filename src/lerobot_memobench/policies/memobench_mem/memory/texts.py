@@ -23,7 +23,8 @@ class CheckpointTexts(nn.Module):
         self.length = 1 + max(map(len, spelled))
         padding = [[-1] * (self.length - 1 - len(words)) for words in spelled]
         rows = [[*(number[word] for word in words), 0, *rest] for words, rest in zip(spelled, padding, strict=True)]
-        self.register_buffer("rows", torch.tensor(rows), persistent=False)
+        # Known without weights: a model that is built on the meta device has it too.
+        self.register_buffer("rows", torch.tensor(rows, device="cpu"), persistent=False)
         self.embedding = nn.Embedding(1 + len(number), width)
 
     def forward(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
