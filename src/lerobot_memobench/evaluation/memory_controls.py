@@ -90,13 +90,25 @@ def paired_outcomes(
 
 def contrasts(standard: Sequence[Record], other: Sequence[Record], draws: int = DRAWS) -> Contrasts:
     """Return, per memory type and on average, each metric under both evaluations; rollouts are paired already."""
-    outcomes = paired_outcomes(standard, other, draws)
-    memory_type = {record["task"]: str(record["memory_type"]) for record in standard}
-    kinds: dict[str, list[dict[str, Outcomes]]] = {}
-    for task, metrics in outcomes.items():
-        kinds.setdefault(memory_type[task], []).append(metrics)
+    return contrasts_by_type(paired_outcomes(standard, other, draws), standard)
+
+
+def contrasts_by_type(outcomes: Mapping[str, Mapping[str, Outcomes]], records: Sequence[Record]) -> Contrasts:
+    """Return the contrasts of each memory type and on average, of tasks whose memory types rollouts tell."""
+    kinds = grouped(outcomes, {record["task"]: str(record["memory_type"]) for record in records})
     scopes = {**{name: [tasks] for name, tasks in kinds.items()}, AVERAGE: list(kinds.values())}
     return {name: contrasts_of(groups) for name, groups in scopes.items()}
+
+
+def grouped(
+    outcomes: Mapping[str, Mapping[str, Outcomes]], group_of: Mapping[str, str]
+) -> dict[str, list[Mapping[str, Outcomes]]]:
+    """Return group -> the outcomes of its tasks; tasks that are in none are left out."""
+    groups: dict[str, list[Mapping[str, Outcomes]]] = {}
+    for task, metrics in outcomes.items():
+        if task in group_of:
+            groups.setdefault(group_of[task], []).append(metrics)
+    return groups
 
 
 def contrasts_of(groups: Sequence[Sequence[Mapping[str, Outcomes]]]) -> dict[str, Contrast]:

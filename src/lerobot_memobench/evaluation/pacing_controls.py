@@ -15,8 +15,15 @@ from typing import Any, Literal, NotRequired, TypedDict, cast
 from lerobot_memobench.envs.episode_log import UNTOLD
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.controls import check_one_policy, pairs_by_replan, replan_title
-from lerobot_memobench.evaluation.memory_controls import AVERAGE, Contrast, contrasts_of, paired_outcomes
-from lerobot_memobench.evaluation.metrics import METRICS, Record, by_task, percent
+from lerobot_memobench.evaluation.memory_controls import (
+    AVERAGE,
+    Contrast,
+    contrasts_by_type,
+    contrasts_of,
+    grouped,
+    paired_outcomes,
+)
+from lerobot_memobench.evaluation.metrics import METRICS, Record, percent
 from lerobot_memobench.evaluation.records import read_protocol
 from lerobot_memobench.evaluation.statistics import DRAWS
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Name, Numbers, Section, Table
@@ -91,25 +98,16 @@ def _paced(
     setting: str, value: float, replan: int | None, plain: Sequence[Record], paced: Sequence[Record], draws: int
 ) -> Paced:
     outcomes = paired_outcomes(plain, paced, draws)
-    memory_type = {task: str(group[0]["memory_type"]) for task, group in by_task(plain).items()}
-    known = {task: get_task(task).family for task in outcomes if task in task_names(suite=None)}
-
-    def grouped(by: Mapping[str, str]) -> dict[str, list[Any]]:
-        groups: dict[str, list[Any]] = {}
-        for task in outcomes:
-            if task in by:
-                groups.setdefault(by[task], []).append(outcomes[task])
-        return groups
-
-    kinds = grouped(memory_type)
+    families = {task: get_task(task).family for task in outcomes if task in task_names(suite=None)}
+    kinds = {name: _changes(contrasts) for name, contrasts in contrasts_by_type(outcomes, plain).items()}
     found: dict[str, Any] = {
         "setting": setting,
         "value": value,
         "replan_steps": replan,
         "pairs": len(plain),
-        AVERAGE: _changes(contrasts_of(list(kinds.values()))),
-        "memory_types": {name: _changes(contrasts_of([tasks])) for name, tasks in kinds.items()},
-        "families": {name: _changes(contrasts_of([tasks])) for name, tasks in grouped(known).items()},
+        AVERAGE: kinds.pop(AVERAGE),
+        "memory_types": kinds,
+        "families": {name: _changes(contrasts_of([tasks])) for name, tasks in grouped(outcomes, families).items()},
         "tasks": {name: _changes(contrasts_of([[metrics]])) for name, metrics in outcomes.items()},
     }
     rests = [record["paused_steps"] for record in paced if "paused_steps" in record]

@@ -79,7 +79,8 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
     # A run may change the objective of the one it goes on from; its heads then start anew.
     new = {name for name in policy.state_dict() if name.startswith("alignment.")}
     if remembers_otherwise(config, trained):
-        new |= {f"model.{name}" for name in model.memory_names()}
+        own = model.memory_names()
+        new |= {f"model.{name}" for name in own}
         plain = {plain_name(name.removeprefix("model.")): tensor for name, tensor in weights.items()}
         weights = {f"model.{model.place_of(name)}": tensor for name, tensor in plain.items()}
         weights = {name: tensor for name, tensor in weights.items() if name not in new}
@@ -89,7 +90,7 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             source,
             trained.memory,
             config.memory,
-            len(model.memory_names()),
+            len(own),
         )
     elif config.memory != NONE and not any(name.startswith("model.memory.") for name in weights):
         raise MemobenchError(

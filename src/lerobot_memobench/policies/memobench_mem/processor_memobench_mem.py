@@ -251,8 +251,9 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         if self.subgoals:
             number = {text: row for row, text in enumerate(texts_of(self.subgoals))}
             known = np.array([*(number.get(text, -1) for text in cache.texts), -1])
-            labels = torch.from_numpy(known[cache.text_rows(self.subgoal_level)])
-            memory |= {SUBGOAL: labels[torch.tensor(indices)], SUBGOALS: labels[numbers]}
+            rows = cache.text_rows(self.subgoal_level)
+            asked = {SUBGOAL: np.asarray(indices), SUBGOALS: numbers.numpy()}
+            memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
         if self.align == "none":
             return memory | phase
         rows = self._text_rows(cache)

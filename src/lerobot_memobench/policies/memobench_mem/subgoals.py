@@ -75,11 +75,12 @@ def choices(subgoals: dict[str, list[str]], tasks: str | Sequence[str]) -> Tenso
     Args:
         subgoals: instruction -> texts of its checkpoints. tasks: the rows' instructions.
     """
-    texts, rows = texts_of(subgoals), []
-    for task in [tasks] if isinstance(tasks, str) else tasks:
+    texts, rows = texts_of(subgoals), dict[str, list[bool]]()
+    tasks = [tasks] if isinstance(tasks, str) else tasks
+    for task in dict.fromkeys(tasks):
         own = subgoals.get(task)
         if own is None and task not in _told:
             _told.add(task)
             logger.warning("the memory knows no checkpoints of %r, and chooses among those of all tasks", task)
-        rows.append([own is None or text in own for text in texts])
-    return torch.tensor(rows)
+        rows[task] = [own is None or text in own for text in texts]
+    return torch.tensor([rows[task] for task in tasks])
