@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import differences, read_episodes, read_protocol_file
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.episode_log import differences, read_episodes, read_log, read_protocol_file
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import OBJECTS, RESET
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import seed_base
 from lerobot_memobench.run.card import drawn_otherwise
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -48,6 +50,18 @@ def test_a_scene_is_run_with_each_variant_before_the_next(tmp_path: Path) -> Non
     assert drawn["scene_hash"] == records[0]["scene_hash"], "only the past differs"
     each, once = (read_protocol_file(tmp_path / name) for name in ("each", "drawn"))
     assert differences(each, once) == ["evidence: True and False"]
+
+
+def test_an_episode_that_cannot_be_run_names_its_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any) -> None:
+        raise MemobenchError("no simulator")
+
+    monkeypatch.setattr(Episode, "reset", fails)
+    episodes(tmp_path, range(20_002, 20_004), evidence=True)
+    assert [(r["episode"], r["seed"], seed_base(r)) for r in read_log(tmp_path)] == [
+        (2, 20_001, 20_000),
+        (3, 20_001, 20_000),
+    ]
 
 
 def test_who_follows_the_prompt_chooses_what_it_showed(tmp_path: Path) -> None:

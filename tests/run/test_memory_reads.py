@@ -5,13 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
+from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.observations import OBJECTS, RESET
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.html.data import page_data
 from lerobot_memobench.evaluation.memory_reads import find_reads, reads_file
+from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.policies.memobench_mem.reads import ChunkReads
 from lerobot_memobench.run.memory_reads import ReadLog
+from lerobot_memobench.run.merging import merge
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.shards import plan_shards
 from tests.support.logs import record
@@ -72,6 +78,42 @@ def test_a_rollout_that_breaks_off_leaves_only_whole_episodes(tmp_path: Path) ->
         raise ZeroDivisionError
     assert not policy.watched
     assert not reads_file(tmp_path, "a_task", 0).exists()
+
+
+def test_reads_of_evidence_stand_at_their_own_episode(tmp_path: Path) -> None:
+    """Four episodes of two scenes, in two parts, of which the second goes on after its first episode."""
+    for part, number in (("a", 0), ("a", 1), ("b", 2), ("b", 3)):
+        env = gym.vector.SyncVectorEnv([lambda folder=tmp_path / part: evidence(folder)])
+        policy: Any = Policy([ChunkReads(0, (0,), (number / 10,))])
+        with ReadLog(tmp_path / part, 20_000, "drawn").noting(env, policy, [20_000 + number]) as ended:
+            env.reset(seed=[20_000 + number])
+            ended(env.step(np.zeros((1, 7), np.float32))[3])
+        env.close()
+    merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b"])
+    (run,) = read_runs([tmp_path / "all"])
+    found, notes = find_reads(run.folder, run.records, run.protocol)
+    assert notes == []
+    episodes = page_data([run], [{}], {}, [found])["runs"][0]["episodes"]
+    assert [(each["episode"], each["seed"], each["variant"]) for each in episodes] == [
+        (0, 20_000, 0),
+        (1, 20_000, 1),
+        (2, 20_001, 0),
+        (3, 20_001, 1),
+    ]
+    assert [each["reads"][0][2] for each in episodes] == [[0.0], [0.1], [0.2], [0.3]]
+
+
+def evidence(folder: Path) -> MemobenchEnv:
+    return MemobenchEnv(
+        "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate",
+        obs_type=OBJECTS,
+        prompt_in=RESET,
+        horizon=1,
+        demonstration_prompt=False,
+        evidence=True,
+        seed_base=20_000,
+        log_dir=str(folder),
+    )
 
 
 def test_it_is_asked_of_a_policy_with_a_memory() -> None:

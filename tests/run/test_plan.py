@@ -156,6 +156,13 @@ def test_evidence_is_asked_for_in_whole_scenes() -> None:
     assert plan_line(["env=memobench", "tasks=object", "referent=random", "evidence=true", "episodes=9"]).grid.runs == 9
 
 
+def test_scenes_of_evidence_are_counted_from_episode_0() -> None:
+    line = ["env=memobench", "tasks=object", "referent=random", "evidence=true", "env.seed_base=30000"]
+    assert plan_line([*line, "seed=30000"]).seeds == range(30_000, 30_018)
+    # Of two variants and of nine: episode 12 is of scene 6 and of scene 1.
+    assert plan_line([*line, "seed=30012", "episodes=6"]).seeds == range(30_001, 30_009)
+
+
 def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:
     for words, videos in (([], 10), (["videos=0"], 0), (["env.videos=3"], 3)):
         environment = plan_line([*LINE, *words]).environment

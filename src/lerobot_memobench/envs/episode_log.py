@@ -184,15 +184,18 @@ def evidence_line(task: Task, choice: int | None) -> dict[str, Any]:
     return {"choice": choice, "variants": len(task.random_variants), "chance": chance(task)}
 
 
-def not_run_record(task: Task, seed: int, seed_base: int, referent: str, why: str) -> dict[str, Any]:
-    """Return the line for the log of an episode that could not be run."""
+def not_run_record(
+    task: Task, number: int, seed: int, referent: str, why: str, variants: int | None = None
+) -> dict[str, Any]:
+    """Return the line for the log of an episode that could not be run; arguments are fields of `EpisodeRecord`."""
     return {
         "task": task.name,
         "memory_type": task.memory_type,
-        "episode": seed - seed_base,
+        "episode": number,
         "seed": seed,
         "referent": referent,
         "success": False,
+        **({} if variants is None else {"variants": variants}),
         "checkpoints": [],
         **({} if task.suite == PUBLISHED else {"suite": task.suite}),
         "not_run": why,

@@ -212,13 +212,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._started = time.monotonic()
         self._began, self._closed, self._over, self._not_run = True, False, False, None
         self._discard_video()
-        number = seed - self._seed_base
+        self._number = number = seed - self._seed_base
+        scene, variant = scene_and_variant(self._task, number) if self._evidence else (number, None)
+        self._scene_seed = self._seed_base + scene
         with self._noting():
-            if self._evidence:
-                scene, variant = scene_and_variant(self._task, number)
-                self.episode.reset(self._seed_base + scene, variant)
-            else:
-                self.episode.reset(seed)
+            self.episode.reset(self._scene_seed, variant)
         if self._not_run is not None:
             return blank(self.observation_space), self._info()
         self._describe(0)
@@ -306,7 +304,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         """Say at once what ends this episode alone; the same once, if it ends all of them."""
         if why not in self._warned:
             self._warned.add(why)
-            logger.warning("%s, episode %d: %s", self.task, self._seed - self._seed_base, why)
+            logger.warning("%s, episode %d: %s", self.task, self._number, why)
 
     def _check_began(self, call: str) -> None:
         """Raise gymnasium's own error for a call that only a running episode can answer."""
@@ -344,9 +342,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._check_began("record")
         if self._not_run is None:
             seconds = time.monotonic() - self._started
-            found = episode_record(self.episode, self._seed - self._seed_base, self._replan_steps, seconds)
+            found = episode_record(self.episode, self._number, self._replan_steps, seconds)
         else:
-            found = not_run_record(self._task, self._seed, self._seed_base, self._referent, self._not_run)
+            variants = len(self._task.random_variants) if self._evidence else None
+            found = not_run_record(self._task, self._number, self._scene_seed, self._referent, self._not_run, variants)
         return found | self._acting.line
 
     def _observation(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any, TypedDict
 
 from lerobot_memobench.envs.observations import RESET
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import seed_base
 from lerobot_memobench.io import Count, Name, Number, Whole, count_of, file_name, read_json, write_file
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -41,7 +42,9 @@ class EpisodeReads(TypedDict):
     """The content of a file.
 
     Attributes:
-        seed, referent: of the episode, as in its line of the log.
+        seed: that of episode 0 + the episode's number; in the log stands the scene's, which several episodes share
+            where each scene is run with each variant.
+        referent: of the episode, as in its line of the log.
         chunks: in the order in which they were planned.
     """
 
@@ -102,7 +105,9 @@ def _later(chunk: Chunk, shift: int) -> Chunk:
 
 
 def _is_of(reads: EpisodeReads, record: Mapping[str, Any]) -> bool:
-    return reads["seed"] == record.get("seed") and reads["referent"] == record.get("referent", "fixed")
+    if record.get("seed") is None or reads["referent"] != record.get("referent", "fixed"):
+        return False
+    return reads["seed"] == seed_base(record) + int(record["episode"])
 
 
 def _fit(chunks: Sequence[Chunk], record: Mapping[str, Any]) -> bool:

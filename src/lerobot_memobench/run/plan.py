@@ -107,14 +107,14 @@ class EvaluationPlan:
 
     @property
     def seeds(self) -> range:
-        """Seeds of the scenes; where each is run with each variant, those of the task with the fewest variants."""
+        """Seeds of the scenes; where each is run with each variant, those of all tasks, whose numbers of it differ."""
         from lerobot_memobench.tasks.catalogue import load_task
 
-        first, scenes = self.environment.seed_base + self.grid.first, self.grid.runs
+        base, first, last = self.environment.seed_base, self.grid.first, self.grid.first + self.grid.runs - 1
         if self.environment.evidence:
-            fewest = min(len(load_task(task.folder).random_variants) for task in self.grid.tasks)
-            scenes = -(-scenes // fewest)
-        return range(first, first + scenes)
+            variants = [len(load_task(task.folder).random_variants) for task in self.grid.tasks]
+            first, last = first // max(variants), last // min(variants)
+        return range(base + first, base + last + 1)
 
     @property
     def draws(self) -> bool:
