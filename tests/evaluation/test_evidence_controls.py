@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,14 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.evaluation import evidence_controls
+from lerobot_memobench.evaluation import records as evaluations
 from lerobot_memobench.evaluation.evidence_controls import evidence_of
 from lerobot_memobench.evaluation.html.data import facts
+from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import mixtures
 from lerobot_memobench.evaluation.records import protocol_of_log, read_runs
+from lerobot_memobench.evaluation.report import write_report
 from tests.support.logs import SETTINGS, rollout
 
 Policy = Callable[[int, int], int | None]
@@ -107,6 +111,23 @@ def test_the_rate_joins_every_report(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert written["tasks"]["bowl"]["choices"]["1"] == {"0": 4, "1": 3, "2": 3}
     assert "## Evidence" in (tmp_path / "run" / "report.md").read_text()
     assert "follows the evidence 33.3 %, chance 33.3 %" in facts(read_runs([folder])[0])
+
+
+def test_a_report_draws_its_scenes_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, asked = evaluation(tmp_path / "run", stubborn), list[int]()
+
+    def noted(found: Sequence[Mapping[str, Any]], *more: int) -> Any:
+        asked.append(len(found))
+        return evidence_of(found, *more)
+
+    for module in (evidence_controls, evaluations):
+        monkeypatch.setattr(module, "evidence_of", noted)
+    write_report(folder)
+    assert asked == [60]
+    write_html([folder], tmp_path / "html")
+    assert asked == [60, 60]
+    assert main(["controls", "evidence", folder]) == 0
+    assert asked == [60, 60, 60]
 
 
 def test_policies_stand_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

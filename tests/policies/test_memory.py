@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,14 +12,16 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
+from safetensors.torch import save_file
+from torch import Tensor, nn
 from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem
+from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem, memory
+from lerobot_memobench.policies.memobench_mem.checkpoints import load_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FUSIONS, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
-from lerobot_memobench.policies.memobench_mem.memory.frames import Frame, MemoryEncoder, sample_frames
+from lerobot_memobench.policies.memobench_mem.memory.frames import Frame, Frames, MemoryEncoder, sample_frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     FRAMES,
     PLACES,
@@ -28,10 +32,12 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.motion_fields import MotionField
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
+from tests.support.small_policy import small_config
 
 P, D, SUBGOALS = 2, 16, ("close it", "open it", "put it there")
 
@@ -266,10 +272,6 @@ def test_settings_of_the_memory_that_a_checkpoint_had_are_left_out(monkeypatch: 
 
 
 def test_a_package_that_brings_no_memory_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    from importlib.metadata import EntryPoint
-
-    from lerobot_memobench.policies.memobench_mem import memory
-
     brought = [
         EntryPoint("gone", "no_such_package:Memory", memory.GROUP),
         EntryPoint("other", "pathlib:Path", memory.GROUP),
@@ -278,6 +280,28 @@ def test_a_package_that_brings_no_memory_is_named(monkeypatch: pytest.MonkeyPatc
     for name, told in (("gone", "cannot be imported"), ("other", "no subclass of MemoryMechanism")):
         with pytest.raises(MemobenchError, match=told):
             find_mechanism(name)
+
+
+class Straight(Frames):
+    """A mechanism of another package, whose layers have the names that those of frames once had."""
+
+    def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:
+        super().__init__(spec, pool, settings)
+        self.position, self.project = nn.Linear(2, 2), nn.Linear(2, 2)
+
+
+def test_only_what_frames_had_is_renamed_in_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    brought = [EntryPoint("straight", f"{__name__}:Straight", memory.GROUP)]
+    monkeypatch.setattr(memory, "entry_points", lambda group: brought)
+    for name, renamed in (("straight", ("", "")), ("frames", ("model.memory.encoder.", "model.memory."))):
+        policy = MemobenchMemPolicy(small_config(memory=name))
+        saved = {key: tensor.clone() for key, tensor in policy.state_dict().items()}
+        save_file({key.replace(*renamed): tensor for key, tensor in saved.items()}, tmp_path / "weights.safetensors")
+        with torch.no_grad():
+            for parameter in policy.model.memory_parameters().values():
+                parameter.zero_()
+        load_weights(policy, tmp_path / "weights.safetensors", name, policy.config)
+        assert all(torch.equal(tensor, saved[key]) for key, tensor in policy.state_dict().items())
 
 
 # -- frames -----------------------------------------------------------------------------------------------------------

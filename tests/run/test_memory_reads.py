@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def test_a_rollout_that_breaks_off_leaves_only_whole_episodes(tmp_path: Path) ->
 def test_reads_of_evidence_stand_at_their_own_episode(tmp_path: Path) -> None:
     """Four episodes of two scenes, in two parts, of which the second goes on after its first episode."""
     for part, number in (("a", 0), ("a", 1), ("b", 2), ("b", 3)):
-        env = gym.vector.SyncVectorEnv([lambda folder=tmp_path / part: evidence(folder)])
+        env = gym.vector.SyncVectorEnv([partial(evidence, tmp_path / part)])
         policy: Any = Policy([ChunkReads(0, (0,), (number / 10,))])
         with ReadLog(tmp_path / part, 20_000, "drawn").noting(env, policy, [20_000 + number]) as ended:
             env.reset(seed=[20_000 + number])

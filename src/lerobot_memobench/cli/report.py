@@ -277,7 +277,12 @@ def speed(
 @controls.command()
 def evidence(folders: Runs, draws: Draws = 2000, out: TableOut = None) -> int:
     """Print how often the choice follows the evidence, beside chance. Evaluations with evidence=true, side by side."""
-    from lerobot_memobench.evaluation.evidence_controls import evidence_data, evidence_section, ran_evidence
+    from lerobot_memobench.evaluation.evidence_controls import (
+        evidence_data,
+        evidence_of,
+        evidence_section,
+        ran_evidence,
+    )
     from lerobot_memobench.evaluation.records import read_runs, unlike
     from lerobot_memobench.evaluation.tables import Report
 
@@ -288,8 +293,10 @@ def evidence(folders: Runs, draws: Draws = 2000, out: TableOut = None) -> int:
                 f"{run.folder} did not run each scene with each variant; evaluate with evidence=true, of published "
                 "tasks with referent=random"
             )
-    sections = [replace(evidence_section(run.records, draws), title=run.name) for run in runs]
-    report = Report("Evidence", tuple(sections), {run.name: evidence_data(run.records, draws) for run in runs})
+    found = [evidence_of(run.records, draws) for run in runs]
+    sections = [replace(evidence_section(each), title=run.name) for run, each in zip(runs, found, strict=True)]
+    figures = {run.name: evidence_data(each, run.records) for run, each in zip(runs, found, strict=True)}
+    report = Report("Evidence", tuple(sections), figures)
     return _show(report, unlike(runs), "evidence", out)
 
 

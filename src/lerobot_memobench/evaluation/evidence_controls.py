@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,18 @@ class Evidence:
     rates: Mapping[str, Estimate]
 
 
+class FoundEvidence(NamedTuple):
+    """What `evidence_of` finds.
+
+    Attributes:
+        rates: by task (``tasks``), memory type (``memory_types``), and on average (`AVERAGE`, in both places).
+        notes: what a reader must know.
+    """
+
+    rates: dict[str, dict[str, Evidence]]
+    notes: list[str]
+
+
 @dataclass(frozen=True)
 class _Task:
     """Rates per scene (S, 3), and the scenes that are drawn (D, S)."""
@@ -64,8 +76,8 @@ def _tells(record: Record) -> bool:
     return "choice" in record and bool(record.get("variants"))
 
 
-def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> tuple[dict[str, dict[str, Evidence]], list[str]]:
-    """Return the rates by task, memory type and on average, and what a reader must know.
+def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:
+    """Return how often choices follow the evidence. An evaluation (`records.Run`) keeps what was found for its reports.
 
     Args:
         records: of which those of scenes count that were run with every variant.
@@ -94,7 +106,7 @@ def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> tuple[dict[str
         "memory_types": {name: _rates([group]) for name, group in asked.items()},
         AVERAGE: {AVERAGE: _rates(list(asked.values()))} if asked else {},
     }
-    return found, notes if left_out else []
+    return FoundEvidence(found, notes if left_out else [])
 
 
 def _outcome(record: Record) -> tuple[bool, bool, bool]:
@@ -129,9 +141,9 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
 # --- the report ---
 
 
-def evidence_section(records: Sequence[Record], draws: int = DRAWS) -> Section:
+def evidence_section(evidence: FoundEvidence) -> Section:
     """Return the tables of an evaluation in which each scene was run with each variant, with a title."""
-    found, notes = evidence_of(records, draws)
+    found, notes = evidence
     header = ("scenes", "variants", "chance", *RATES)
     kinds = [*found["memory_types"].items(), *found[AVERAGE].items()]
     tables = [
@@ -152,17 +164,14 @@ def _cell(found: Estimate) -> Numbers:
     return Numbers(f"{figure(found.value)} [{figure(found.low)}–{figure(found.high)}]")
 
 
-def evidence_data(records: Sequence[Record], draws: int = DRAWS) -> dict[str, Any]:
-    """Return the same as JSON values, per cent; {} where scenes were not run with each variant."""
-    if not ran_evidence(records):
-        return {}
-    found, _ = evidence_of(records, draws)
-    average = found.pop(AVERAGE)
-    told = {place: {name: _data(each) for name, each in rates.items()} for place, rates in found.items()}
+def evidence_data(evidence: FoundEvidence, records: Sequence[Record]) -> dict[str, Any]:
+    """Return the same as JSON values, per cent, and what was chosen in the rollouts."""
+    told = {place: {name: _data(each) for name, each in rates.items()} for place, rates in evidence.rates.items()}
+    average = told.pop(AVERAGE)
     for name, group in by_task(filter(_tells, records)).items():
         if name in told["tasks"]:
             told["tasks"][name]["choices"] = _choices(group)
-    return {AVERAGE: _data(average[AVERAGE]) if average else None, **told}
+    return {AVERAGE: average.get(AVERAGE), **told}
 
 
 def _choices(group: Sequence[Record]) -> dict[str, dict[str, int]]:
@@ -182,9 +191,9 @@ def _data(found: Evidence) -> dict[str, Any]:
     return {"scenes": found.scenes, "variants": found.variants, "chance": percent(found.chance), **rates}
 
 
-def evidence_phrase(records: Sequence[Record]) -> list[str]:
+def evidence_phrase(evidence: FoundEvidence) -> list[str]:
     """Return the average in words, for one line; [] where there is none."""
-    if not ran_evidence(records) or not (average := evidence_of(records)[0][AVERAGE]):
+    told = evidence.rates[AVERAGE].get(AVERAGE)
+    if told is None:
         return []
-    told = average[AVERAGE]
     return [f"follows the evidence {figure(told.rates['follows'].value)} %, chance {figure(told.chance)} %"]

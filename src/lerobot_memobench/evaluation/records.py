@@ -30,6 +30,7 @@ from lerobot_memobench.envs.episode_log import (
     read_protocol_file,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.evidence_controls import FoundEvidence, evidence_of, ran_evidence
 from lerobot_memobench.evaluation.metrics import Record, Summary, faults, mixtures, seed_base, summarise
 from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, is_there, read_json
 from lerobot_memobench.tasks.task import PUBLISHED
@@ -312,6 +313,11 @@ class Run:
     def summary(self) -> Summary:
         """Every figure of its rollouts."""
         return summarise(self.records)
+
+    @cached_property
+    def evidence(self) -> FoundEvidence | None:
+        """How often choices follow the evidence, None where scenes were not run with each variant."""
+        return evidence_of(self.records) if ran_evidence(self.records) else None
 
     @cached_property
     def card(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from rich.console import RenderableType
 
 from lerobot_memobench.envs.episode_log import POLICY, not_run, notes_on_not_run, read_log, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.evaluation.evidence_controls import evidence_data, evidence_section, ran_evidence
+from lerobot_memobench.evaluation.evidence_controls import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     METRICS,
@@ -157,13 +157,14 @@ def control_sections(run: Run) -> list[Section]:
     """Return the sections of the controls that were run with an evaluation."""
     changes = kept_changes(run.folder)
     paced = [pacing_section(changes)] if changes else []
-    return [*([evidence_section(run.records)] if ran_evidence(run.records) else []), *paced]
+    return [*([] if run.evidence is None else [evidence_section(run.evidence)]), *paced]
 
 
 def control_data(run: Run) -> dict[str, Any]:
     """Return the figures of the controls that were run with an evaluation, per cent."""
-    evidence, changes = evidence_data(run.records), kept_changes(run.folder)
-    return {**({"evidence": evidence} if evidence else {}), **({"pacing": changes} if changes else {})}
+    changes = kept_changes(run.folder)
+    evidence = {} if run.evidence is None else {"evidence": evidence_data(run.evidence, run.records)}
+    return {**evidence, **({"pacing": changes} if changes else {})}
 
 
 def render(found: Report, runs: Sequence[Run], format_: str, paper: bool = False) -> str:

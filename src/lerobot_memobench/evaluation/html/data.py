@@ -139,7 +139,8 @@ def run_data(run: Run, videos: Mapping[int, str], reads: Mapping[int, Sequence[C
 def facts(run: Run) -> list[str]:
     """Return what stands below the first line: how many rollouts, their horizon, and controls that were run."""
     horizon = run.protocol.get("horizon")
-    controls = [*evidence_phrase(run.records), *map(pace_phrase, kept_changes(run.folder))]
+    evidence = [] if run.evidence is None else evidence_phrase(run.evidence)
+    controls = [*evidence, *map(pace_phrase, kept_changes(run.folder))]
     return [count_of(len(run.records), "rollout"), *([] if horizon is None else [f"horizon {horizon}"]), *controls]
 
 

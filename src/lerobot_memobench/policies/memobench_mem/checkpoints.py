@@ -74,7 +74,9 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
     Raises:
         MemobenchError: they cannot be read, do not fit, or bring no memory to a policy of the same.
     """
-    weights = _today(read_tensors(path))
+    weights = read_tensors(path)
+    if trained.memory == "frames":  # all that there was; a package's memory may have layers of the old names
+        weights = _today(weights)
     config, model = cast(MemobenchMemConfig, policy.config), cast(MemoryPI05, policy.model)
     # A run may change the objective of the one it goes on from; its heads then start anew.
     new = {name for name in policy.state_dict() if name.startswith("alignment.")}
@@ -103,7 +105,7 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
 
 
 def _today(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the weights by today's names: without a pool, the encoder of frames was the memory itself."""
+    """Return the weights of `Frames` by today's names: without a pool, its encoder was the memory itself."""
     begins = ("model.memory.position.", "model.memory.project.")
     return {
         name.replace("model.memory.", "model.memory.encoder.") if name.startswith(begins) else name: tensor
