@@ -18,6 +18,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import check_protocol
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import PIXEL_INPUT, RESET, STEPS, check_counts
+from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, HORIZON, PROMPT, SEALED, SPLITS
@@ -70,6 +71,7 @@ class MEMOBench(StepBenchmark):
         seed: of episode 0.
         horizon: control steps of an execution. A ``max_steps`` of the harness that is lower ends episodes unlogged.
         demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
+        pause_steps, speed, evidence: controls, as of `MemobenchEnvConfig`. A pause begins and ends between two answers.
         history_every: steps between the frames of the prompt that are sent.
         n_action_steps: actions executed of each answer, open-loop.
         send_wrist_image: whether that picture is sent; of this and the next two the harness takes a model server's
@@ -99,6 +101,9 @@ class MEMOBench(StepBenchmark):
         seed: int = EVALUATION_SEED,
         horizon: int = HORIZON,
         demonstration_prompt: bool = True,
+        pause_steps: int = 0,
+        speed: float = 1.0,
+        evidence: bool = False,
         history_every: int = 1,
         n_action_steps: int = 1,
         send_wrist_image: bool = True,
@@ -125,6 +130,9 @@ class MEMOBench(StepBenchmark):
             seed_base=seed,
             horizon=horizon,
             demonstration_prompt=demonstration_prompt,
+            pause_steps=pause_steps,
+            speed=speed,
+            evidence=evidence,
             render=render,
             replan_steps=n_action_steps,
         )
@@ -250,8 +258,10 @@ class MEMOBench(StepBenchmark):
         return dict.fromkeys((SUCCESS, *PROCESS_METRICS), "mean")
 
     def get_metadata(self) -> dict[str, Any]:
-        """Return the harness's bound of steps, the horizon, and the suite."""
-        return {"max_steps": self._config.horizon, "suite": self._config.suite}
+        """Return the harness's bound of steps, the horizon with all pauses, and the suite."""
+        config = self._config
+        most = longest(config.horizon, config.pause_steps, config.speed, self._n_action_steps)
+        return {"max_steps": most, "suite": config.suite}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """Return the conventions of an action."""

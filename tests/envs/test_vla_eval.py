@@ -162,6 +162,49 @@ def test_frames_in_which_a_strict_robot_idles_are_counted_and_not_sent() -> None
     benchmark.cleanup()
 
 
+@pytest.mark.slow
+def test_controls_are_run_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes, "PROMPT_HORIZON", 7)
+    paces: dict[str, Any] = {"referent": "random", "pause_steps": 5, "speed": 0.5, "evidence": True, "horizon": 24}
+    server = DigestServer(steps=3)
+    with vla_eval.serve_background(server) as handle:
+        with recorded(monkeypatch) as theirs:
+            settings = {"tasks": [PROMPTED], "render": "fast"}
+            by_harness(handle.url, episodes=2, **settings, **paces, log_dir=str(tmp_path / "log"), label="digest")
+        with recorded(monkeypatch) as ours:
+            remote = ("policy=memobench_remote", "dialect=vla_eval", f"port={handle.port}", "batch_size=1")
+            words = [f"{name}={str(value).lower()}" for name, value in paces.items()]
+            by_lerobot(tmp_path / "run", *remote, f"tasks={PROMPTED}", "env.render=fast", *words, episodes=2)
+    assert ours == theirs
+    assert log_of(tmp_path / "log") == log_of(tmp_path / "run")
+    assert [record["variant"] for record in log_of(tmp_path / "run")] == [0, 1]
+
+
+def test_controls_are_the_environments(tmp_path: Path) -> None:
+    benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=25, pause_steps=5, speed=0.5, n_action_steps=2)
+    benchmark._recorder = vla_eval.recording.NullEpisodeRecorder()
+    benchmark.reset(benchmark.get_tasks()[0])
+    benchmark._running().need_observation(False)
+    answers = 1
+    while not benchmark.step({"actions": np.zeros((2, 7))}).done:
+        answers += 1
+    record = benchmark._running().record()
+    assert record["steps"] == 50
+    assert record["paused_steps"] == 6, "a whole number of answers"
+    assert answers == 28 <= benchmark.get_metadata()["max_steps"]
+    benchmark.cleanup()
+    settings: dict[str, Any] = {"suite": "strict", "demonstration_prompt": False, "horizon": 1, "seed": 20_000}
+    each = MEMOBench(HIGHLIGHT, evidence=True, log_dir=str(tmp_path), **settings)
+    (task,) = each.get_tasks()
+    for number in range(3):
+        played(each, task | {"episode_idx": number}, expert=False)
+    each.cleanup()
+    found = [(record["episode"], record["seed"], record["variant"]) for record in read_episodes(tmp_path)]
+    assert found == [(0, 20_000, 0), (1, 20_000, 1), (2, 20_001, 0)]
+    with pytest.raises(MemobenchError, match="holds episodes of another protocol"):
+        MEMOBench(HIGHLIGHT, log_dir=str(tmp_path), **settings)
+
+
 def test_what_is_sent() -> None:
     benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=2, send_state=False, send_wrist_image=False, mirror=True)
     plain = MEMOBench(UNPROMPTED, render="fast", horizon=2)
@@ -215,6 +258,8 @@ def test_chunks_are_executed_to_the_end_of_the_episode(caplog: pytest.LogCapture
         ({"seed": "7"}, "seed is '7'; expected a whole number"),
         ({"seed": 100_007}, "seed 100007 is of the sealed test.*memobench test-sealed"),
         ({"tasks": [31]}, "31"),
+        ({"speed": "0.5"}, "speed is '0.5'; expected 1, 0.5"),
+        ({"evidence": True}, "say referent=random"),
         ({"render": "best"}, "'best'"),
     ],
 )
