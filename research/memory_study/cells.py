@@ -120,23 +120,22 @@ class Cell:
     def training_words(self) -> list[str]:
         """Return the command that trains its policy."""
         row, data = self.grid.rows[self.row], Demonstrations(self.grid, self.suite, self.out).folder
-        words = ["lerobot", "train", *self.grid.training, *row.training]
         rate = self.tuned or chosen_rate(self.out, self.suite, self.row)
-        if self.tuned is not None:
-            words = [*(word for word in words if not word.startswith("steps=")), f"steps={self.grid.tuning.steps}"]
-        words += [] if rate is None else [f"policy.optimizer_lr={rate:g}"]
-        return [*words, f"dataset={data}", f"seed={self.seed}", f"output_dir={self.policy}"]
+        tuned = [] if rate is None else [f"policy.optimizer_lr={rate:g}"]
+        short = [] if self.tuned is None else [f"steps={self.grid.tuning.steps}"]
+        told = [*(row.policy or self.grid.policy), *self.grid.training, *row.training, *tuned, *short]
+        rest = [f"dataset={data}", f"seed={self.seed}", f"output_dir={self.policy}"]
+        return ["lerobot", "train", *_last_of_each(told), *rest]
 
     def evaluation_words(self, part: str) -> list[str]:
-        """Return the command that rolls its policy out; a later word takes the place of an earlier one of its name."""
+        """Return the command that rolls its policy out."""
         row = self.grid.rows[self.row]
         own = [] if part == ROLLOUTS else self.grid.controls[part]
         short = [] if self.tuned is None else [f"episodes={self.grid.tuning.episodes}"]
         told = [*self.grid.evaluation, *self.grid.suites[self.suite].evaluation, *row.evaluation, *own, *short]
-        words = {word.partition("=")[0]: word for word in told}
         return [
             *("lerobot", "eval", "env=memobench", f"policy={self.policy}"),
-            *words.values(),
+            *_last_of_each(told),
             f"output_dir={self.evaluation(part)}",
         ]
 
@@ -146,6 +145,11 @@ class Cell:
         return {
             name: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for name, told in found.items() if told
         }
+
+
+def _last_of_each(words: Sequence[str]) -> list[str]:
+    """Let a later word take the place of an earlier one of its name."""
+    return list({word.partition("=")[0]: word for word in words}.values())
 
 
 def ended(log: Path) -> bool:

@@ -26,12 +26,14 @@ class Row:
 
     Attributes:
         training: words of ``lerobot train``. evaluation: of ``lerobot eval env=memobench``.
+        policy: which policy is trained, in words of ``lerobot train``; none: the grid's.
         seeds: training seeds, the first so many numbers. controls: names of those that are run.
         privileged: whether it is given what the others are not, in training or in rollouts.
     """
 
-    training: list[str]
+    training: list[str] = field(default_factory=list)
     evaluation: list[str] = field(default_factory=list)
+    policy: list[str] = field(default_factory=list)
     seeds: int = 1
     controls: list[str] = field(default_factory=list)
     privileged: bool = False
@@ -49,6 +51,7 @@ class Tuning:
 class Grid:
     """All rows, suites and seeds, and what they share."""
 
+    policy: list[str]
     training: list[str]
     evaluation: list[str]
     suites: dict[str, Suite]

@@ -20,7 +20,8 @@ from research.memory_study.grid import Grid, chosen, read_grid
 from research.memory_study.tables import tables
 
 SMALL = """
-training: [policy=memobench_mem, size=small, perception=objects, steps=4]
+policy: [policy=memobench_mem, size=small, perception=objects]
+training: [steps=4]
 evaluation: [split=validation, episodes=2, videos=0]
 suites: {strict: {demonstrations: [--suite, strict], evaluation: [suite=strict]}}
 controls: {evidence: [evidence=true, episodes=12]}
@@ -113,7 +114,7 @@ def test_a_killed_cell_goes_on_where_it_was(grid: Grid, tmp_path: Path, monkeypa
 def test_a_learning_rate_is_chosen_once_and_then_used(grid: Grid, tmp_path: Path) -> None:
     tried = tuning(grid, tmp_path, chosen(grid, ["no memory"]))
     assert [cell.tuned for cell in tried] == [0.0005, 0.001, 0.002]
-    assert "steps=3000" in tried[0].training_words()
+    assert [word for word in tried[0].training_words() if word.startswith("steps=")] == ["steps=3000"]
     assert "episodes=3" in tried[0].evaluation_words(ROLLOUTS)
     for cell, success in zip(tried, (40.0, 50.0, 50.0), strict=True):
         folder = cell.evaluation(ROLLOUTS)
