@@ -2,8 +2,8 @@
 
 A difference pairs the same episodes, over all training seeds. Its interval is of a bootstrap that draws training seeds
 and, within each task, episodes: a difference that depends on how a training began is not a difference of arms. It is at
-least as wide as so few episodes allow (`statistics`). With few training seeds it is still too narrow, and the test
-holds for these trainings only; the table says how many there were.
+least as wide as so few episodes allow (`statistics`). With few training seeds it is still too narrow. The test of
+episodes holds for these trainings only, that of training seeds for trainings at large; the table has both.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import ttest_1samp
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Rate, Record, by_task, mean_rate, success_rate
@@ -38,6 +39,8 @@ class Contrast:
             arms (Holm).
         episodes: how many were paired.
         detectable: smallest true difference that so many episodes show with 80 % power at 5 %; None above 1.
+        of_seeds: the difference of each training seed.
+        p_of_seeds: of a paired t test over them, adjusted alike; None of one seed.
     """
 
     value: float
@@ -46,6 +49,8 @@ class Contrast:
     p: float
     episodes: int
     detectable: float | None
+    of_seeds: tuple[float, ...]
+    p_of_seeds: float | None
 
 
 def contrasts(arms: Mapping[str, Runs], reference: str) -> dict[str, Contrast]:
@@ -61,6 +66,7 @@ def contrasts(arms: Mapping[str, Runs], reference: str) -> dict[str, Contrast]:
     others = [name for name in arms if name != reference]
     gaps = {name: _table(arms[name], episodes, name) - base for name in others}
     p = holm([sign_flip(gap.mean(axis=0), weights, rng)[0] for gap in gaps.values()])
+    p_of_seeds = holm([_p_of_seeds(gap @ weights) for gap in gaps.values()])
     return {
         name: Contrast(
             float((gap @ weights).mean()),
@@ -68,9 +74,18 @@ def contrasts(arms: Mapping[str, Runs], reference: str) -> dict[str, Contrast]:
             adjusted,
             len(episodes),
             detectable(gap.mean(axis=0), weights),
+            tuple((gap @ weights).tolist()),
+            of_seeds if len(base) > 1 else None,
         )
-        for (name, gap), adjusted in zip(gaps.items(), p, strict=True)
+        for (name, gap), adjusted, of_seeds in zip(gaps.items(), p, p_of_seeds, strict=True)
     }
+
+
+def _p_of_seeds(differences: Array) -> float:
+    """Return the two-sided p of a paired t test; 1 of no difference at all, or of one seed."""
+    if len(differences) < 2 or not differences.any():
+        return 1.0
+    return float(ttest_1samp(differences, 0.0).pvalue)
 
 
 Key = tuple[str, int]
@@ -296,15 +311,20 @@ def contrasts_table(found: Mapping[str, Contrast], seeds: int, reference: str = 
             f"{name} less {reference}",
             str(one.episodes),
             *(f"{100 * one.value:+.1f}", f"{100 * one.low:+.1f} to {100 * one.high:+.1f}", _probability(one.p)),
+            ", ".join(f"{100 * each:+.0f}" for each in one.of_seeds),
+            _probability(one.p_of_seeds),
             "–" if one.detectable is None else f"{100 * one.detectable:.1f}",
         ]
         for name, one in found.items()
     ]
     trained = f"95 % interval, {seeds} training seed{'s' if seeds > 1 else ''}"
-    return markdown(("", "episodes", "difference, points", trained, "p (Holm)", "detectable"), rows)
+    tests = ("p of episodes (Holm)", "of training seeds", "p of training seeds (Holm)")
+    return markdown(("", "episodes", "difference, points", trained, *tests, "detectable"), rows)
 
 
-def _probability(p: float) -> str:
+def _probability(p: float | None) -> str:
+    if p is None:
+        return "–"
     return f"{p:.3f}" if p >= 0.001 else "< 0.001"
 
 

@@ -53,6 +53,8 @@ def test_a_difference_of_one_training_is_none_of_arms() -> None:
     assert found.value == pytest.approx(1 / 6)
     assert found.low == 0
     assert found.high > 0.3
+    assert found.of_seeds == pytest.approx((0.5, 0, 0))
+    assert found.p_of_seeds == pytest.approx(0.4226, abs=1e-4), "a paired t test: t = 1 with two degrees of freedom"
 
 
 @pytest.mark.parametrize("ends", [(0, 0), (1, 1), (0, 1), (1, 0)])
@@ -62,6 +64,7 @@ def test_two_rollouts_leave_much_open(ends: tuple[int, int]) -> None:
     (found,) = contrasts(arms, "a").values()
     assert found.value == ends[1] - ends[0]
     assert found.episodes == 2
+    assert found.p_of_seeds is None, "one training says nothing about others"
     assert found.high - found.low > 0.6
     assert -1 <= found.low <= found.value <= found.high <= 1
 
