@@ -18,6 +18,7 @@ from lerobot_memobench.jobs.executors import read_options, run_jobs
 from lerobot_memobench.jobs.processes import Advance, Job
 from research.command import run
 from research.memory_study.cells import Cell, Demonstrations, choose_rates, tuning
+from research.memory_study.figure import draw
 from research.memory_study.grid import chosen, read_grid
 from research.memory_study.tables import tables
 
@@ -38,7 +39,7 @@ def study(
     executor: Annotated[str, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")] = "processes",
     executor_option: Annotated[list[str] | None, typer.Option(help="key=value for datatrove's; repeatable.")] = None,
 ) -> None:
-    """Train and evaluate every cell that is not done, then print and keep the tables."""
+    """Train and evaluate every cell that is not done, then print and keep the tables and the figure."""
     read = read_grid(grid)
     places = chosen(read, only or [])
     if not places:
@@ -65,6 +66,7 @@ def study(
             say("; ".join(f"{suite}, {row}: learning rate {rate:g}" for (suite, row), rate in rates.items()))
     text = "\n\n".join(filter(None, (tables(read, out, suite) for suite in read.suites)))
     write_file(out / "study.md", text + "\n")
+    draw(read, out, out / "study.png")
     say(text)
 
 

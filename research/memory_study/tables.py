@@ -26,11 +26,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
 
     A row counts as soon as one of its training seeds has been evaluated; the table says how many have.
     """
-    cells = {
-        row: [cell for seed in range(told.seeds) if evaluated(cell := Cell(grid, out, suite, row, seed), ROLLOUTS)]
-        for row, told in grid.rows.items()
-    }
-    there = {row: own for row, own in cells.items() if own}
+    there = _evaluated_rows(grid, out, suite)
     if not there:
         return ""
     parts = [f"## {suite}", markdown(_header(), [_line(grid, row, own) for row, own in there.items()])]
@@ -39,6 +35,32 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
             parts.append(f"Less *{reference}*, by the training seeds that both have:")
             parts.append(_differences(there, reference))
     return "\n\n".join(parts)
+
+
+def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, Any]]:
+    """Return row -> SR ("solved") and rate of "follows" of each training seed, and the chance of it; per cent."""
+    found = {}
+    for row, cells in _evaluated_rows(grid, out, suite).items():
+        evidence = _evidence(cells)
+        found[row] = {
+            "solved": [_report(cell, ROLLOUTS)["average"]["SR"] for cell in cells],
+            "follows": [told["follows"] for told in evidence],
+            "chance": evidence[0]["chance"] if evidence else None,
+        }
+    return found
+
+
+def _evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
+    cells = {
+        row: [cell for seed in range(told.seeds) if evaluated(cell := Cell(grid, out, suite, row, seed), ROLLOUTS)]
+        for row, told in grid.rows.items()
+    }
+    return {row: own for row, own in cells.items() if own}
+
+
+def _evidence(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    reports = [_report(cell, EVIDENCE).get("evidence") for cell in cells if evaluated(cell, EVIDENCE)]
+    return [told["average"] for told in reports if told]
 
 
 def evaluated(cell: Cell, part: str) -> bool:
@@ -55,9 +77,8 @@ def _header() -> list[str]:
 
 def _line(grid: Grid, row: str, cells: Sequence[Cell]) -> list[str]:
     reports = [_report(cell, ROLLOUTS) for cell in cells]
-    evidence = [_report(cell, EVIDENCE).get("evidence") for cell in cells if evaluated(cell, EVIDENCE)]
+    follows = _evidence(cells)
     paused = [_report(cell, PAUSES) for cell in cells if evaluated(cell, PAUSES)]
-    follows = [told["average"] for told in evidence if told]
     return [
         row + (" (privileged)" if grid.rows[row].privileged else ""),
         str(len(cells)),

@@ -16,8 +16,9 @@ from research.learning import stages
 from research.learning.stages import Cost
 from research.memory_study.__main__ import GRID, planned
 from research.memory_study.cells import ROLLOUTS, Cell, Demonstrations, choose_rates, chosen_rate, tuning
+from research.memory_study.figure import draw
 from research.memory_study.grid import Grid, chosen, read_grid
-from research.memory_study.tables import tables
+from research.memory_study.tables import figures_of_rows, tables
 
 SMALL = """
 policy: [policy=memobench_mem, size=small, perception=objects]
@@ -137,3 +138,21 @@ def test_demonstrations_are_made_once_for_a_suite(grid: Grid, tmp_path: Path) ->
     assert not data.finished()
     assert f"dataset={data.folder}" in Cell(grid, tmp_path, "strict", "no memory", 0).training_words()
     assert tables(grid, tmp_path, "strict") == ""
+
+
+def test_the_figure_shows_what_is_evaluated(grid: Grid, tmp_path: Path) -> None:
+    path = tmp_path / "study.png"
+    assert draw(grid, tmp_path, path) is None
+    for row, seed, parts in (("no memory", 0, [ROLLOUTS]), ("frames, no time", 0, [ROLLOUTS, "evidence"])):
+        cell = Cell(grid, tmp_path, "strict", row, seed)
+        for part in parts:
+            cell.evaluation(part).mkdir(parents=True)
+            report = {"average": {"SR": 40.0}, "evidence": {"average": {"follows": 80.0, "chance": 50.0}}}
+            (cell.evaluation(part) / "report.json").write_text(json.dumps(report))
+            (cell.folder / f"{part}.json").write_text(json.dumps({"ended": True}))
+    assert figures_of_rows(grid, tmp_path, "strict") == {
+        "no memory": {"solved": [40.0], "follows": [], "chance": None},
+        "frames, no time": {"solved": [40.0], "follows": [80.0], "chance": 50.0},
+    }
+    assert draw(grid, tmp_path, path) == path
+    assert path.stat().st_size > 5_000
