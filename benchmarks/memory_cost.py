@@ -36,10 +36,10 @@ from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_names
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import CHOICES, MemoryMechanism, Query
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, attend_fused
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep, gathering
-from lerobot_memobench.policies.memobench_mem.training import keep_freed_memory
+from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory
 from lerobot_memobench.protocol import CONTROL_HZ, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE
 
@@ -140,7 +140,10 @@ def updater(settings: MemobenchMemConfig, steps: int) -> Callable[[], None]:
     cache: Any = Recorded(steps, settings.memory_stride or 1)
     looked_up = GatherMemoryProcessorStep(cache=cache, **gathering(settings)).gather(cache, moments.flatten().tolist())
     actions = {ACTION: torch.rand(rows, settings.chunk_size, 7)}
-    return updates(MemobenchMemPolicy(settings), observed(settings, rows) | actions | looked_up)
+    policy = MemobenchMemPolicy(settings)
+    if policy.attends_fused:
+        attend_fused(policy.model)  # as training does
+    return updates(policy, observed(settings, rows) | actions | looked_up)
 
 
 def observed(settings: MemobenchMemConfig, rows: int) -> dict[str, Tensor]:

@@ -28,7 +28,7 @@ from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
-from lerobot_memobench.policies.memobench_mem.training import keep_freed_memory
+from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 
 REMEMBERED, THINGS = 50, 10

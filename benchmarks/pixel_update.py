@@ -25,7 +25,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import attend_fused
-from lerobot_memobench.policies.memobench_mem.training import keep_freed_memory
+from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory
 
 SLOTS = 50
 """Remembered frames of an episode: its prompt, and an execution of 250 steps."""

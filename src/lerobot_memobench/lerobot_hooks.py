@@ -146,7 +146,7 @@ ATTEND = Hook(
     "transformers.models.gemma.modeling_gemma",
     "eager_attention_forward",
     ("module", "query", "key", "value", "attention_mask", "scaling"),
-    "compute attention in one kernel where a policy with a visual encoder learns",
+    "compute attention in one kernel where a policy with a long prefix learns",
     "LeRobot's pi0.5 calls this function by its name, whatever `attn_implementation` says",
     caller="lerobot.policies.pi05.modeling_pi05",
     package="transformers",

@@ -15,10 +15,10 @@ from torch import Tensor
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS, Query
-from lerobot_memobench.policies.memobench_mem.memory.subgoal import NarrowChannel
+from lerobot_memobench.policies.memobench_mem.memory.subgoal import SCORES, NarrowChannel
 from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.network import MARK, MemoryPI05, attend_fused
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
 from tests.support.memory import histories
@@ -151,6 +151,41 @@ def test_gradients_flow_through_the_text_alone(model: MemoryPI05) -> None:
     loss.sum().backward()
     assert history.grad is not None
     assert history.grad[:1].any()
+
+
+def test_a_training_leaves_out_what_nobody_reads(model: MemoryPI05, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loss, scores and gradients are those of a pass that makes every last state; a rollout makes every one."""
+    model.train()
+    channel, made = channel_of(model), list[int]()
+    last: Any = model.paligemma_with_expert.paligemma.model.language_model.layers[-1]
+    last.mlp.register_forward_pre_hook(lambda _, inputs: made.append(inputs[0].shape[1]))
+    actions, inputs = torch.randn(B, CHUNK, model.config.max_action_dim), inputs_of(model)
+
+    def learned() -> list[Tensor | None]:
+        model.zero_grad()
+        history = remember(model, subgoal=[0, 2], learns=True)
+        losses = passed(model, inputs, actions)
+        scores = channel.outputs()[SCORES]
+        (losses.mean() + torch.nn.functional.cross_entropy(scores, torch.tensor([0, 2]))).backward()
+        return [losses, scores, history.grad, *(parameter.grad for parameter in model.parameters())]
+
+    narrowed = learned()
+    attend_fused(model)
+    fused = learned()
+    with monkeypatch.context() as patched:
+        patched.setattr(channel, "_skipped", lambda: 0)
+        for layer in model.modules():
+            vars(layer).pop(MARK, None)
+        whole = learned()
+    for found in (narrowed, fused):
+        for ours, all_made in zip(found, whole, strict=True):
+            torch.testing.assert_close(ours, all_made, rtol=1e-4, atol=1e-5)
+    read = 1 + channel._length - channel._unread  # what asks, the text and the state's copy
+    assert made == [read, read, channel._length]
+    remember(model)
+    made.clear()
+    planned(model, inputs)
+    assert made == [channel._unread, channel._length]
 
 
 def test_both_paths_are_the_same(model: MemoryPI05) -> None:

@@ -29,6 +29,10 @@ Suffix = tuple[Tensor, Tensor, Tensor, Tensor]
 """The same of the action expert's tokens (B, T, W), and the condition (B, W) of its norms."""
 
 
+UNREAD = "unread"
+"""Attribute of attention modules that learn in one kernel: of how many of the first tokens nobody reads the result."""
+
+
 class MemoryFusion(ABC):
     """A way by which actions read memory tokens; made once for a model, to which it may add parameters.
 

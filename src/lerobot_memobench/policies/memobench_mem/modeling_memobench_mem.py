@@ -63,6 +63,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 )
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision, attend_fused
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
+from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory, quick_gradients, quick_products
 from lerobot_memobench.policies.memobench_mem.reads import ChunkReads, chunk_reads
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, begin_training
@@ -73,13 +74,10 @@ from lerobot_memobench.policies.memobench_mem.training import (
     WeightAverage,
     counted_actions,
     is_first_rank,
-    keep_freed_memory,
     losses_of,
     mean_losses,
     means_over_ranks,
     noise_and_time,
-    quick_gradients,
-    quick_products,
 )
 from lerobot_memobench.protocol import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
@@ -218,11 +216,17 @@ class MemobenchMemPolicy(PI05Policy):
         cache = open_frames(Path(meta.root), self.config, self.perception)
         self.run = TrainingRun(self.config, cache, meta)
         begin_training(self.run)
-        if self.config.uses_visual_encoder or (self.model.fusion is not None and self.model.fusion.attends_fused):
+        if self.attends_fused:
             attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()
         prepare_shards(self)
+
+    @property
+    def attends_fused(self) -> bool:
+        """Whether it learns with attention in one kernel."""
+        fusion = self.model.fusion
+        return self.config.uses_visual_encoder or (fusion is not None and fusion.attends_fused)
 
     @property
     def averages(self) -> bool:

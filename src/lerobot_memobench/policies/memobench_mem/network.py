@@ -14,6 +14,7 @@ from copy import deepcopy
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from einops import rearrange, repeat
 from lerobot.policies.pi05.modeling_pi05 import GemmaConfig, PaliGemmaWithExpertModel, PI05Pytorch
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
@@ -34,11 +35,12 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     VisualTokenEncoder,
     seed_parameters,
 )
-from lerobot_memobench.policies.memobench_mem.fusion import Context, MemoryFusion, Modulation, Prefix, Suffix
+from lerobot_memobench.policies.memobench_mem.fusion import UNREAD, Context, MemoryFusion, Modulation, Prefix, Suffix
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
 from lerobot_memobench.policies.memobench_mem.motion_fields import motion_field
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
+from lerobot_memobench.policies.memobench_mem.products import exact_gradients, exact_products
 from lerobot_memobench.sim.object_slots import classes
 
 FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
@@ -330,7 +332,8 @@ def attend_fused(model: nn.Module) -> None:
     LeRobot's pi0.5 attends by Hugging Face's ``eager_attention_forward``, called by its name, whatever
     ``attn_implementation`` says. It keeps a weight for each pair of tokens: of 72 samples with two pictures 56 MB in a
     layer, which come from the system page by page. torch's kernel keeps none, and an update of such a policy takes 1.1
-    instead of 2.0 s on one core. It rounds otherwise, so rollouts go on with LeRobot's.
+    instead of 2.0 s on one core. It rounds otherwise, so rollouts go on with LeRobot's. Its products are exact: rounding
+    to bfloat16, which makes large ones quicker, makes its many small ones several times slower.
     """
     for module in model.modules():
         if isinstance(module, modeling_gemma.GemmaAttention):
@@ -349,7 +352,12 @@ def _fused(attend: Callable[..., Any]) -> Callable[..., Any]:
             weighed: tuple[Tensor, Tensor] = attend(module, query, key, value, mask, scaling, **more)
             return weighed
         key, value = (modeling_gemma.repeat_kv(kept, module.num_key_value_groups) for kept in (key, value))
-        read = scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=scaling)
-        return read.transpose(1, 2).contiguous(), None
+        unread = getattr(module, UNREAD, 0)
+        query, mask = query[:, :, unread:], None if mask is None else mask[:, :, unread:]
+        with exact_products():
+            read = scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=scaling)
+        exact_gradients(read)
+        read = read.transpose(1, 2)
+        return F.pad(read, (0, 0, 0, 0, unread, 0)) if unread else read.contiguous(), None
 
     return attention

@@ -1,4 +1,4 @@
-"""Parts of training: the actions' loss, ranks of a distributed run, the weights' average, the curve, speed on a CPU.
+"""Parts of training: the actions' loss, ranks of a distributed run, the weights' average, and the curve.
 
 Actions are learned by flow matching, as in pi0.5, or by regression, through the same passes of the same model. Flow
 matching learns the velocity ``noise - actions`` at every time between the two, and a chunk follows it from drawn noise.
@@ -11,11 +11,9 @@ made for that average: it is then the gradient of the joint batch. Every rank mu
 
 from __future__ import annotations
 
-import ctypes
 import json
-import platform
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
@@ -387,70 +385,3 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, str]]:
         of = rest if first in STYLES else name
         looks[name] = {"linestyle": STYLES.get(first, "-"), "color": colours.setdefault(of, f"C{len(colours)}")}
     return looks
-
-
-# -- speed on a CPU --------------------------------------------------------------------------------------------------
-
-
-def quicker_in_bfloat16() -> bool:
-    """Return whether this CPU is quicker by instructions for products in bfloat16; not where torch cannot tell.
-
-    It follows from the instructions and from no stopwatch: the same machine learns the same, however busy it is.
-    By ``avx512_bf16`` an AMD EPYC made twice as many products a second as in float32; an Intel Xeon without AMX, which
-    alone has ``avx512_fp16`` beside it, no more.
-    """
-    # LeRobot takes torch from 2.7 on, which could not be asked yet.
-    known: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()
-    return known.get("amx_bf16", False) or (known.get("avx512_bf16", False) and not known.get("avx512_fp16", False))
-
-
-@contextmanager
-def quick_products() -> Iterator[None]:
-    """While this lasts, round the factors of products to bfloat16, if that is quicker on this CPU.
-
-    Weights, gradients, sums and all that is no product stay float32. Attention in one kernel, whose many small
-    products suffer, is left out, and a policy that learns by it (`network.attend_fused`) does without. The setting is
-    torch's and the process's, so it is on within a pass only, forward or backward.
-    """
-    if not quicker_in_bfloat16():
-        yield
-        return
-    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # torch sets it late
-    before = products.fp32_precision, torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
-    products.fp32_precision = "bf16"
-    torch.backends.cuda.enable_flash_sdp(False)
-    try:
-        yield
-    finally:
-        products.fp32_precision, fused = before
-        torch.backends.cuda.enable_flash_sdp(fused)
-
-
-def quick_gradients(loss: Tensor) -> None:
-    """Let a loss's backward pass be computed with `quick_products`."""
-
-    def begin(_: Tensor) -> None:
-        passing = ExitStack()
-        passing.enter_context(quick_products())
-        torch.autograd.Variable._execution_engine.queue_callback(passing.close)  # when the pass has ended
-
-    if loss.requires_grad:
-        loss.register_hook(begin)
-
-
-_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # of glibc's malloc.h
-_LARGEST = 32 << 20
-"""What glibc allows at most of what it does not map one by one, bytes."""
-
-
-def keep_freed_memory() -> None:
-    """Let this process's malloc hold on to what is freed; nothing where the C library is not glibc.
-
-    Else it goes back to the system and comes anew, page by page. A small policy's update frees and takes some hundred
-    MB; without the pages' faults it took 16 % less.
-    """
-    if platform.libc_ver()[0] != "glibc":
-        return
-    libc = ctypes.CDLL(None)
-    for parameter, value in ((_MMAP_THRESHOLD, _LARGEST), (_TRIM_THRESHOLD, 2**31 - 1), (_TOP_PAD, 8 * _LARGEST)):
-        libc.mallopt(parameter, value)

@@ -12,13 +12,14 @@ width of memory tokens, L memory tokens of a row.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
+
+from lerobot_memobench.policies.memobench_mem.products import exact_products
 
 MEMORY_GRID = 4
 """A remembered picture is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
@@ -233,7 +234,7 @@ class MemoryMechanism(nn.Module, ABC):
         """Return the states of B samples, each after the last frame of its history."""
         count = (histories.places >= 0).sum(dim=1)
         begin = (count - self.gradient_frames).clamp(min=0)
-        with torch.no_grad(), _exact_products():
+        with torch.no_grad(), exact_products():
             state = self._before(histories, begin, query)
         if not self.gradient_frames:
             return state
@@ -316,23 +317,6 @@ class MemoryMechanism(nn.Module, ABC):
             batch: the training batch, and what its fusion made beside actions (`MemoryFusion.outputs`).
         """
         return {}
-
-
-@contextmanager
-def _exact_products() -> Iterator[None]:
-    """While this lasts, products are those of a rollout, whatever training rounds them to on a CPU.
-
-    A memory that chooses by comparing then chooses the same; and products as small as these are a quarter quicker.
-    """
-    products: Any = getattr(torch.backends.mkldnn, "matmul", None)  # torch has had it since 2.9
-    if products is None or products.fp32_precision != "bf16":
-        yield
-        return
-    products.fp32_precision = "ieee"
-    try:
-        yield
-    finally:
-        products.fp32_precision = "bf16"
 
 
 def _rows(state: dict[str, Tensor], chosen: Any) -> dict[str, Tensor]:

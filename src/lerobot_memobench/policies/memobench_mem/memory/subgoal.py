@@ -17,7 +17,7 @@ from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attenti
 from lerobot.utils.constants import OPENPI_ATTENTION_MASK_VALUE
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix, hooked
+from lerobot_memobench.policies.memobench_mem.fusion import UNREAD, MemoryFusion, Prefix, hooked
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
@@ -77,6 +77,23 @@ class NarrowChannel(MemoryFusion):
         self._scores: Tensor | None = None
         self._unread = self._length = 0  # of the prefix: what actions do not read, and all of it; 0: it is not made yet
         self._copies_state = False
+        language: Any = model.paligemma_with_expert.paligemma.model.language_model
+        last = language.layers[-1]
+        self._attention = last.self_attn
+        for part in (last.self_attn.q_proj, last.self_attn.o_proj, last.post_attention_layernorm, language.norm):
+            part.register_forward_pre_hook(self._those_read)
+        for part in (last.self_attn.q_proj, last.self_attn.o_proj, last.mlp):
+            part.register_forward_hook(self._padded)
+
+    def _skipped(self) -> int:
+        """Return of how many of the prefix's first tokens a training's pass makes no last state: none reads them."""
+        return self._unread - 1 if self._length and torch.is_grad_enabled() else 0
+
+    def _those_read(self, part: nn.Module, inputs: tuple[Tensor]) -> Tensor:
+        return inputs[0][:, self._skipped() :]
+
+    def _padded(self, part: nn.Module, inputs: Any, outputs: Tensor) -> Tensor:
+        return F.pad(outputs, (0, 0, self._skipped(), 0))
 
     def hand_over(self, memory: MemoryTokens) -> None:
         """Keep this memory, and what may be said, for the next prefix."""
@@ -110,6 +127,7 @@ class NarrowChannel(MemoryFusion):
         behind = torch.ones(own.shape[:2], dtype=torch.bool, device=real.device)
         embeddings = torch.cat([embeddings, text.to(dtype), own], dim=1)
         self._length = embeddings.shape[1]
+        setattr(self._attention, UNREAD, self._unread - 1)
         return embeddings, torch.cat([real, of_text, behind], dim=1), torch.cat([blocks, begins, behind], dim=1)
 
     @torch.no_grad()
@@ -144,7 +162,7 @@ class NarrowChannel(MemoryFusion):
         assert memory is not None
         assert memory.query is not None
         assert memory.query.choices is not None
-        asked = states[:, self._unread - 1 if self._length else -1]
+        asked = states[:, self._unread - self._length - 1 if self._length else -1]
         self._scores = scored(added.score(asked.to(added.score.weight.dtype)), memory.query.choices)
 
     @contextmanager
