@@ -332,8 +332,8 @@ def attend_fused(model: nn.Module) -> None:
     LeRobot's pi0.5 attends by Hugging Face's ``eager_attention_forward``, called by its name, whatever
     ``attn_implementation`` says. It keeps a weight for each pair of tokens: of 72 samples with two pictures 56 MB in a
     layer, which come from the system page by page. torch's kernel keeps none, and an update of such a policy takes 1.1
-    instead of 2.0 s on one core. It rounds otherwise, so rollouts go on with LeRobot's. Its products are exact: rounding
-    to bfloat16, which makes large ones quicker, makes its many small ones several times slower.
+    instead of 2.0 s on one core. It rounds otherwise, so rollouts go on with LeRobot's. Its products are exact:
+    rounding to bfloat16, which makes large ones quicker, makes its many small ones several times slower.
     """
     for module in model.modules():
         if isinstance(module, modeling_gemma.GemmaAttention):
