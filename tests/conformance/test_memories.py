@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from lerobot_memobench.conformance.checks import Outcome, run_checks
+from lerobot_memobench.conformance.streams import TASK, task_of_texts
 from lerobot_memobench.conformance.subject import Subject, load_subject
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import OURS, mechanism_names
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.tasks.catalogue import get_task
 
 
 def test_a_memory_of_another_package_is_built_and_goes_through_an_episode(traces: None) -> None:
@@ -25,6 +27,17 @@ def test_a_memory_of_another_package_is_built_and_goes_through_an_episode(traces
         tokens = torch.randn(2, memory.spec.tokens, memory.spec.dim)
         state = memory.write(state, tokens, torch.tensor([step, step]))
     assert memory.read(state).rows().shape == (2, 4 * memory.spec.tokens, memory.spec.width)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_a_trained_memory_is_shown_a_task_whose_checkpoints_it_can_say(level: int) -> None:
+    """Else the dataset that is made for it is one that it would refuse to learn from."""
+    known = {}
+    for name in ("put_the_butter_into_the_bowl_from_the_prompt_video", "check_all_three_drawers_of_the_cabinet"):
+        task = get_task(name)
+        known[task.language] = [checkpoint.language[level] for checkpoint in task.checkpoints]
+    assert task_of_texts(known) == "put_the_butter_into_the_bowl_from_the_prompt_video", "it has a prompt"
+    assert task_of_texts({"another": ["text"]}) == task_of_texts({}) == TASK
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
-from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.task import Task
 
 TASK = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"
 """It has three checkpoints, among which a memory that is privileged in training can choose."""
@@ -27,18 +28,40 @@ THINGS = 4
 """Objects of the made-up scenes."""
 
 
-def write_streams(folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES) -> Path:
+def write_streams(folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK) -> Path:
     """Write a dataset of three short episodes: real columns and shapes, made-up pictures, states and objects.
 
     Args:
-        frames: of each execution.
+        frames: of each execution. task: whose instruction and checkpoints they have.
     """
-    return write_dataset((_episode(seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS)), folder)
+    return write_dataset(
+        (_episode(get_task(task), seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS)), folder
+    )
 
 
-def _episode(seed: int, prompt: int, pictures: bool, frames: int) -> Demonstration:
+def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
+    """Return a task of the catalogue whose checkpoints a memory can say, best one with a prompt and many of them.
+
+    Args:
+        subgoals: instruction -> texts, of a memory that is privileged in training. Of none that is known: `TASK`.
+    """
+    known = {text for own in subgoals.values() for text in own}
+    found = [
+        task
+        for task in map(get_task, task_names(suite=None))
+        if task.language in subgoals and any(known.issuperset(texts) for texts in _texts_of_levels(task))
+    ]
+    best = max(found, key=lambda task: (task.prompt is not None, len(task.checkpoints)), default=None)
+    return TASK if best is None else best.name
+
+
+def _texts_of_levels(task: Task) -> Iterator[tuple[str, ...]]:
+    return zip(*(checkpoint.language for checkpoint in task.checkpoints), strict=True)
+
+
+def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) -> Demonstration:
     """An episode in which an arm and some things move smoothly, by numbers that the seed decides."""
-    task, rng, length = get_task(TASK), np.random.default_rng(seed), prompt + frames
+    rng, length = np.random.default_rng(seed), prompt + frames
     count = len(task.checkpoints)
     completed = prompt + frames * np.arange(1, count + 1) // (count + 1)
     times = np.arange(length)[:, None] / 2

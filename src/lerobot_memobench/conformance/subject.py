@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, write_streams
+from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import check_clock, objects_column
 from lerobot_memobench.envs.command_line import quiet
@@ -141,7 +141,9 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
         if key.partition(".")[0] not in KEYS and key not in short:
             raise MemobenchError(f"memobench conformance has no setting {key!r}, {nearest(key, [*KEYS, *short])}")
     if given.value("dataset") is None:
-        given = type(given)([*given.pairs, ("dataset", str(write_streams(folder / "streams")))], given.flags)
+        known = getattr(policy_config(read_arguments("train", given)), "subgoals", None)
+        made = write_streams(folder / "streams", task=task_of_texts(known or {}))
+        given = type(given)([*given.pairs, ("dataset", str(made))], given.flags)
     arguments = read_arguments("train", given)
     if not torch.cuda.is_available():
         arguments = arguments.default("policy.device", "cpu")
