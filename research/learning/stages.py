@@ -65,18 +65,44 @@ def run_once(
     if kept.is_file():
         told = read_json(kept, dict[str, object], "remove it, and the command is run again")
         if told.get("words") != list(words):
-            raise MemobenchError(f"{kept} is of another command; name another --out, or remove the file")
+            raise MemobenchError(
+                f"{kept} is of another command; name another --out, or remove the file and what the command has made"
+            )
         spent = Cost(float(str(told["wall_s"])), float(str(told["cpu_s"])))
         if told["ended"]:
             return spent
     log.parent.mkdir(parents=True, exist_ok=True)
+    _keep(kept, words, False, spent)  # so that what is killed is gone on with by the same command alone
     status, took = _run(going_on or [*words, *how], log, sharing(beside))
-    spent, ended = spent + took, status in accept
-    write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent)}, indent=1))
-    if not ended:
+    well = status in accept
+    _keep(kept, words, well, spent + took)
+    if not well:
         *_, last = log.read_text(errors="replace").rstrip().splitlines() or [""]
         raise MemobenchError(f"`{' '.join(words)}` ended with status {status} ({last[:400]}); see {log}")
-    return spent
+    return spent + took
+
+
+def _keep(kept: Path, words: Sequence[str], ended: bool, spent: Cost) -> None:
+    write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent)}, indent=1))
+
+
+def told_of(log: Path) -> dict[str, object]:
+    """Return what is kept of the command of a log; {} where it has not been begun."""
+    try:
+        return read_json(log.with_suffix(".json"), dict[str, object], "remove it, and the command is run again")
+    except FileNotFoundError:
+        return {}
+
+
+def ended(log: Path) -> bool:
+    """Return whether the command of a log has ended well."""
+    return bool(told_of(log).get("ended"))
+
+
+def remove_unfinished(policy: Path, log: Path) -> None:
+    """Remove the folder of a training that was ended before its first checkpoint: nothing can go on with it."""
+    if not ended(log):
+        shutil.rmtree(policy, ignore_errors=True)
 
 
 def _run(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> tuple[int, Cost]:
@@ -176,8 +202,8 @@ class Stages:
         begun = self.checkpoint(arm, seed) / "train_config.json"
         going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
         log = self.log("training", arm, seed)
-        if going_on is None and not log.with_suffix(".json").is_file():
-            shutil.rmtree(folder, ignore_errors=True)  # of an attempt that was killed before its first checkpoint
+        if going_on is None:
+            remove_unfinished(folder, log)
         return run_once(self.training_words(arm, seed), log, beside=self.workers, going_on=going_on)
 
     def evaluate(self, arm: str, seed: int) -> Cost:

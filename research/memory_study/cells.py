@@ -6,14 +6,13 @@ Whatever kills a cell, the same call goes on with it: a training from its last c
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, write_file
-from research.learning.stages import Cost, run_once
+from research.learning.stages import Cost, ended, remove_unfinished, run_once, told_of
 from research.memory_study.grid import Grid, folder_name
 
 ROLLOUTS = "rollouts"
@@ -103,8 +102,8 @@ class Cell:
         begun = self.policy / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
         going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
         log = self.folder / "training.log"
-        if going_on is None and not log.with_suffix(".json").is_file():
-            shutil.rmtree(self.policy, ignore_errors=True)  # of an attempt that was killed before its first checkpoint
+        if going_on is None:
+            remove_unfinished(self.policy, log)
         run_once(self.training_words(), log, going_on=going_on)
         for part in self.parts:
             run_once(self.evaluation_words(part), self.folder / f"{part}.log", how=["resume=true"])
@@ -141,7 +140,7 @@ class Cell:
 
     def costs(self) -> dict[str, Cost]:
         """Return what each part has taken so far."""
-        found = {name: _told(self.folder / f"{name}.log") for name in ("training", *self.parts)}
+        found = {name: told_of(self.folder / f"{name}.log") for name in ("training", *self.parts)}
         return {
             name: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for name, told in found.items() if told
         }
@@ -150,18 +149,6 @@ class Cell:
 def _last_of_each(words: Sequence[str]) -> list[str]:
     """Let a later word take the place of an earlier one of its name."""
     return list({word.partition("=")[0]: word for word in words}.values())
-
-
-def ended(log: Path) -> bool:
-    """Return whether the command of a log has ended well."""
-    return bool(_told(log).get("ended"))
-
-
-def _told(log: Path) -> dict[str, object]:
-    try:
-        return read_json(log.with_suffix(".json"), dict[str, object], "remove it, and the command is run again")
-    except FileNotFoundError:
-        return {}
 
 
 # -- learning rates ---------------------------------------------------------------------------------------------------

@@ -61,12 +61,16 @@ class Grid:
     tuning: Tuning = field(default_factory=Tuning)
 
     def __post_init__(self) -> None:
+        if not self.rows or not self.suites:
+            raise MemobenchError("a study needs rows and suites, and has none; name some in its file")
         for name, row in self.rows.items():
             for control in row.controls:
                 if control not in self.controls:
                     raise MemobenchError(
                         f"row {name!r} names the control {control!r}; {nearest(control, self.controls)}"
                     )
+            if row.seeds < 1:
+                raise MemobenchError(f"row {name!r} has seeds: {row.seeds}; expected how many trainings, at least 1")
         folders = [folder_name(name) for name in self.rows]
         if len({*folders}) < len(folders):
             raise MemobenchError(f"two of the rows {', '.join(self.rows)} have one folder; rename one")

@@ -12,7 +12,8 @@ from lerobot_memobench.evaluation.records import read_rollouts
 from lerobot_memobench.io import read_json
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.learning.results import contrasts, contrasts_table, markdown
-from research.memory_study.cells import ROLLOUTS, Cell, ended
+from research.learning.stages import ended
+from research.memory_study.cells import ROLLOUTS, Cell
 from research.memory_study.grid import Grid
 
 REFERENCES = ("no memory", "clock only")
@@ -58,9 +59,11 @@ def _evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
     return {row: own for row, own in cells.items() if own}
 
 
-def _evidence(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+def _evidence(cells: Sequence[Cell]) -> list[dict[str, float]]:
+    """Return "follows" and "chance" of each training seed, per cent; [] where no task tells a chance."""
     reports = [_report(cell, EVIDENCE).get("evidence") for cell in cells if evaluated(cell, EVIDENCE)]
-    return [told["average"] for told in reports if told]
+    averages = [told["average"] for told in reports if told and told["average"]]
+    return [{"follows": one["follows"]["percent"], "chance": one["chance"]} for one in averages]
 
 
 def evaluated(cell: Cell, part: str) -> bool:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.run.arguments import read_arguments, split_arguments
 from lerobot_memobench.run.plan import take_run_options
@@ -19,6 +22,7 @@ from research.memory_study.cells import ROLLOUTS, Cell, Demonstrations, choose_r
 from research.memory_study.figure import draw
 from research.memory_study.grid import Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
+from tests.support.logs import rollout
 
 SMALL = """
 policy: [policy=memobench_mem, size=small, perception=objects]
@@ -63,6 +67,8 @@ def test_the_study_has_every_mechanism_and_its_commands_are_understood(tmp_path:
         ("controls: [evidence]", "controls: [evidenec]", "'evidenec'; did you mean 'evidence'"),
         ("rows:", "row:", "no study's file"),
         ("frames, no time", "no_memory", "have one folder"),
+        ("seeds: 2", "seeds: 0", "'no memory' has seeds: 0"),
+        ("suites: {", "suites: {}\nnone: {", "needs rows and suites|no study's file"),
     ],
 )
 def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, old: str, new: str, told: str) -> None:
@@ -140,19 +146,76 @@ def test_demonstrations_are_made_once_for_a_suite(grid: Grid, tmp_path: Path) ->
     assert tables(grid, tmp_path, "strict") == ""
 
 
-def test_the_figure_shows_what_is_evaluated(grid: Grid, tmp_path: Path) -> None:
+def test_an_interrupted_training_is_gone_on_with_by_its_own_command_alone(
+    grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = Cell(grid, tmp_path, "strict", "frames, no time", 0)
+
+    def interrupted(words: list[str], log: Path, environment: object) -> tuple[int, Cost]:
+        kept = cell.policy / "checkpoints" / "last" / "pretrained_model"
+        kept.mkdir(parents=True)
+        (kept / "train_config.json").write_text("{}")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stages, "_run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        cell.run()
+    (tmp_path / "grid.yaml").write_text(SMALL.replace("steps=4", "steps=8"))
+    with pytest.raises(MemobenchError, match="is of another command"):
+        Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "frames, no time", 0).run()
+
+
+def test_a_training_that_failed_before_its_first_checkpoint_begins_anew(
+    grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
+
+    def failing(words: list[str], log: Path, environment: object) -> tuple[int, Cost]:
+        cell.policy.mkdir(parents=True)  # as LeRobot makes it, which refuses one that is there
+        log.write_text("out of memory")
+        return 1, Cost(1.0, 1.0)
+
+    monkeypatch.setattr(stages, "_run", failing)
+    for _ in range(2):
+        with pytest.raises(MemobenchError, match="out of memory"):
+            cell.run()
+
+
+def test_tables_and_figure_show_what_is_evaluated(grid: Grid, tmp_path: Path) -> None:
     path = tmp_path / "study.png"
     assert draw(grid, tmp_path, path) is None
-    for row, seed, parts in (("no memory", 0, [ROLLOUTS]), ("frames, no time", 0, [ROLLOUTS, "evidence"])):
-        cell = Cell(grid, tmp_path, "strict", row, seed)
+    for row, parts in (("no memory", [ROLLOUTS]), ("frames, no time", [ROLLOUTS, "evidence"])):
+        cell = Cell(grid, tmp_path, "strict", row, 0)
         for part in parts:
-            cell.evaluation(part).mkdir(parents=True)
-            report = {"average": {"SR": 40.0}, "evidence": {"average": {"follows": 80.0, "chance": 50.0}}}
-            (cell.evaluation(part) / "report.json").write_text(json.dumps(report))
+            episodes = [_rollout(episode, part == "evidence") for episode in range(10)]
+            write_episodes(cell.evaluation(part), episodes)
+            write_report(cell.evaluation(part))
             (cell.folder / f"{part}.json").write_text(json.dumps({"ended": True}))
     assert figures_of_rows(grid, tmp_path, "strict") == {
         "no memory": {"solved": [40.0], "follows": [], "chance": None},
         "frames, no time": {"solved": [40.0], "follows": [80.0], "chance": 50.0},
     }
+    told = tables(grid, tmp_path, "strict")
+    assert "| no memory | 1 |" in told
+    assert "| frames, no time | 1 |" in told
+    assert "80.0 (50.0)" in told
     assert draw(grid, tmp_path, path) == path
     assert path.stat().st_size > 5_000
+
+
+def _rollout(episode: int, evidence: bool) -> dict[str, Any]:
+    """Return one of ten rollouts: four succeed; in four of five scenes with two variants the choice is right."""
+    variant, right = episode % 2, episode < 8
+    told = {"seed": 7 + episode // 2, "variant": variant, "choice": variant if right else None} if evidence else {}
+    told |= {"variants": 2, "chance": 0.5} if evidence else {}
+    return rollout("bowl", "object", "SC", [True, True], episode < 4, episode, **told)
+
+
+def test_evidence_without_a_chance_is_in_no_table(grid: Grid, tmp_path: Path) -> None:
+    cell = Cell(grid, tmp_path, "strict", "frames, no time", 0)
+    for part in (ROLLOUTS, "evidence"):
+        write_episodes(cell.evaluation(part), [{**_rollout(k, part == "evidence"), "chance": None} for k in range(10)])
+        write_report(cell.evaluation(part))
+        (cell.folder / f"{part}.json").write_text(json.dumps({"ended": True}))
+    assert figures_of_rows(grid, tmp_path, "strict")["frames, no time"]["follows"] == []
+    assert "frames, no time" in tables(grid, tmp_path, "strict")

@@ -32,6 +32,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
+from lerobot_memobench.policies.memobench_mem.memory.recurrent import Recurrent
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.motion_fields import MotionField
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
@@ -249,7 +250,10 @@ def test_what_the_configuration_names_is_there() -> None:
         ({"memory": "bnak"}, "no memory 'bnak'"),
         ({"memory_fusion": "own"}, "cannot be read"),
         ({"memory_settings": {"time_code": False}}, "'time_code', which is no setting of memory=frames"),
-        ({"memory_settings": {"time_codes": "perhaps"}}, "cannot be read"),
+        ({"memory_settings": {"time_codes": "perhaps"}}, "time_codes='perhaps' of memory=frames.*expected bool"),
+        ({"memory": "bank", "memory_settings": {"length": True}}, "length=True of memory=bank.*expected int"),
+        ({"memory": "bank", "memory_settings": {"length": None}}, "length=None of memory=bank.*expected int"),
+        ({"memory": "bank", "memory_settings": {"length": {"a": 1}}}, "expected int"),
         ({"memory_settings": {"time_codes": False, "content": False}}, "says nothing"),
     ],
 )
@@ -275,11 +279,30 @@ def test_a_package_that_brings_no_memory_is_named(monkeypatch: pytest.MonkeyPatc
     brought = [
         EntryPoint("gone", "no_such_package:Memory", memory.GROUP),
         EntryPoint("other", "pathlib:Path", memory.GROUP),
+        EntryPoint("twice", "one_package:Memory", memory.GROUP),
+        EntryPoint("twice", "another:Memory", memory.GROUP),
+        EntryPoint("unset", f"{__name__}:Unset", memory.GROUP),
+        EntryPoint("frames", "pathlib:Path", memory.GROUP),
     ]
     monkeypatch.setattr(memory, "entry_points", lambda group: brought if group == memory.GROUP else [])
-    for name, told in (("gone", "cannot be imported"), ("other", "no subclass of MemoryMechanism")):
+    for name, told in (
+        ("gone", "cannot be imported"),
+        ("other", "no subclass of MemoryMechanism"),
+        ("twice", r"several memories 'twice' \(another:Memory and one_package:Memory\)"),
+        ("unset", "Settings of the memory 'unset'.*are no dataclass"),
+    ):
         with pytest.raises(MemobenchError, match=told):
             find_mechanism(name)
+    told_of: list[str] = []
+    monkeypatch.setattr(memory.logger, "warning", lambda text, *of: told_of.append(text % of))
+    assert find_mechanism.__wrapped__("frames") is Frames
+    assert told_of == ["the memory 'frames' of a package (pathlib:Path) is not used: ours has this name"]
+
+
+class Unset(Frames):
+    """A mechanism of another package, whose settings are none."""
+
+    Settings = dict
 
 
 class Straight(Frames):
@@ -288,6 +311,21 @@ class Straight(Frames):
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:
         super().__init__(spec, pool, settings)
         self.position, self.project = nn.Linear(2, 2), nn.Linear(2, 2)
+
+
+class Sampled(Recurrent):
+    """A mechanism that is loaded frames spread evenly, and is gone through as if they were all."""
+
+    slots = classmethod(lambda cls, slot, frames: sample_frames(slot, frames))  # type: ignore[assignment]
+
+
+def test_frames_that_are_no_beginning_of_an_episodes_are_refused() -> None:
+    given = read_settings("recurrent", {"gradient_frames": 1})
+    built = Sampled(MemorySpec(4, 2, 32, 32, 3, 0, 1), nn.Identity(), given)
+    frames, steps = torch.randn(9, 2, 4), torch.arange(9)
+    assert built.replay(Histories(frames, steps, torch.tensor([[0, 1, 2], [0, 1, -1]]))).each.isfinite().all()
+    with pytest.raises(ValueError, match="slots of Sampled are not the beginning of one sequence"):
+        built.replay(Histories(frames, steps, torch.tensor([sample_frames(8, 3), sample_frames(3, 3)])))
 
 
 def test_only_what_frames_had_is_renamed_in_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,9 @@ from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointText
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MARK, MemoryPI05, attend_fused
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
+from lerobot_memobench.policies.memobench_mem.subgoals import choices
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
+from lerobot_memobench.tasks.memory_text import with_memory
 from tests.support.memory import histories
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, losses_in_training, made_for_training
@@ -43,6 +45,13 @@ def model(request: pytest.FixtureRequest) -> MemoryPI05:
         for parameter in made.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))  # some of pi0.5's start at zero and hide errors
     return made.eval()
+
+
+def test_oracle_memory_behind_an_instruction_changes_no_choice() -> None:
+    """In a rollout the environment writes it there; in training it comes later."""
+    told = [with_memory(task, memory) for task, memory in zip(OF_TASKS, ("", "opened it"), strict=True)]
+    assert torch.equal(choices(OF_TASKS, told), choices(OF_TASKS, [*OF_TASKS]))
+    assert not choices(OF_TASKS, told).all(dim=1).any()
 
 
 def inputs_of(model: MemoryPI05, seed: int = 1) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lerobot_memobench.datasets.feature_cache.frames import LEVEL_COLUMNS, read_frame_table
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.memory_text import MARK
 
 logger = logging.getLogger(__name__)
 
@@ -73,10 +74,11 @@ def choices(subgoals: dict[str, list[str]], tasks: str | Sequence[str]) -> Tenso
     """Return which of all texts each row's task has, (B, S) bool; all, where an instruction is unknown.
 
     Args:
-        subgoals: instruction -> texts of its checkpoints. tasks: the rows' instructions.
+        subgoals: instruction -> texts of its checkpoints. tasks: the rows' instructions, oracle memory text behind them
+            perhaps.
     """
     texts, rows = texts_of(subgoals), dict[str, list[bool]]()
-    tasks = [tasks] if isinstance(tasks, str) else tasks
+    tasks = [task.partition(MARK)[0] for task in ([tasks] if isinstance(tasks, str) else tasks)]
     for task in dict.fromkeys(tasks):
         own = subgoals.get(task)
         if own is None and task not in _told:

@@ -5,16 +5,19 @@ Another package brings one by an entry point: its name and class in the group ``
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, get_type_hints
 
 import draccus
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism
+
+logger = logging.getLogger(__name__)
 
 GROUP = "lerobot_memobench.memories"
 NONE = "none"
@@ -40,15 +43,21 @@ def find_mechanism(name: str) -> type[MemoryMechanism]:
     """Return a mechanism by its name.
 
     Raises:
-        MemobenchError: there is none, or the package that brings it is broken.
+        MemobenchError: there is none, several have this name, or the package that brings it is broken.
     """
+    found = [point for point in entry_points(group=GROUP) if point.name == name]
     if name in OURS:
+        for point in found:
+            logger.warning("the memory '%s' of a package (%s) is not used: ours has this name", name, point.value)
         found = [EntryPoint(name, f"{__name__}.{name}:{OURS[name]}", GROUP)]
-    else:
-        found = [point for point in entry_points(group=GROUP) if point.name == name]
     if not found:
         known = [NONE, *mechanism_names()]
         raise MemobenchError(f"There is no memory '{name}': {nearest(name, known)} Pass --policy.memory=<one of them>.")
+    if len({point.value for point in found}) > 1:
+        told = " and ".join(sorted(point.value for point in found))
+        raise MemobenchError(
+            f"There are several memories '{name}' ({told}); remove a package, or rename its entry point."
+        )
     try:
         made = found[0].load()
     except Exception as error:
@@ -61,6 +70,8 @@ def find_mechanism(name: str) -> type[MemoryMechanism]:
             f"The memory '{name}' ({found[0].value}) is no subclass of MemoryMechanism "
             "(lerobot_memobench.policies.memobench_mem.memory.mechanism)."
         )
+    if not is_dataclass(made.Settings):
+        raise MemobenchError(f"The Settings of the memory '{name}' ({found[0].value}) are no dataclass.")
     return made
 
 
@@ -86,9 +97,26 @@ def read_settings(name: str, given: Mapping[str, Any]) -> Any:
         if key not in known:
             told = nearest(key, known) if known else "it has none."
             raise MemobenchError(f"policy.memory_settings names '{key}', which is no setting of memory={name}; {told}")
+    settings = find_mechanism(name).Settings
+    for key, value in given.items():
+        _check_type(name, key, value, get_type_hints(settings)[key])
     try:
-        return draccus.decode(find_mechanism(name).Settings, dict(given))
+        return draccus.decode(settings, dict(given))
     except Exception as error:  # draccus answers by its own kinds of error
         raise MemobenchError(
             f"policy.memory_settings={dict(given)} of memory={name} cannot be read: {error.__cause__ or error}"
         ) from None
+
+
+def _check_type(name: str, key: str, value: Any, kind: Any) -> None:
+    """Refuse what draccus cannot read as this type, or takes for one: none, and a truth value for a number."""
+    try:
+        read = draccus.decode(kind, value)
+        fits = isinstance(read, bool) or not isinstance(value, bool)
+    except Exception:  # of whatever kind
+        fits = False
+    if not fits or (value is None and kind in (bool, int, float, str)):
+        expected = kind.__name__ if isinstance(kind, type) else kind
+        raise MemobenchError(
+            f"policy.memory_settings says {key}={value!r} of memory={name}, which cannot be read; expected {expected}"
+        )

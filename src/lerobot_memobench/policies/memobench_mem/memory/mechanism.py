@@ -261,6 +261,12 @@ class MemoryMechanism(nn.Module, ABC):
         latest[episode[ends]] = ends.nonzero().flatten()  # a sample of each episode, which asks the furthest
         order = until.argsort(descending=True, stable=True)
         samples, row_of = latest[order], order.argsort()[episode]
+        read = torch.arange(histories.places.shape[1], device=begin.device) < begin[:, None]
+        if ((histories.places != histories.places[latest[episode]]) & read).any():
+            raise ValueError(
+                f"slots of {type(self).__name__} are not the beginning of one sequence for all samples of an episode "
+                "that have the first in common; replay goes through that once, so write one of your own"
+            )
         stops: dict[int, list[int]] = {}
         for sample, stop in enumerate(begin.tolist()):
             stops.setdefault(stop, []).append(sample)
