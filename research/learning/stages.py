@@ -86,7 +86,7 @@ def _keep(kept: Path, words: Sequence[str], ended: bool, spent: Cost) -> None:
     write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent)}, indent=1))
 
 
-def told_of(log: Path) -> dict[str, object]:
+def kept_of(log: Path) -> dict[str, object]:
     """Return what is kept of the command of a log; {} where it has not been begun."""
     try:
         return read_json(log.with_suffix(".json"), dict[str, object], "remove it, and the command is run again")
@@ -96,7 +96,7 @@ def told_of(log: Path) -> dict[str, object]:
 
 def ended(log: Path) -> bool:
     """Return whether the command of a log has ended well."""
-    return bool(told_of(log).get("ended"))
+    return bool(kept_of(log).get("ended"))
 
 
 def remove_unfinished(policy: Path, log: Path) -> None:

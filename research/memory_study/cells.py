@@ -12,7 +12,7 @@ from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, write_file
-from research.learning.stages import Cost, ended, remove_unfinished, run_once, told_of
+from research.learning.stages import Cost, ended, kept_of, remove_unfinished, run_once
 from research.memory_study.grid import Grid, folder_name
 
 ROLLOUTS = "rollouts"
@@ -140,7 +140,7 @@ class Cell:
 
     def costs(self) -> dict[str, Cost]:
         """Return what each part has taken so far."""
-        found = {name: told_of(self.folder / f"{name}.log") for name in ("training", *self.parts)}
+        found = {name: kept_of(self.folder / f"{name}.log") for name in ("training", *self.parts)}
         return {
             name: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for name, told in found.items() if told
         }

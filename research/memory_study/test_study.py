@@ -206,8 +206,10 @@ def test_tables_and_figure_show_what_is_evaluated(grid: Grid, tmp_path: Path) ->
 def _rollout(episode: int, evidence: bool) -> dict[str, Any]:
     """Return one of ten rollouts: four succeed; in four of five scenes with two variants the choice is right."""
     variant, right = episode % 2, episode < 8
-    told = {"seed": 7 + episode // 2, "variant": variant, "choice": variant if right else None} if evidence else {}
-    told |= {"variants": 2, "chance": 0.5} if evidence else {}
+    told: dict[str, Any] = {}
+    if evidence:
+        told = {"seed": 7 + episode // 2, "variant": variant, "choice": variant if right else None}
+        told |= {"variants": 2, "chance": 0.5}
     return rollout("bowl", "object", "SC", [True, True], episode < 4, episode, **told)
 
 

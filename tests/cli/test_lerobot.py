@@ -18,15 +18,17 @@ import lerobot.scripts.lerobot_eval
 import lerobot.scripts.lerobot_train
 import numpy as np
 import pytest
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
+from lerobot_memobench.envs.command_line import overrides
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import (
     OPTIONS,
@@ -482,6 +484,27 @@ def test_other_settings_than_a_checkpoint_was_trained_with_are_told_of(
     assert note.endswith("memory_frames=4, memory_stride=2\n")
 
 
+def test_another_memory_than_a_checkpoints_has_its_own_defaults(training: Called) -> None:
+    """Of the checkpoint's it would take the stride, the fusion and the settings."""
+    words = ["train", "policy=memobench_small", "steps=1", "device=cpu"]
+    named = ("memory_stride", "memory_fusion", "memory_frames", "memory_phase")
+    for more, told in (
+        ([], [None] * 4),
+        (["policy.memory=frames"], [None] * 4),
+        (["policy.memory=bank", "policy.memory_settings={length: 4}"], ["null", "null", "32", "false"]),
+        (["policy.memory=motion", "policy.memory_stride=2"], ["2", "null", "32", "false"]),
+    ):
+        assert main([*words, *more]) == 0
+        assert [training.value(f"policy.{name}") for name in named] == told
+        # What LeRobot makes of it.
+        path = training.value("policy.path")
+        found: Any = PreTrainedConfig.from_pretrained(str(path), cli_overrides=overrides("policy", training.flags))
+        own = MemobenchMemConfig(device="cpu", size="small", perception="objects", memory=found.memory)
+        assert found.memory_fusion == own.memory_fusion
+        assert found.memory_stride == (2 if told[0] == "2" else own.memory_stride)
+        assert found.memory_settings == own.memory_settings | ({"length": 4} if "bank" in found.memory else {})
+
+
 # --- mistakes: one sentence, status 2, LeRobot never called, nothing written ---
 
 
@@ -514,6 +537,19 @@ def test_an_unknown_alignment(training: Called, capsys: pytest.CaptureFixture[st
 
 def test_an_unknown_referent(evaluation: Called, capsys: pytest.CaptureFixture[str]) -> None:
     assert "random" in refused(["eval", "env=memobench", "referent=rnd"], evaluation, capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["policy.memory=none", "policy.memory_settings={content: false}"], "policy.memory=none has none"),
+        (["policy.memory=recurrent", "policy.memory_settings={length: 4, time_codes: true}"], "names 'length'"),
+    ],
+)
+def test_settings_of_another_memory(
+    words: list[str], told: str, training: Called, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert told in refused(["train", "policy=memobench_mem", *words], training, capsys)
 
 
 def test_a_folder_that_is_no_dataset(training: Called, capsys: pytest.CaptureFixture[str]) -> None:

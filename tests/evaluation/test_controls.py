@@ -16,7 +16,7 @@ from lerobot_memobench.evaluation.controls import by_replan, paired, relabelled
 from lerobot_memobench.evaluation.memory_controls import contrasts, gap_closed, prefix_curves, published_contrasts
 from lerobot_memobench.evaluation.metrics import summarise
 from lerobot_memobench.paper import raw_tables
-from tests.support.logs import record
+from tests.support.logs import SETTINGS, record
 
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
 DRAWERS = "check_all_three_drawers_of_the_cabinet"
@@ -208,6 +208,30 @@ def test_two_policies_are_no_sweep_of_one(tmp_path: Path, capsys: pytest.Capture
         (tmp_path / name / "protocol.json").write_text(json.dumps({"policy": {"type": "act", "sha256": digest}}))
     assert main(["controls", "oracle", *words, "--oracle", words[0]]) == 2
     assert "are of two policies (sha256 aaaa and bbbb)" in " ".join(capsys.readouterr().err.split())
+
+
+def test_an_evaluation_in_anothers_place_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Swapped, or given twice, it would be a difference of the wrong sign, or none."""
+    for name, oracle in (("plain", False), ("oracle", True)):
+        folder(tmp_path / name, rollouts([1, 2]))
+        (tmp_path / name / "protocol.json").write_text(json.dumps({"oracle_memory": oracle}))
+    for name, shuffled, level in (("normal", False, "coarse"), ("shuffled", True, "fine")):
+        folder(tmp_path / name, rollouts([1, 2]))
+        told = {"type": "memobench_mem", "settings": {"shuffle_subgoals": shuffled, "subgoal_level": level}}
+        protocol = {**SETTINGS, "tasks": [STOVE], "episodes": 2}
+        (tmp_path / name / "card.json").write_text(json.dumps({"protocol": protocol, "policy": told}))
+    levels = ["--coarse", "shuffled", "--intermediate", "normal", "--fine", "normal"]
+    for words, said in (
+        (["oracle", "oracle", "--oracle", "plain"], "oracle is of oracle_memory=True"),
+        (["oracle", "plain", "--oracle", "plain"], "plain is of oracle_memory=False"),
+        (["shuffled", "shuffled", "normal"], "shuffled is of shuffle_subgoals=True"),
+        (["shuffled", "normal", "normal"], "normal is of shuffle_subgoals=False"),
+        (["granularity", *levels], "shuffled is of subgoal_level=fine"),
+    ):
+        placed = [words[0], *(str(tmp_path / word) if word.isalpha() else word for word in words[1:])]
+        assert main(["controls", *placed]) == 2, words
+        assert said in " ".join(capsys.readouterr().err.split())
+    assert main(["controls", "shuffled", str(tmp_path / "normal"), str(tmp_path / "shuffled")]) == 0
 
 
 def test_oracle_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -87,6 +87,9 @@ def test_scenes_that_were_not_run_with_every_variant_are_left_out() -> None:
     found, notes = evidence_of(rollouts("bowl", "object", remembers)[:-1])
     assert found["tasks"]["bowl"].scenes == 9
     assert notes == ["2 rollouts of scenes that were not run with every variant left out"]
+    found, notes = evidence_of(rollouts("bowl", "object", remembers) + rollouts("milk", "object", remembers, 1)[:-1])
+    assert set(found["tasks"]) == {"bowl"}
+    assert notes == ["2 rollouts of scenes that were not run with every variant left out; no rate tells of milk"]
 
 
 def test_scenes_repeat_and_are_no_mixture_of_seeds() -> None:

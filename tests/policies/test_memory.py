@@ -269,10 +269,15 @@ def test_settings_of_the_memory_that_a_checkpoint_had_are_left_out(monkeypatch: 
     for name in set(OURS) - {"frames", "subgoal"}:  # the latter's are the same
         found = MemobenchMemConfig(device="cpu", memory=name, memory_settings=had).memory_settings
         assert found == vars(read_settings(name, {}))
-        assert told.pop() == f"memory_settings are those of memory=frames; memory={name} begins with its own"
+        assert told.pop() == f"memory_settings are those of memory=frames; memory={name} keeps its own"
     kept = {"time_codes": False, "content": True}
     assert MemobenchMemConfig(device="cpu", memory="subgoal", memory_settings=kept).memory_settings == kept
     assert not told
+    # LeRobot joins what is given to what a checkpoint holds.
+    joined = MemobenchMemConfig(device="cpu", memory="bank", memory_settings={**kept, "length": 4}).memory_settings
+    assert joined == {"time_codes": False, "length": 4}
+    with pytest.raises(MemobenchError, match="'content', which is no setting of memory=bank"):
+        MemobenchMemConfig(device="cpu", memory="bank", memory_settings={"content": True, "length": 4})
 
 
 def test_a_package_that_brings_no_memory_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -309,6 +309,10 @@ def test_torch_waits_briefly_in_evaluations_unless_told_otherwise(
     assert os.environ.get("OMP_WAIT_POLICY") == before.get("OMP_WAIT_POLICY")
 
 
+def test_a_mapping_is_handed_on_as_lerobot_reads_it_beside_a_checkpoint() -> None:
+    assert checked_value("policy.memory_settings", dict[str, bool], "{content: false}") == '{"content": false}'
+
+
 @pytest.mark.parametrize(
     ("key", "annotation"), [("demonstration_prompt", bool), ("horizon", int), ("resume", bool), ("lr", float)]
 )
@@ -324,6 +328,7 @@ def test_what_must_have_a_value_is_not_nothing(key: str, annotation: type, text:
     [
         (["env=memobench", "env.horizon.x=1"], "no setting 'env.horizon.x'"),
         (["env=memobench", "policy=act", "policy.type.x=1"], "no setting 'policy.type.x'"),
+        (["env=memobench", "rename_map.a=b"], """say rename_map='{"a": …}'"""),
         (["env=memobench", "rename_map={"], "rename_map={: expected a mapping"),
         (["env=memobench", "rename_map=a"], "rename_map=a: expected a mapping"),
         (["env="], "env= is empty; expected a name"),

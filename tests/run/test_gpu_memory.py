@@ -130,5 +130,7 @@ def test_the_command_prints_the_count(capsys: pytest.CaptureFixture[str], monkey
     assert "disk: 8 × checkpoint of" in printed
     assert [line.split()[1] for line in printed.splitlines() if " fits " in line][:2] == [DDP, FSDP]
     assert main(["fit", "config=train_paper", "size=tiny", "batch_size=100000", "--gpu-memory", "45"]) == 1
+    assert main(["fit", "config=train_paper", "batch_size=-3"]) == 2
+    assert "found batch_size=-3" in capsys.readouterr().err
     assert main(["fit", "policy=act"]) == 2
     assert "memobench_mem" in capsys.readouterr().err

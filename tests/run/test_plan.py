@@ -156,11 +156,19 @@ def test_evidence_is_asked_for_in_whole_scenes() -> None:
     assert plan_line(["env=memobench", "tasks=object", "referent=random", "evidence=true", "episodes=9"]).grid.runs == 9
 
 
+def test_evidence_of_less_than_a_scene_is_refused() -> None:
+    line = ["env=memobench", "suite=strict", "evidence=true"]
+    with pytest.raises(MemobenchError, match=r"has 12: with episodes=6 no scene .* at least episodes=12"):
+        plan_line([*line, "episodes=6"])
+    assert plan_line([*line, "episodes=12"]).grid.runs == 12
+    assert plan_line(["env=memobench", "suite=strict", "episodes=1"]).grid.runs == 1
+
+
 def test_scenes_of_evidence_are_counted_from_episode_0() -> None:
     line = ["env=memobench", "tasks=object", "referent=random", "evidence=true", "env.seed_base=30000"]
     assert plan_line([*line, "seed=30000"]).seeds == range(30_000, 30_018)
     # Of two variants and of nine: episode 12 is of scene 6 and of scene 1.
-    assert plan_line([*line, "seed=30012", "episodes=6"]).seeds == range(30_001, 30_009)
+    assert plan_line([*line, "seed=30012", "episodes=9"]).seeds == range(30_001, 30_011)
 
 
 def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:

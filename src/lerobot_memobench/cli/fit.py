@@ -31,8 +31,10 @@ def fit(
     """
     from lerobot_memobench.run.arguments import read_arguments, resolve_recipe, split_arguments
     from lerobot_memobench.run.gpu_memory import GIB, OVERHEAD, disk, training_of
+    from lerobot_memobench.run.training import check_numbers
 
     arguments = read_arguments("train", resolve_recipe(split_arguments(settings)))
+    check_numbers(arguments)
     training = training_of(arguments, gpus)
     if training is None:
         raise MemobenchError("only trainings of policy=memobench_mem are counted; name one, as config=train_paper")

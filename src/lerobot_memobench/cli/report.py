@@ -205,10 +205,12 @@ def oracle(
     out: TableOut = None,
 ) -> int:
     """Print which share of the gap to 100 % oracle memory closes: what a perfect memory would recover."""
-    from lerobot_memobench.evaluation.controls import pairs_by_replan
+    from lerobot_memobench.evaluation.controls import check_place, pairs_by_replan
     from lerobot_memobench.evaluation.memory_controls import contrasts, oracle_report, published_contrasts
     from lerobot_memobench.paper import raw_tables
 
+    check_place(standard, "oracle_memory", False)
+    check_place(oracle, "oracle_memory", True)
     pairs, notes = pairs_by_replan(standard, oracle, ignore=("oracle_memory",))
     found = {replan: contrasts(a, b, draws) for replan, (a, b) in pairs.items()}
     published = raw_tables()["oracle_memory"]
@@ -225,10 +227,12 @@ def shuffled(
     out: TableOut = None,
 ) -> int:
     """Print how far rollouts come with normal and with shuffled memory, checkpoint by checkpoint."""
-    from lerobot_memobench.evaluation.controls import pairs_by_replan
+    from lerobot_memobench.evaluation.controls import check_place, pairs_by_replan
     from lerobot_memobench.evaluation.memory_controls import prefix_curves, shuffled_report
     from lerobot_memobench.paper import shuffled_control
 
+    check_place([normal], "shuffle_subgoals", False, of_policy=True)
+    check_place([shuffled], "shuffle_subgoals", True, of_policy=True)
     pairs, notes = pairs_by_replan([normal], [shuffled])
     found = {replan: prefix_curves(a, b, draws) for replan, (a, b) in pairs.items()}
     return _show(shuffled_report(found, shuffled_control() if beside else None), notes, "shuffled", out)

@@ -88,6 +88,25 @@ def check_alike(first: Sequence[Path], second: Sequence[Path], ignore: Sequence[
             )
 
 
+def check_place(folders: Sequence[Path], setting: str, value: Any, *, of_policy: bool = False) -> None:
+    """Refuse evaluations that tell another value of a setting than their place among a control's arguments says.
+
+    Args:
+        of_policy: the setting is its policy's, by the card.
+
+    Raises:
+        MemobenchError: naming the first of them.
+    """
+    for folder in folders:
+        protocol = read_protocol(folder)
+        told = protocol[POLICY].get("settings", {}) if of_policy else protocol
+        if told.get(setting, value) != value:
+            raise MemobenchError(
+                f"{folder} is of {setting}={told[setting]}, and stands where {setting}={value} is expected; name the "
+                "folders in the order that `memobench controls --help` says"
+            )
+
+
 def check_one_policy(folders: Sequence[Path]) -> None:
     """Refuse evaluations of two policies where those of one, at several replan intervals, were expected.
 
@@ -164,7 +183,8 @@ def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str
     Raises:
         MemobenchError: they were evaluated under different protocols or at different replan intervals.
     """
-    for folder in folders[1:]:
+    for level, folder in zip(LEVELS, folders, strict=True):
+        check_place([folder], "subgoal_level", level, of_policy=True)
         check_alike(folders[:1], [folder])
     notes: list[str] = []
     inputs: list[str] = []

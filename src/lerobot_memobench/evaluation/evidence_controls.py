@@ -85,7 +85,7 @@ def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:
     rng = np.random.default_rng(0)
     tasks: dict[str, _Task] = {}
     kinds: dict[str, list[_Task]] = {}
-    left_out = 0
+    left_out, nowhere = 0, list[str]()
     for name, group in by_task(filter(_tells, records)).items():
         variants = int(group[0]["variants"])
         scenes: dict[int, dict[int, Record]] = {}
@@ -94,12 +94,14 @@ def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:
         whole = [list(scene.values()) for scene in scenes.values() if len(scene) == variants]
         left_out += len(group) - sum(map(len, whole))
         if not whole:
+            nowhere.append(name)
             continue
         values = np.array([np.mean([_outcome(record) for record in scene], axis=0) for scene in whole])
         drawn = rng.integers(len(whole), size=(draws, len(whole)))
         tasks[name] = _Task(variants, group[0].get("chance"), values, drawn)
         kinds.setdefault(str(group[0]["memory_type"]), []).append(tasks[name])
-    notes = [f"{count_of(left_out, 'rollout')} of scenes that were not run with every variant left out"]
+    absent = f"; no rate tells of {' and '.join(nowhere)}" if nowhere else ""
+    notes = [f"{count_of(left_out, 'rollout')} of scenes that were not run with every variant left out{absent}"]
     asked = {name: told for name, group in kinds.items() if (told := [t for t in group if t.chance is not None])}
     found = {
         "tasks": {name: _rates([[task]]) for name, task in tasks.items()},

@@ -537,11 +537,11 @@ def has_settings(kind: Any) -> bool:
 
 
 def setting_type(known: Mapping[str, Any], key: str) -> Any:
-    """Return the type of one of the `settings`; ``Any`` where LeRobot's parser alone decides, as within a dict.
+    """Return the type of one of the `settings`; ``Any`` where LeRobot's parser alone decides.
 
     Raises:
         KeyError: there is no such setting. MemobenchError: it belongs to a choice that has not been made
-            (``env.horizon`` without an environment).
+            (``env.horizon`` without an environment), or is within a mapping.
     """
     if key == CONFIG_FILE:
         return str
@@ -555,6 +555,11 @@ def setting_type(known: Mapping[str, Any], key: str) -> Any:
     kind = without_none(known[owner])
     if is_choice_type(kind) and "." not in owner:
         raise MemobenchError(f"{key!r} needs {owner}=: name one before setting something of it")
+    if typing.get_origin(kind) is dict:
+        raise MemobenchError(
+            f"found {key}=, and {owner} is a mapping that is given whole; say {owner}="
+            f"'{{\"{key.removeprefix(owner)[1:]}\": …}}'"
+        )
     if has_settings(kind) or kind in (*PLAIN, str) or is_literal(kind) or is_enum(kind):
         raise KeyError(key)
     return Any
@@ -588,7 +593,7 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
             found = None
         if not isinstance(found, dict):
             raise MemobenchError(f'{key}={text[:80]}: expected a mapping, such as {key}=\'{{"name": "other"}}\'')
-        return text
+        return json.dumps(found, default=str)  # beside a checkpoint LeRobot reads JSON alone
     if is_literal(kind):
         known = named = [str(value) for value in typing.get_args(kind)]
     elif is_enum(kind):

@@ -212,6 +212,7 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
         command=tuple(command),
     )
     check_split(plan)
+    check_scenes(plan)
     if options.executor not in ELSEWHERE:  # there, each part finds out
         _check_simulator(plan.draws)
     return plan
@@ -234,6 +235,26 @@ def check_split(plan: EvaluationPlan) -> None:
         raise MemobenchError(
             f"seeds {seeds[0]} to {seeds[-1]} reach into the sealed test's ({sealed[0]} to {sealed[-1]}), which are "
             "looked at once per release, by `memobench test-sealed policy=…`; choose settings by split=validation"
+        )
+
+
+def check_scenes(plan: EvaluationPlan) -> None:
+    """Refuse fewer episodes than a task has variants, where each scene is run with each: it would be in no rate.
+
+    Raises:
+        MemobenchError: of a task there would be no whole scene.
+    """
+    from lerobot_memobench.tasks.catalogue import load_task
+
+    if not plan.environment.evidence:
+        return
+    variants = {task.name: len(load_task(task.folder).random_variants) for task in plan.grid.tasks}
+    name = max(variants, key=lambda name: variants[name])
+    if variants[name] > plan.grid.runs:
+        raise MemobenchError(
+            f"evidence=true runs each scene with each variant, and {name} has {variants[name]}: with "
+            f"episodes={plan.grid.runs} no scene of it is whole, and it would be in no rate; ask for at least "
+            f"episodes={variants[name]}, or for other tasks"
         )
 
 

@@ -37,12 +37,14 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
+from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_FILE
 from lerobot_memobench.policies.checkpoint import (
     as_trained,
     check_as_begun,
     checkpoint_folder,
     checkpoint_type,
     differing,
+    local_folder,
     read_json,
 )
 from lerobot_memobench.protocol import CLOCK
@@ -147,7 +149,9 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
     check_numbers(arguments)
     check_dataset(arguments)
     check_same_training(arguments)
+    arguments = with_own_memory(arguments)
     policy = policy_config(arguments)
+    check_memory_settings(arguments, policy)
     check_observations(policy, env_config(arguments))
     steps = whole_number(arguments.get("steps"))
     if steps is not None and steps < 2000 and arguments.get("resume") != "true":
@@ -170,6 +174,49 @@ def check_numbers(arguments: LerobotArguments) -> None:
         number = whole_number(text)
         if number is not None and number < least:
             raise MemobenchError(f"found {key}={number}; expected at least {least}")
+
+
+def with_own_memory(arguments: LerobotArguments) -> LerobotArguments:
+    """Return arguments in which a memory that is another one than that of the checkpoint it begins with has its own
+    defaults: LeRobot would take the checkpoint's, which were those of the other memory.
+    """
+    path, memory = arguments.get("policy.path"), arguments.get("policy.memory")
+    folder = None if path is None else local_folder(path)
+    if folder is None or memory is None or checkpoint_type(str(folder)) != "memobench_mem":
+        return arguments
+    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FRAMES
+
+    held = read_json(folder / POLICY_FILE)
+    fusion = held.get("memory_fusion")  # alone in files from before there were several memories
+    if memory == (held.get("memory") or ("none" if fusion == "none" else "frames")):
+        return arguments
+    own = {
+        "memory_stride": "null",
+        "memory_fusion": "null",
+        "memory_frames": MEMORY_FRAMES,
+        "memory_phase": False,
+    }
+    for name, value in own.items():
+        arguments = arguments.default(f"policy.{name}", value)
+    return arguments
+
+
+def check_memory_settings(arguments: LerobotArguments, policy: Any) -> None:
+    """Refuse settings on the line that are not those of the policy's memory.
+
+    Raises:
+        MemobenchError: they are another memory's, or there is none.
+    """
+    given = yaml.safe_load(arguments.get("policy.memory_settings") or "{}")
+    if not given or getattr(policy, "type", None) != "memobench_mem":
+        return
+    from lerobot_memobench.policies.memobench_mem.memory import NONE, read_settings
+
+    if policy.memory == NONE:
+        raise MemobenchError(
+            f"policy.memory_settings={given} says how a memory remembers, and policy.memory=none has none; leave it out"
+        )
+    read_settings(policy.memory, given)
 
 
 def check_dataset(arguments: LerobotArguments) -> None:

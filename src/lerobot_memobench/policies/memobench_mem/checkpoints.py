@@ -87,12 +87,14 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
         weights = {f"model.{model.place_of(name)}": tensor for name, tensor in plain.items()}
         weights = {name: tensor for name, tensor in weights.items() if name not in new}
         logger.warning(
-            "'%s' was trained with memory=%s, and this is memory=%s: of the latter and of how actions read it, %d "
-            "tensors begin anew; all others go on.",
+            "'%s' was trained with memory=%s, and this is memory=%s%s: of the latter and of how actions read it, %d "
+            "tensors begin anew; all others go on. A frame is written every %d control steps.",
             source,
             trained.memory,
             config.memory,
+            "" if config.memory != trained.memory else " with other settings",
             len(own),
+            config.memory_stride,
         )
     elif config.memory != NONE and not any(name.startswith("model.memory.") for name in weights):
         raise MemobenchError(

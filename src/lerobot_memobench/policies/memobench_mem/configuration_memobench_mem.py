@@ -30,6 +30,7 @@ from lerobot_memobench.policies.memobench_mem.memory import (
     find_mechanism,
     mechanism_names,
     read_settings,
+    settings_of,
     settings_of_another,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
@@ -417,8 +418,9 @@ class MemobenchMemConfig(PI05Config):
             )
         other = settings_of_another(self.memory, self.memory_settings)
         if other is not None:  # a checkpoint's, whose training this memory goes on from
-            logger.warning("memory_settings are those of memory=%s; memory=%s begins with its own", other, self.memory)
-            self.memory_settings = {}
+            logger.warning("memory_settings are those of memory=%s; memory=%s keeps its own", other, self.memory)
+            own = settings_of(self.memory)
+            self.memory_settings = {name: value for name, value in self.memory_settings.items() if name in own}
         self.memory_settings = asdict(read_settings(self.memory, self.memory_settings))
         if self.memory_stride is None:
             stride = mechanism.stride

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -76,13 +77,19 @@ def find_mechanism(name: str) -> type[MemoryMechanism]:
 
 
 def settings_of_another(name: str, given: Mapping[str, Any]) -> str | None:
-    """Return one of our mechanisms whose settings, all of them, are ``given``, and do not fit this mechanism."""
-    if set(given) <= _settings(name):
+    """Return another mechanism all of whose settings are among ``given``, with all of these that this one lacks."""
+    strange = set(given) - settings_of(name)
+    if not strange:
         return None
-    return next((other for other in OURS if _settings(other) == set(given)), None)
+    for other in mechanism_names():
+        with suppress(MemobenchError):  # of a broken package
+            if strange <= settings_of(other) <= set(given):
+                return other
+    return None
 
 
-def _settings(name: str) -> set[str]:
+def settings_of(name: str) -> set[str]:
+    """Return the names of a mechanism's settings."""
     return {one.name for one in fields(find_mechanism(name).Settings)}
 
 
@@ -92,7 +99,7 @@ def read_settings(name: str, given: Mapping[str, Any]) -> Any:
     Raises:
         MemobenchError: a setting is unknown, or of another type.
     """
-    known = _settings(name)
+    known = settings_of(name)
     for key in given:
         if key not in known:
             told = nearest(key, known) if known else "it has none."
