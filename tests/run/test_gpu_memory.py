@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +16,9 @@ import torch
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem import memory
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.run import gpu_memory
 from lerobot_memobench.run.arguments import read_arguments, resolve_recipe, split_arguments
 from lerobot_memobench.run.gpu_memory import (
@@ -120,6 +125,78 @@ def test_lerobot_train_asks_by_the_gpu_and_the_launcher(monkeypatch: pytest.Monk
     monkeypatch.delenv("ACCELERATE_USE_FSDP")
     on_gpu.config.device = "cpu"
     gpu_memory.refuse_too_large(arguments)
+
+
+# -- memories ---------------------------------------------------------------------------------------------------------
+
+
+def tiny(memory: str, **fields: Any) -> Training:
+    return Training(MemobenchMemConfig(size="tiny", device="cpu", memory=memory, **fields), 16)
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "prefix", "suffix"),
+    [
+        ("recurrent", {"memory_fusion": "context"}, 32, 0),  # its slots
+        pytest.param("motion", {}, 0, 8, marks=pytest.mark.slow),  # queries of foresight
+        pytest.param("subgoal", {"subgoals": {"": ["open it now"]}}, 512 + 1 + 4, 0, marks=pytest.mark.slow),
+        pytest.param("keyframes", {"subgoals": {"": ["open it now"]}}, 0, 0, marks=pytest.mark.slow),
+        pytest.param("frames", {}, 0, 0, marks=pytest.mark.slow),
+        pytest.param("bank", {}, 0, 0, marks=pytest.mark.slow),
+        pytest.param("fast_weights", {"memory_fusion": "context"}, 8 * 16, 0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_memory_takes_what_its_samples_leave_behind(
+    name: str, fields: dict[str, Any], prefix: int, suffix: int
+) -> None:
+    training = tiny(name, **fields)
+    found, without = training.memory, tiny("none")
+    assert (found.prefix, found.suffix) == (prefix, suffix)
+    assert found.kept > found.stored > 0
+    assert training.need().activations >= without.need().activations + 16 * found.kept
+    assert training.weights(WHOLE).trained > without.weights(WHOLE).trained
+    assert disk(training).cache == found.stored * math.ceil(training.frames / training.config.memory_stride)
+
+
+@pytest.mark.slow
+def test_gradients_through_more_frames_keep_more() -> None:
+    made = [tiny("recurrent", memory_settings={"gradient_frames": count}).memory.kept for count in (2, 4, 6)]
+    assert made[2] - made[1] == made[1] - made[0] > 0
+
+
+@pytest.mark.slow
+def test_texts_of_a_privileged_memory_are_those_of_the_published_tasks_where_no_dataset_lies() -> None:
+    training = asked("policy.memory=subgoal", "policy.memory_fusion=own", "size=tiny")
+    texts = training.config.subgoal_texts
+    assert len(texts) > 30
+    one = tiny("subgoal", subgoals={"": texts[:1]})
+    assert training.weights(WHOLE).trained >= one.weights(WHOLE).trained + 128 * (len(texts) - 1)
+
+
+class Strange(Frames):
+    """A package's memory, whose training wants more than frames."""
+
+    def replay(self, histories: Any, query: Any = None) -> Any:
+        raise KeyError("weather")
+
+
+def test_a_memory_that_cannot_be_counted_is_refused_and_may_be_trained(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(memory, "entry_points", lambda group: [EntryPoint("strange", f"{__name__}:Strange", group)])
+    assert main(["fit", "policy=memobench_mem", "size=tiny", "policy.memory=strange", "dataset=local/none"]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "what memory=strange needs cannot be counted" in told
+    assert "KeyError: 'weather'" in told
+    training = tiny("strange")
+    training.config.size, training.config.device = "pi05", "cuda"
+    training.counted[WHOLE] = tiny("frames").weights(WHOLE)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda rank: SimpleNamespace(total_memory=GIB))
+    monkeypatch.setattr(gpu_memory, "training_of", lambda *_: training)
+    with caplog.at_level("WARNING"):
+        gpu_memory.refuse_too_large(read_arguments("train", split_arguments(["policy=memobench_mem"])))
+    assert "whether it fits this GPU is not known" in caplog.text
 
 
 @pytest.mark.slow

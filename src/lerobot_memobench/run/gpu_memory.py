@@ -1,27 +1,37 @@
 """Memory of a GPU, main memory and disk that a training of ``memobench_mem`` needs, counted before anything is loaded.
 
 The policy is built on torch's meta device, so every weight is counted and none is made. Weights, gradients, AdamW's
-state, average, buckets and shards are exact. Activations are an estimate from layers and tokens. What was measured on
-one GPU (docs/research/full_size_on_one_gpu.md) is 0 to 3 % below the count; tests hold that.
+state, average, buckets and shards are exact. Activations are an estimate from layers and tokens, and from what a sample
+leaves behind in the memory (`memory_use`). What was measured on one GPU with ``memory=frames``
+(docs/research/full_size_on_one_gpu.md) is 0 to 3 % below the count; tests hold that.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 import re
 import tempfile
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from lerobot_memobench.datasets.feature_cache.frames import read_frame_table
 from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.run.arguments import CONFIG_FILE, LerobotArguments, read_config_file, whole_number
 from lerobot_memobench.run.plan import policy_config
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.task import LEVELS
+
+if TYPE_CHECKING:
+    from lerobot_memobench.run.memory_use import MemoryUse
+
+logger = logging.getLogger(__name__)
 
 GIB = 2**30
 OVERHEAD = 2 * GIB
@@ -36,6 +46,7 @@ RANK_OF_ADAPTERS = 16
 """LeRobot's, of LoRA."""
 WHOLE, DDP, FSDP = "one GPU", "DDP", "FSDP"
 LORA, EXPERT = "LoRA", "expert, memory"
+MEMORY = "memory"
 HOW = {
     FSDP: "shards over several GPUs (accelerate launch --use_fsdp)",
     LORA: "adapters (--peft.method_type=LORA)",
@@ -111,15 +122,26 @@ class Training:
     save_freq: int = 0
     frames: int = FRAMES
     way: str | None = None
-    counted: dict[str, Weights] = field(default_factory=dict, repr=False, compare=False)
-    """What was counted already, of each way; shared by trainings that differ in numbers alone."""
+    counted: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    """What was counted already, of each way and of the memory; shared by trainings that differ in numbers alone."""
 
     def weights(self, way: str) -> Weights:
         """Return the numbers of weights in a way to train, counted once."""
         kind = way if way in (LORA, EXPERT) else WHOLE
         if kind not in self.counted:
             self.counted[kind] = count_weights(replace_config(self.config, way), adapters=way == LORA)
-        return self.counted[kind]
+        found: Weights = self.counted[kind]
+        return found
+
+    @property
+    def memory(self) -> MemoryUse:
+        """What the memory takes of each sample, found once."""
+        from lerobot_memobench.run.memory_use import memory_use
+
+        if MEMORY not in self.counted:
+            self.counted[MEMORY] = memory_use(self.config)
+        found: MemoryUse = self.counted[MEMORY]
+        return found
 
     def need(self) -> Need:
         """Return what it needs of each GPU."""
@@ -148,6 +170,9 @@ def training_of(arguments: LerobotArguments, gpus: int = 1) -> Training | None:
 
     root = arguments.get("dataset.root") or (file.get("dataset") or {}).get("root")
     folder = None if root is None else Path(root).expanduser()
+    here = folder is not None and folder.is_dir()
+    if config.privileged_memory and not config.subgoals:
+        config = replace_config(config, WHOLE, subgoals=_texts(folder if here else None, config.subgoal_level))
     adapters = any(flag.startswith("--peft.") for flag in arguments.flags) or bool(file.get("peft"))
     return Training(
         config,
@@ -155,9 +180,18 @@ def training_of(arguments: LerobotArguments, gpus: int = 1) -> Training | None:
         gpus,
         number("steps", 100_000),
         number("save_freq", 20_000),
-        FRAMES if folder is None or not folder.is_dir() else int(read_info(folder).get("total_frames", FRAMES)),
+        int(read_info(folder).get("total_frames", FRAMES)) if folder is not None and here else FRAMES,
         LORA if adapters else None,
     )
+
+
+def _texts(folder: Path | None, level: str) -> dict[str, list[str]]:
+    """Return texts of checkpoints that a memory may learn from: a dataset's, else those of the published tasks."""
+    found = set() if folder is None else {*read_frame_table(folder).subgoals.get(level, [])} - {""}
+    if not found:
+        tasks = [get_task(name) for name in task_names()]
+        found = {one.language[LEVELS.index(level)] for task in tasks for one in task.checkpoints}
+    return {"": sorted(found)}
 
 
 def _policy_of_file(arguments: LerobotArguments, file: dict[str, Any]) -> Any:
@@ -177,6 +211,8 @@ def _policy_of_file(arguments: LerobotArguments, file: dict[str, Any]) -> Any:
 def refuse_too_large(arguments: LerobotArguments) -> None:
     """Refuse a training at full size that cannot fit the GPU it would run on, before anything is loaded.
 
+    One whose memory cannot be counted may try.
+
     Raises:
         MemobenchError: it cannot.
     """
@@ -185,13 +221,18 @@ def refuse_too_large(arguments: LerobotArguments) -> None:
     if not torch.cuda.is_available() or arguments.get("job.target") not in (None, "local"):
         return
     gpus = int(os.environ.get("WORLD_SIZE", "1"))
+    from lerobot_memobench.run.memory_use import UncountedError
+
     training = training_of(arguments, gpus)
     if training is None or training.config.size != "pi05" or training.config.device == "cpu":
         return
     if gpus > 1 and training.way is None and os.environ.get("ACCELERATE_USE_FSDP", "").lower() == "true":
         training = replace(training, way=FSDP)
     card = torch.cuda.get_device_properties(int(os.environ.get("LOCAL_RANK", "0"))).total_memory
-    check_fits(training, card)
+    try:
+        check_fits(training, card)
+    except UncountedError as error:
+        logger.warning("whether it fits this GPU is not known: %s", error)
 
 
 def check_fits(training: Training, card: int) -> None:
@@ -222,7 +263,7 @@ def need(training: Training, way: str) -> Need:
     """Return what a way to train needs of each GPU."""
     config = replace_config(training.config, way)
     weights = training.weights(way)
-    active = activations(config, training.batch)
+    active = activations(config, training.batch, training.memory)
     left = active if config.gradient_checkpointing else 0  # what is computed once more stands beside what was kept
     narrow = 2 if config.dtype == "bfloat16" else 4
     graded = weights.trained - weights.ungraded
@@ -272,23 +313,22 @@ def _part(whole: int, share: int) -> int:
     return math.ceil(whole / share)
 
 
-def activations(config: MemobenchMemConfig, batch: int) -> int:
-    """Estimate the bytes of a batch's activations at their most: two cameras, prompts of full length.
+def activations(config: MemobenchMemConfig, batch: int, memory: MemoryUse) -> int:
+    """Estimate the bytes of a batch's activations at their most: two cameras, prompts of full length, and the memory's.
 
     A layer keeps, of each token, about 20 vectors of its width and 3 of its MLP's, and 12 bytes of each pair of tokens
     and head. With gradient checkpointing each keeps its input in float32, and one is computed at a time.
     """
     dims = config.dimensions
-    prefix = 2 * (dims.vision.image // dims.vision.patch) ** 2 + (config.tokenizer_max_length or 0)
-    if config.memory_fusion == "context":
-        prefix += config.memory_frames * config.tokens_per_frame
-    tokens = ((dims.vlm, prefix), (dims.expert, config.chunk_size))
+    prefix = 2 * (dims.vision.image // dims.vision.patch) ** 2 + (config.tokenizer_max_length or 0) + memory.prefix
+    tokens = ((dims.vlm, prefix), (dims.expert, config.chunk_size + memory.suffix))
     pairs = dims.vlm.num_heads * sum(count for _, count in tokens) ** 2
     width = 2 if config.dtype == "bfloat16" else 4
     layer = width * sum(count * (20 * one.width + 3 * one.mlp_dim) for one, count in tokens) + 12 * pairs
     kept = 4 * sum(count * one.width for one, count in tokens)
     depth = dims.vlm.depth
-    return batch * round(depth * kept + OF_A_LAYER * layer if config.gradient_checkpointing else depth * layer)
+    layers = round(depth * kept + OF_A_LAYER * layer if config.gradient_checkpointing else depth * layer)
+    return batch * (layers + memory.kept)
 
 
 def count_weights(config: MemobenchMemConfig, *, adapters: bool = False) -> Weights:
@@ -368,7 +408,5 @@ def disk(training: Training) -> Disk:
     model = 4 * weights.trained + (0 if training.way == LORA else weights.frozen)
     average = 4 * weights.trained * (bool(config.ema_decay) and training.way != LORA)
     count = math.ceil(training.steps / training.save_freq) if training.save_freq > 0 else 1
-    tokens = config.tokens_per_frame * config.dimensions.vlm.width * (config.memory != "none")
-    return Disk(
-        model + average + optimizer, optimizer, count, 2 * tokens * math.ceil(training.frames / config.memory_stride)
-    )
+    cache = training.memory.stored * math.ceil(training.frames / config.memory_stride)
+    return Disk(model + average + optimizer, optimizer, count, cache)

@@ -73,20 +73,8 @@ class MemoryPI05(PI05Pytorch):
         self.fusion: MemoryFusion | None = None
         if config.memory == NONE:
             return
-        observations, mechanism = self.paligemma_with_expert.perception, find_mechanism(config.memory)
-        spec = MemorySpec(
-            dim=observations.dim,
-            tokens=config.tokens_per_frame,
-            width=vlm_width,
-            expert=width,
-            frames=config.memory_frames,
-            grid=observations.grid,
-            stride=config.memory_stride,
-            subgoals=config.subgoal_texts,
-        )
-        pool = motion_field(observations, width) if mechanism.asks_motion else observations.pool()
-        self.memory = mechanism(spec, pool, read_settings(config.memory, config.memory_settings))
-        self.fusion = (mechanism.fusion or FUSIONS[config.memory_fusion])(self, vlm_width, width)
+        self.memory = make_memory(config, self.paligemma_with_expert.perception)
+        self.fusion = (self.memory.fusion or FUSIONS[config.memory_fusion])(self, vlm_width, width)
         self.paligemma_with_expert.fusion = self.fusion
 
     def set_memory(self, memory: MemoryTokens) -> None:
@@ -146,6 +134,23 @@ class MemoryPI05(PI05Pytorch):
     def place_of(self, name: str) -> str:
         """Return the name in this model of a parameter of plain pi0.5."""
         return name if self.fusion is None else self.fusion.place_of(name)
+
+
+def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) -> MemoryMechanism:
+    """Build the memory mechanism of a policy that reads these observations."""
+    mechanism, dims = find_mechanism(config.memory), config.dimensions
+    spec = MemorySpec(
+        dim=observations.dim,
+        tokens=config.tokens_per_frame,
+        width=dims.vlm.width,
+        expert=dims.expert.width,
+        frames=config.memory_frames,
+        grid=observations.grid,
+        stride=config.memory_stride,
+        subgoals=config.subgoal_texts,
+    )
+    pool = motion_field(observations, dims.expert.width) if mechanism.asks_motion else observations.pool()
+    return mechanism(spec, pool, read_settings(config.memory, config.memory_settings))
 
 
 class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
