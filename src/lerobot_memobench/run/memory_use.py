@@ -1,8 +1,8 @@
 """What a memory takes of a GPU in training beside its weights, found by letting a sample through it on the CPU.
 
-Its state, lengths and gradients are its own, and those of another package's nobody knows here. So a memory is built with
-weights at random, a sample and then two are replayed, and what autograd keeps of the second is what each sample costs.
-The tokens that its fusion adds are counted on the meta device.
+A memory is built with weights at random; one sample and then two are replayed; what autograd keeps of the second is
+what each sample costs. So any mechanism is counted, another package's too. The tokens that its fusion adds are counted
+on the meta device.
 """
 
 from __future__ import annotations
