@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import (
     FramewiseAlignment,
     make_alignment,
     retrieval_accuracy,
 )
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory import OURS
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import batch_of, made_for_training
 
 B, F, P, D, T = 5, 3, 4, 6, 7
 
@@ -136,3 +142,41 @@ def test_retrieval_accuracy() -> None:
 
 def test_none_is_no_objective() -> None:
     assert make_alignment("none", D, T, F, P) is None
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
+
+
+@pytest.mark.parametrize(
+    ("memory", "align"),
+    [
+        *((name, align) for name in OURS for align in ("semantic", "contrastive") if name != "keyframes"),
+        *((name, "framewise") for name in ("frames", "subgoal")),
+    ],
+)
+@pytest.mark.slow
+def test_every_memory_learns_to_tell_its_subgoal(memory: str, align: str, objects: Path) -> None:
+    """Few updates on one batch: the loss falls, and the weights of what is remembered take part in it.
+
+    The contrastive loss of equal texts cannot come near zero.
+    """
+    fields = {"size": "small", "perception": "objects", "memory_frames": 32}
+    policy, before, _, dataset = made_for_training(objects, memory=memory, align=align, **fields)
+    batch = before(batch_of(dataset, [10, 30, 50, 56, 75, 90]))
+    optimizer, found = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3), []
+    for _ in range(20):
+        loss, logged = policy.train().forward(batch)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        found.append(logged)
+    assert found[-1]["align_loss"] < 0.9 * found[0]["align_loss"]
+    assert all(logged["align_grad_norm"] > 0 for logged in found)
+
+
+@pytest.mark.parametrize("align", ["semantic", "contrastive", "framewise"])
+def test_a_memory_that_reads_the_text_itself_is_not_aligned_with_it(align: str) -> None:
+    with pytest.raises(MemobenchError, match="memory=keyframes learns from that text already"):
+        MemobenchMemConfig(device="cpu", memory="keyframes", align=align)

@@ -250,14 +250,12 @@ def test_texts_share_words_and_the_empty_one_is_said_where_no_other_may_be() -> 
     assert CheckpointTexts((), 5)(torch.tensor([0]))[1].tolist() == [[True]]
 
 
-def test_it_is_built_at_full_size_and_has_no_tokens_of_single_frames() -> None:
+def test_it_is_built_at_full_size_and_has_a_fusion_of_its_own() -> None:
     with torch.device("meta"):
         made = MemoryPI05(MemobenchMemConfig(device="cpu", size="pi05", memory="subgoal", subgoals=OF_TASKS))
     assert {name for name in made.memory_names() if name.startswith("subgoal.")} == {
         *("subgoal.ask", "subgoal.score.weight", "subgoal.score.bias", "subgoal.texts.embedding.weight")
     }
-    with pytest.raises(MemobenchError, match="no tokens of single frames"):
-        MemobenchMemConfig(device="cpu", memory="subgoal", align="framewise")
     with pytest.raises(MemobenchError, match="cannot be read by memory_fusion=context"):
         MemobenchMemConfig(device="cpu", memory="subgoal", memory_fusion="context")
 

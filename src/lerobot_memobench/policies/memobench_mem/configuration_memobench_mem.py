@@ -526,6 +526,11 @@ class MemobenchMemConfig(PI05Config):
                 f"--policy.align={self.align} has no memory to align with --policy.memory=none; name a memory "
                 f"({', '.join(mechanism_names())}), or use --policy.align=none."
             )
+        if self.align != "none" and find_mechanism(self.memory).reads_text:
+            raise MemobenchError(
+                f"--policy.align={self.align} ties what is remembered to the subgoal's text, and memory={self.memory} "
+                "learns from that text already, which is all that a chunk reads of it; use --policy.align=none."
+            )
         if self.align == "framewise" and not find_mechanism(self.memory).per_frame:
             raise MemobenchError(
                 "--policy.align=framewise aligns each remembered frame with its own text, and "

@@ -72,6 +72,7 @@ class Keyframes(MemoryMechanism):
     stride = 10
     ahead = 1
     privileged = True
+    reads_text = True
     capacity = RECENT + NOMINATED
 
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:

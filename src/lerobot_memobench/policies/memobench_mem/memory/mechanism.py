@@ -157,6 +157,7 @@ class MemoryMechanism(nn.Module, ABC):
             other of these.
         gradient_frames: through how many of the last frames gradients pass at most.
         per_frame: whether memory tokens are P of each frame read, oldest first, as ``align=framewise`` needs.
+        reads_text: whether memory tokens are words of a checkpoint's text, of the true one in training: no alignment.
         capacity: how many entries are kept of an episode at most.
     """
 
@@ -168,6 +169,7 @@ class MemoryMechanism(nn.Module, ABC):
     privileged: ClassVar[bool] = False
     fusion: ClassVar[Any] = None
     per_frame: ClassVar[bool] = False
+    reads_text: ClassVar[bool] = False
     gradient_frames: int = 0
     capacity: int
 

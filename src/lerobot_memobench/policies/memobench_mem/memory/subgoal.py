@@ -199,7 +199,6 @@ class Subgoal(Frames):
     the last's.
     """
 
-    per_frame = False
     privileged = True
     fusion = NarrowChannel
 
