@@ -90,8 +90,8 @@ class Cell:
 
     @property
     def parts(self) -> list[str]:
-        """The evaluation, and the controls that are run of this row."""
-        return [ROLLOUTS, *(self.grid.rows[self.row].controls if self.tuned is None else ())]
+        """The evaluation, and of a row's first training seed its controls."""
+        return [ROLLOUTS, *(self.grid.rows[self.row].controls if self.tuned is None and self.seed == 0 else ())]
 
     def evaluation(self, part: str) -> Path:
         """The folder of the evaluation or of a control."""

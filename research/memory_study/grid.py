@@ -27,7 +27,7 @@ class Row:
     Attributes:
         training: words of ``lerobot train``. evaluation: of ``lerobot eval env=memobench``.
         policy: which policy is trained, in words of ``lerobot train``; none: the grid's.
-        seeds: training seeds, the first so many numbers. controls: names of those that are run.
+        seeds: training seeds, the first so many numbers. controls: names of those that its first one runs.
         privileged: whether it is given what the others are not, in training or in rollouts.
     """
 

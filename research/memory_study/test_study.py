@@ -77,6 +77,12 @@ def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, old: str, new
         read_grid(tmp_path / "grid.yaml")
 
 
+def test_the_first_training_seed_alone_runs_controls(grid: Grid, tmp_path: Path) -> None:
+    first, second = (Cell(grid, tmp_path, "strict", "frames, no time", seed) for seed in (0, 1))
+    assert first.parts == [ROLLOUTS, "evidence"]
+    assert second.parts == [ROLLOUTS]
+
+
 def test_words_choose_cells(grid: Grid) -> None:
     assert chosen(grid, []) == [
         ("strict", "no memory", 0),
