@@ -23,12 +23,11 @@ from lerobot_memobench.datasets.describe import describe
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble, write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, MANIFEST_FILE
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, episodes_where, list_episodes, read_episode
-from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.short_demonstrations import drawn_steps, with_pictures
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
@@ -38,9 +37,9 @@ REPO = "local/ours"
 
 @pytest.fixture(scope="module")
 def demos() -> list[Demonstration]:
-    """Stove, butter (with a demonstration prompt), stove; without images."""
-    kinds = [(STOVE, 10_000), (BUTTER, 10_000), (STOVE, 10_001)]
-    return [record_demonstration(get_task(task), seed, images=False) for task, seed in kinds]
+    """Stove, butter (with a demonstration prompt), stove; a few steps of each, without images."""
+    kinds = [(STOVE, 10_000, 12, 0), (BUTTER, 10_000, 16, 6), (STOVE, 10_001, 10, 0)]
+    return [drawn_steps(*kind) for kind in kinds]
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +48,9 @@ def ours(demos, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory) -> Path:
+def filmed(demos, tmp_path_factory) -> Path:
     """The first two, with small pictures."""
-    kinds = ((STOVE, 10_000), (BUTTER, 10_000))
-    shown = [record_demonstration(get_task(task), seed, image_size=SIZE) for task, seed in kinds]
+    shown = [with_pictures(demo, SIZE) for demo in demos[:2]]
     return write_dataset(shown, tmp_path_factory.mktemp("filmed") / "ds", repo_id=REPO)
 
 

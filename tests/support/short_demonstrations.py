@@ -1,0 +1,43 @@
+"""Demonstrations of the real simulator that cost next to nothing: few steps, and pictures of any size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.hdf5.writing import model_file
+from lerobot_memobench.datasets.replay import resimulate
+from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+
+
+def drawn_steps(task_name: str, seed: int, frames: int, exec_start: int = 0) -> Demonstration:
+    """Return as many steps of drawn actions; ``exec_start`` of them are of the prompt."""
+    actions = np.random.default_rng(seed).uniform(-1, 1, (frames, 7)).astype(np.float32)
+    return resimulate(get_task(task_name), seed, actions, exec_start)
+
+
+def beginning(demo: Demonstration, frames: int) -> Demonstration:
+    """Return the first steps of a demonstration as one of its own."""
+    found = resimulate(demo.task, demo.seed, demo.applied[:frames], demo.exec_start)
+    executed = None if demo.executed is None else demo.executed[:frames]
+    return replace(
+        found, actions=demo.actions[:frames], executed=executed, referent=demo.referent, variant=demo.variant
+    )
+
+
+def with_pictures(demo: Demonstration, size: int) -> Demonstration:
+    """Return it with what the cameras show, and the scene's model file."""
+    sim = Simulation(demo.task, RenderSettings(size, size))
+    sim.reset(demo.seed)
+    images: dict[str, list[np.ndarray]] = {name: [] for name in CAMERAS}
+    for state in demo.states:
+        sim.set_state(state, demo.fixture_poses)
+        for name, camera in CAMERAS.items():
+            images[name].append(sim.render(camera))
+    xml = model_file(demo.task, demo.fixture_poses)
+    return replace(demo, images={name: np.stack(frames) for name, frames in images.items()}, model_xml=xml)
