@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -41,6 +42,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import checkpoint_folder
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks.catalogue import get_task, task_names
+from tests.support.short_demonstrations import beginning, drawn_steps
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
@@ -74,8 +76,14 @@ def butter() -> Demonstration:
 
 
 @pytest.fixture(scope="module")
-def dataset_folder(stove, butter, tmp_path_factory) -> Path:
-    return write_dataset([stove, butter], tmp_path_factory.mktemp("simulated") / "ds")
+def begun(stove) -> Demonstration:
+    return beginning(stove, 50)
+
+
+@pytest.fixture(scope="module")
+def dataset_folder(begun, tmp_path_factory) -> Path:
+    """What takes few steps to play again."""
+    return write_dataset([begun, drawn_steps(BUTTER, SEED, 15, 5)], tmp_path_factory.mktemp("simulated") / "ds")
 
 
 def tree_hash(root: Path) -> dict[str, str]:
@@ -121,15 +129,11 @@ def test_without_the_prompt_video(butter):
     assert demo.scene_hash == butter.scene_hash
 
 
-def test_random_referent_decides_the_variant():
-    task = get_task(BUTTER)
-    if task.num_variants == 1:
-        pytest.skip("the task has no variants")
-    demo = record_demonstration(task, SEED, images=False, referent="random")
-    assert demo.variant == demo.task.variant_index
-    assert replay(demo) is None
+def test_random_referent_decides_the_variant(moved):
+    assert get_task(MILK).num_variants > 1
+    assert moved.variant == moved.task.variant_index
     with pytest.raises(MemobenchError, match="choose variants with 'fixed'"):
-        record_demonstration(task, SEED, images=False, referent="random", variant=1)
+        record_demonstration(get_task(MILK), SEED, images=False, referent="random", variant=1)
 
 
 @pytest.mark.slow
@@ -149,16 +153,20 @@ def test_replay_agrees(stove, butter):
     assert replay(butter) is None
 
 
+IDLING_SEED = SEED + 2
+"""Of few rounds and a short rest."""
+
+
 @cache
 def strict_demonstration(name: str) -> Demonstration:
-    return record_demonstration(get_task(name), SEED, images=False, referent="drawn", perturb=True)
+    return record_demonstration(get_task(name), IDLING_SEED, images=False, referent="drawn", perturb=True)
 
 
 @pytest.mark.parametrize("name", [COUNTING, HIGHLIGHT])
 def test_a_robot_that_idles_is_recorded_at_rest(name):
     """Its step counts through, its actions are zeros, and what a policy sees is the execution's first frame."""
     demo = strict_demonstration(name)
-    begins, found = first_execution_step(get_task(name), SEED, True), labels(demo)
+    begins, found = first_execution_step(get_task(name), IDLING_SEED, True), labels(demo)
     assert demo.success
     assert demo.exec_start == begins > 0
     np.testing.assert_array_equal(found.step, np.arange(len(demo)))
@@ -313,14 +321,16 @@ def test_some_grasps_miss_and_some_are_lost():
 
 def test_replay_agrees_on_moved_arms_and_seen_objects(moved, tmp_path):
     assert replay(moved) is None
-    folder = write_dataset([moved], tmp_path / "ds")
-    episode = read_episode(folder, 0)
-    np.testing.assert_array_equal(episode.columns["executed_action"], moved.applied)
-    np.testing.assert_array_equal(episode.columns["action"], moved.actions)
-    np.testing.assert_array_equal(episode.columns["observation.environment_state"], moved.objects)
     lit = moved.objects.reshape(len(moved), SLOTS, -1)[..., STARTS["highlighted"]].any(axis=1)
     assert lit[: moved.exec_start].any()
     assert not lit[moved.exec_start :].any()
+    demo = beginning(moved, moved.exec_start + 20)
+    np.testing.assert_array_equal(demo.states, moved.states[: len(demo)])
+    folder = write_dataset([demo], tmp_path / "ds")
+    episode = read_episode(folder, 0)
+    np.testing.assert_array_equal(episode.columns["executed_action"], demo.applied)
+    np.testing.assert_array_equal(episode.columns["action"], demo.actions)
+    np.testing.assert_array_equal(episode.columns["observation.environment_state"], demo.objects)
     assert replay(episode) is None
     seen = episode.columns["observation.environment_state"].copy()
     seen[moved.exec_start, 3] += 0.01
@@ -331,24 +341,24 @@ def test_replay_agrees_on_moved_arms_and_seen_objects(moved, tmp_path):
     assert (found.column, found.frame) == ("privileged.environment_state", moved.exec_start), "beside pictures"
 
 
-def test_replay_finds_the_first_disagreement(stove, butter):
-    actions = stove.actions.copy()
+def test_replay_finds_the_first_disagreement(stove, begun):
+    actions = begun.actions.copy()
     actions[40, 0] = np.clip(actions[40, 0] + 0.05, -1, 1)
-    if np.array_equal(actions, stove.actions):
+    if np.array_equal(actions, begun.actions):
         actions[40, 0] -= 0.05
-    found = replay(replace(stove, actions=actions))
+    found = replay(replace(begun, actions=actions))
     assert found is not None
     assert (found.column, found.frame) == ("states", 41)
     assert "states at frame 41" in str(found)
 
-    satisfied = butter.satisfied.copy()
-    satisfied[butter.exec_start + 5] = True
-    found = replay(replace(butter, satisfied=satisfied))
+    satisfied = begun.satisfied.copy()
+    satisfied[5] = True
+    found = replay(replace(begun, satisfied=satisfied))
     assert found is not None
-    assert (found.column, found.frame) == ("checkpoint.completed", butter.exec_start + 5)
+    assert (found.column, found.frame) == ("checkpoint.completed", 5)
 
     assert str(replay(replace(stove, success=False))) == "success: recorded False, replayed True"
-    assert replay(replace(stove, seed=SEED + 1)).column == "states"
+    assert replay(replace(begun, seed=SEED + 1)).column == "states"
 
 
 def test_replay_of_a_dataset_names_column_and_frame(dataset_folder):
@@ -416,19 +426,6 @@ def test_an_episode_is_given_up_when_the_expert_is_through(monkeypatch):
     assert len(demo) == 30 + PATIENCE + HOLD_FRAMES
 
 
-SCRIPT = """
-import sys
-from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.sim.object_layout import SLOTS, STARTS
-from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.catalogue import task_names
-
-if __name__ == "__main__":
-    task = get_task("turn_on_the_stove_and_turn_it_off")
-    generate([task], 3, sys.argv[1], images=False, workers=2)
-"""
-
-
 def children(pid: int) -> list[int]:
     found = []
     for entry in Path("/proc").iterdir():
@@ -452,26 +449,27 @@ def alive(pid: int) -> bool:
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_two_workers_killed_and_resumed(tmp_path):
     """kill -9 of the command ends its workers; going on gives the bytes of an undisturbed run with one worker."""
-    out, script = tmp_path / "ds", tmp_path / "make.py"
-    script.write_text(SCRIPT)
-    process = subprocess.Popen([sys.executable, str(script), str(out)], env={**os.environ, "OMP_NUM_THREADS": "1"})
+    out, task = tmp_path / "ds", get_task(STOVE)
+    pid = os.fork()
+    if not pid:
+        with contextlib.suppress(BaseException):
+            generate([task], 3, out, images=False, workers=2)
+        os._exit(1)
     try:
         deadline = time.monotonic() + 300
         while not list(out.glob(".staging/episodes/[0-9]*")):
-            assert process.poll() is None
+            assert os.waitpid(pid, os.WNOHANG)[0] == 0
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        workers = children(process.pid)
-        os.kill(process.pid, signal.SIGKILL)
+        workers = children(pid)
     finally:
-        process.kill()
-        process.wait()
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
     assert workers
     while any(alive(pid) for pid in workers):
         assert time.monotonic() < deadline, "workers outlived the command"
         time.sleep(0.05)
     assert not is_dataset(out)
-    task = get_task(STOVE)
     summary = generate([task], 3, out, images=False, workers=1)
     assert summary.exit_status == 0
     generate([task], 3, tmp_path / "undisturbed", images=False, workers=1)
