@@ -5,18 +5,29 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Collection, Iterator
+from functools import cache
 
 from tests.support.scripts import load_script
 
 architecture = load_script("architecture")
 PACKAGE = architecture.PACKAGE
-IMPORTS = architecture.read_imports()
-TREES = {name: ast.parse(path.read_text()) for name, path in architecture.modules().items()}
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """Return what each module imports; not read while tests are collected, which every worker does."""
+    return architecture.read_imports()
+
+
+@cache
+def trees() -> dict[str, ast.Module]:
+    """Return each module as it is parsed."""
+    return {name: ast.parse(path.read_text()) for name, path in architecture.modules().items()}
 
 
 def test_the_plan_names_every_package() -> None:
     listed = set(architecture.plan())
-    there = {architecture.package_of(name) for name in IMPORTS} - {""}
+    there = {architecture.package_of(name) for name in imports()} - {""}
     assert listed == there, "docs/develop.md lists the packages, lowest first"
 
 
@@ -24,7 +35,7 @@ def test_imports_go_down_the_plan_only() -> None:
     order = list(architecture.plan())
     upwards = [
         f"{name} imports {target}"
-        for name, targets in IMPORTS.items()
+        for name, targets in imports().items()
         for target in targets
         if architecture.package_of(name) and target != PACKAGE
         if order.index(architecture.package_of(target)) > order.index(architecture.package_of(name))
@@ -34,10 +45,10 @@ def test_imports_go_down_the_plan_only() -> None:
 
 def test_what_is_imported_from_the_project_is_there() -> None:
     """The type checker lets an import of a module that is gone pass."""
-    known = set(IMPORTS)
+    known = set(imports())
     absent = [
         f"{name} imports {source}"
-        for name, tree in TREES.items()
+        for name, tree in trees().items()
         for source, _ in architecture.imported(tree)
         if source.partition(".")[0] == PACKAGE and source not in known
     ]
@@ -45,7 +56,7 @@ def test_what_is_imported_from_the_project_is_there() -> None:
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:
-    assert architecture.circle(IMPORTS) == []
+    assert architecture.circle(imports()) == []
 
 
 def test_a_circle_is_found() -> None:
@@ -57,7 +68,7 @@ def test_no_module_of_one_system_is_imported() -> None:
     """Each can be imported on Windows and macOS, whose users read reports and train without the simulator."""
     of_unix = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
     of_windows = {"_winapi", "msvcrt", "winreg"}
-    found = [(name, source) for name, tree in TREES.items() for source, _ in architecture.imported(tree)]
+    found = [(name, source) for name, tree in trees().items() for source, _ in architecture.imported(tree)]
     assert [(name, source) for name, source in found if source in of_unix | of_windows] == []
 
 
@@ -76,7 +87,7 @@ def test_files_are_written_whole_in_one_place() -> None:
     """Elsewhere finished folders are moved, by the one process that holds their destination."""
     movers = ("io", "datasets.staging", "datasets.lerobot_format.assembling", "run.demo")
     allowed = {f"{PACKAGE}.{name}" for name in movers}
-    assert [(name, call) for name, tree in TREES.items() for call in renamed(tree) if name not in allowed] == []
+    assert [(name, call) for name, tree in trees().items() for call in renamed(tree) if name not in allowed] == []
 
 
 def test_a_renaming_is_found() -> None:
@@ -100,16 +111,16 @@ def private_names(tree: ast.AST, known: Collection[str]) -> Iterator[str]:
 
 
 def test_no_private_name_crosses_modules() -> None:
-    assert [(name, found) for name, tree in TREES.items() for found in private_names(tree, TREES)] == []
+    assert [(name, found) for name, tree in trees().items() for found in private_names(tree, trees())] == []
 
 
 def test_a_private_name_is_found() -> None:
     source = f"from {PACKAGE}.sim import world\nfrom {PACKAGE}.io import _to_disk\nworld._x, world.__doc__"
-    assert list(private_names(ast.parse(source), TREES)) == [f"{PACKAGE}.io._to_disk", "world._x"]
+    assert list(private_names(ast.parse(source), trees())) == [f"{PACKAGE}.io._to_disk", "world._x"]
 
 
 def test_the_picture_shows_the_imports_of_today() -> None:
-    wanted = {here: targets for here, targets in architecture.direct(architecture.arrows(IMPORTS)).items() if targets}
+    wanted = {here: targets for here, targets in architecture.direct(architecture.arrows(imports())).items() if targets}
     assert architecture.drawn() == wanted, "draw it anew: python scripts/architecture.py"
 
 
