@@ -149,10 +149,12 @@ def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
     }
 
 
-NAMES = ("reset", "mixed rows", "one queue", "per chunk", "prompt", "late", "finished", "noise", "needs")
+NAMES = ("reset", "mixed rows", "per chunk", "prompt", "late", "noise", "needs")
+MORE = ("one queue", "finished")
+"""What names these names mixed rows too."""
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE)])
 def test_a_flaw_is_named(name: str, window: Subject) -> None:
     base = type(window.policy)
     window.policy.__class__, expected = flaws(base)[name]

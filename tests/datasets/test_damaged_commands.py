@@ -411,13 +411,13 @@ def cut(path: Path) -> None:
     ("pattern", "damage"),
     [
         ("data/**/*.parquet", cut),
-        ("data/**/*.parquet", zeroed),
+        pytest.param("data/**/*.parquet", zeroed, marks=pytest.mark.slow),
         ("meta/episodes/**/*.parquet", cut),
-        ("meta/stats.json", cut),
+        pytest.param("meta/stats.json", cut, marks=pytest.mark.slow),
         ("meta/stats.json", Path.unlink),
         ("meta/tasks.parquet", Path.unlink),
         ("videos/*wrist_image/**/*.mp4", cut),
-        ("videos/*wrist_image/**/*.mp4", Path.unlink),
+        pytest.param("videos/*wrist_image/**/*.mp4", Path.unlink, marks=pytest.mark.slow),
     ],
     ids=[
         "table cut",

@@ -446,6 +446,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_two_workers_killed_and_resumed(tmp_path):
     """kill -9 of the command ends its workers; going on gives the bytes of an undisturbed run with one worker."""
