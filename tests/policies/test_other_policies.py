@@ -324,7 +324,8 @@ def test_a_policy_that_reads_prompts_is_shown_them(
         return select(this, batch, **options)
 
     monkeypatch.setattr(MemobenchExpertPolicy, "select_action", selected)
-    lerobot_eval("--policy.type=memobench_expert", "--env.expert_action=true", "--env.horizon=2")
+    nothing_drawn = "--env.obs_type=environment_state_agent_pos"
+    lerobot_eval("--policy.type=memobench_expert", "--env.expert_action=true", "--env.horizon=2", nothing_drawn)
     assert [sum(row == PROMPT for row in rows) for rows in zip(*seen, strict=True)] == PROMPTS
     assert read_protocol_file(tmp_path)["prompt_in"] == "steps"
 
