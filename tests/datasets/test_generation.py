@@ -460,6 +460,19 @@ def test_the_estimates_are_those_of_the_full_runs():
 # --- damage ---
 
 
+@pytest.fixture(scope="module")
+def finished_once(tmp_path_factory):
+    return tmp_path_factory.mktemp("finished") / "ds"
+
+
+@pytest.fixture
+def finished(tasks, recorded, finished_once):
+    """A finished dataset in both formats, made once; tests damage copies."""
+    if not finished_once.exists():
+        run(tasks, finished_once, formats=("lerobot", "hdf5"))
+    return finished_once
+
+
 @pytest.mark.parametrize(
     ("pattern", "said"),
     [
@@ -471,9 +484,8 @@ def test_the_estimates_are_those_of_the_full_runs():
     ],
 )
 @pytest.mark.parametrize("how", ["cut", "gone"])
-def test_a_damaged_dataset_is_not_called_finished(tasks, recorded, tmp_path, pattern, said, how):
-    out = tmp_path / "ds"
-    run(tasks, out, formats=("lerobot", "hdf5"))
+def test_a_damaged_dataset_is_not_called_finished(tasks, recorded, finished, tmp_path, pattern, said, how):
+    out = Path(shutil.copytree(finished, tmp_path / "ds"))
     (path,) = out.glob(pattern)
     if how == "gone":
         path.unlink()
@@ -571,7 +583,7 @@ def kill_at(call: int, work) -> bool:
         os._exit(1)
 
 
-@pytest.mark.parametrize("every", [19, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [23, pytest.param(2, marks=pytest.mark.slow)])
 def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path, every):
     """Kill at every n-th change, resume, compare with an undisturbed run, byte for byte."""
     out = tmp_path / "ds"
