@@ -108,13 +108,18 @@ class EvaluationPlan:
     @property
     def seeds(self) -> range:
         """Seeds of the scenes; where each is run with each variant, those of all tasks, whose numbers of it differ."""
-        from lerobot_memobench.tasks.catalogue import load_task
-
         base, first, last = self.environment.seed_base, self.grid.first, self.grid.first + self.grid.runs - 1
         if self.environment.evidence:
-            variants = [len(load_task(task.folder).random_variants) for task in self.grid.tasks]
+            variants = self.variants.values()
             first, last = first // max(variants), last // min(variants)
         return range(base + first, base + last + 1)
+
+    @property
+    def variants(self) -> dict[str, int]:
+        """Task -> with how many variants each of its scenes is run where evidence is asked."""
+        from lerobot_memobench.tasks.catalogue import load_task
+
+        return {task.name: len(load_task(task.folder).random_variants) for task in self.grid.tasks}
 
     @property
     def draws(self) -> bool:
@@ -244,11 +249,9 @@ def check_scenes(plan: EvaluationPlan) -> None:
     Raises:
         MemobenchError: of a task there would be no whole scene.
     """
-    from lerobot_memobench.tasks.catalogue import load_task
-
     if not plan.environment.evidence:
         return
-    variants = {task.name: len(load_task(task.folder).random_variants) for task in plan.grid.tasks}
+    variants = plan.variants
     name = max(variants, key=lambda name: variants[name])
     if variants[name] > plan.grid.runs:
         raise MemobenchError(
