@@ -240,6 +240,7 @@ def test_without_memory_fusion_it_is_plain_pi05(dataset_root: Path, tmp_path: Pa
     [
         ({"memory_fusion": "none", "align": "semantic"}, "no memory to align"),
         ({"shuffle_subgoals": True}, "changes nothing"),
+        ({"open_gate": True, "memory_fusion": "context"}, "has no gate"),
     ],
 )
 def test_controls_without_effect_are_refused(fields: dict[str, Any], message: str) -> None:

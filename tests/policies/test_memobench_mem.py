@@ -22,7 +22,7 @@ from lerobot_memobench.datasets.feature_cache.layout import find_cache
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem, processor_memobench_mem
-from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder, make_alignment
+from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder, make_alignment, make_text_encoder
 from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
@@ -586,6 +586,14 @@ def test_word_text_encoder_tells_texts_apart() -> None:
     similarity.fill_diagonal_(0)
     similarity[0, 4] = similarity[4, 0] = 0
     assert similarity.max() < 0.99
+
+
+def test_label_text_encoder_knows_which_texts_are_equal_and_no_words() -> None:
+    texts = ["pick up the red cup", "pick up the green cup", "pick up the red cup"]
+    labels, hashed = (make_text_encoder(name, 512)(texts) for name in ("labels", "words"))
+    assert labels[0] @ labels[2] > 0.999
+    assert abs(labels[0] @ labels[1]) < 0.2 < hashed[0] @ hashed[1]
+    assert make_text_encoder("labels", 512).key != make_text_encoder("words", 512).key
 
 
 def test_cache_of_one_dataset_is_not_used_for_another(trained: Any) -> None:

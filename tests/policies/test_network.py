@@ -270,6 +270,16 @@ def test_modulator_starts_at_zero() -> None:
     assert not shift.any()
 
 
+@pytest.mark.parametrize("opened", [False, True])
+def test_memory_gets_gradients_from_the_first_update_on_where_the_gate_is_open(opened: bool) -> None:
+    ours = MemoryPI05(_config(size="tiny", open_gate=opened))
+    tokens, *rest = _memory(ours.config)
+    _hand_over(ours, tokens.requires_grad_(), *rest)
+    _losses(ours, _inputs(ours.config)).mean().backward()
+    assert tokens.grad is not None
+    assert tokens.grad.any() == opened
+
+
 def test_modulator_sees_only_unmasked_memory() -> None:
     modulator, actions, memory = _modulator(), torch.randn(1, 5, 32), torch.randn(1, 6, 32)
     mask = torch.tensor([[True, True, True, True, False, False]])

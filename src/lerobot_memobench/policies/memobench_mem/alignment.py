@@ -373,12 +373,24 @@ class WordTextEncoder:
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
         """(N, dim) float32, normalised."""
-        rows = []
-        for text in texts:
-            tokens = words(text)
-            pairs = [f"{first} {second}" for first, second in itertools.pairwise(tokens)]
-            rows.append(torch.stack([self._vector(token) for token in [*tokens, *pairs]]).sum(dim=0))
+        rows = [torch.stack([self._vector(token) for token in self._tokens(text)]).sum(dim=0) for text in texts]
         return F.normalize(torch.stack(rows), dim=-1)
+
+    def _tokens(self, text: str) -> list[str]:
+        tokens = words(text)
+        return [*tokens, *(f"{first} {second}" for first, second in itertools.pairwise(tokens))]
+
+
+class LabelTextEncoder(WordTextEncoder):
+    """One random vector per text, whatever its words: a label. What an alignment gains by it is not language's."""
+
+    @property
+    def key(self) -> str:
+        """Identity of the embeddings."""
+        return f"labels-1-{self.dim}"
+
+    def _tokens(self, text: str) -> list[str]:
+        return [text]
 
 
 class SiglipTextEncoder:
@@ -428,5 +440,6 @@ class SiglipTextEncoder:
 
 
 def make_text_encoder(name: str, dim: int, device: str = "cpu") -> WordTextEncoder | SiglipTextEncoder:
-    """``words`` gives the built-in encoder, anything else is a SigLIP model's folder or repository."""
-    return WordTextEncoder(dim) if name == "words" else SiglipTextEncoder(name, dim, device)
+    """``words`` and ``labels`` give the built-in encoders, anything else is a SigLIP model's folder or repository."""
+    built_in = {"words": WordTextEncoder, "labels": LabelTextEncoder}
+    return built_in[name](dim) if name in built_in else SiglipTextEncoder(name, dim, device)

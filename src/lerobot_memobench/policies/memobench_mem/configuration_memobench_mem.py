@@ -101,7 +101,7 @@ class Dimensions:
     vocabulary: int
     tokenizer: str  # "words" (built here) or a Hugging Face tokenizer
     tokenizer_max_length: int
-    text_encoder: str  # "words" (built here) or a folder or repository of a SigLIP model
+    text_encoder: str  # "words" or "labels" (built here) or a folder or repository of a SigLIP model
     text_dim: int
     learning_rate: float
     normalization: str = "QUANTILES"  # LeRobot's mode for states and actions
@@ -179,7 +179,7 @@ rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` o
 `policies.compatibility` compares with the checkpoint's, and ``freeze_vision_encoder`` has one value here."""
 OF_TRAINING = _names(
     """
-    detection_noise base_weights align align_weight subgoal_level shuffle_subgoals
+    detection_noise base_weights open_gate align align_weight subgoal_level shuffle_subgoals
     shuffle_seed text_encoder feature_cache_dir ema_decay frames_per_episode task_weights
     train_expert_only warmup_fraction min_lr_ratio gradient_checkpointing time_sampling_beta_alpha
     time_sampling_beta_beta time_sampling_scale time_sampling_offset optimizer_lr optimizer_betas optimizer_eps
@@ -256,7 +256,8 @@ class MemobenchMemConfig(PI05Config):
     shuffle_seed: int = 7
     """Seed of that shuffle; the result is the same for every epoch and on every machine."""
     text_encoder: str | None = None
-    """Encoder of subgoals: ``words`` (a hash of words), or folder or repository of a SigLIP model; none: the size's."""
+    """Encoder of subgoals: ``words`` (a hash of words), ``labels`` (a vector for each text, whatever its words), or
+    folder or repository of a SigLIP model; none: the size's."""
 
     # -- memory
     memory: str = FROM_SIZE
@@ -267,6 +268,9 @@ class MemobenchMemConfig(PI05Config):
     memory_fusion: str = FROM_SIZE
     """How actions read memory: ``modulation``, ``context`` (memory joins the prefix), ``own``, where the mechanism has
     a way of its own, or ``none`` without one. None: ``own``, or else ``modulation``."""
+    open_gate: bool = False
+    """With ``memory_fusion=modulation``, whether training begins with a random modulation, by which memory gets
+    gradients from the first update on; else it begins with none, as plain pi0.5."""
     subgoals: dict[str, list[str]] | None = None
     """Instruction -> texts of its checkpoints, where the memory learns from them; none: those of the dataset."""
     oracle_memory: bool = False
@@ -541,6 +545,11 @@ class MemobenchMemConfig(PI05Config):
             raise MemobenchError(
                 "--policy.shuffle_subgoals=true changes nothing with --policy.align=none, which reads no subgoals; "
                 "name an alignment too."
+            )
+        if self.open_gate and self.memory_fusion != MODULATION:
+            raise MemobenchError(
+                f"--policy.open_gate=true changes nothing with memory_fusion={self.memory_fusion}, which has no gate; "
+                f"leave it out, or pass --policy.memory_fusion={MODULATION}."
             )
 
     # -- properties that follow ------------------------------------------------------------------------------------

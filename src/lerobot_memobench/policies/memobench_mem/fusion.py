@@ -264,13 +264,22 @@ class Modulation(MemoryFusion):
         """Begin a pass over this memory in every layer."""
         self.shared.set(memory.through(cast(nn.Linear, self.model.memory_to_expert)))
 
+    @property
+    def modulators(self) -> list[MemoryModulator]:
+        """Those of the expert's layers."""
+        layers = self.model.paligemma_with_expert.gemma_expert.model.layers
+        return [layer.post_attention_layernorm.modulator for layer in layers]
+
+    def open_gate(self) -> None:
+        """Draw what starts at zero, so that memory gets gradients from the first update on."""
+        for modulator in self.modulators:
+            modulator.modulation.reset_parameters()
+
     @contextmanager
     def watched(self) -> Iterator[list[Tensor]]:
         """Yield how much the modulators look at each token."""
         found: list[Tensor] = []
-        layers = self.model.paligemma_with_expert.gemma_expert.model.layers
-        modulators = [layer.post_attention_layernorm.modulator for layer in layers]
-        with hooked(modulators, lambda modulator, inputs, _: found.append(modulator.weights(*inputs))):
+        with hooked(self.modulators, lambda modulator, inputs, _: found.append(modulator.weights(*inputs))):
             yield found
 
     def owns(self, name: str) -> bool:

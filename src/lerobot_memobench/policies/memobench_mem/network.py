@@ -75,6 +75,8 @@ class MemoryPI05(PI05Pytorch):
             return
         self.memory = make_memory(config, self.paligemma_with_expert.perception)
         self.fusion = (self.memory.fusion or FUSIONS[config.memory_fusion])(self, vlm_width, width)
+        if config.open_gate and isinstance(self.fusion, Modulation):
+            self.fusion.open_gate()
         self.paligemma_with_expert.fusion = self.fusion
 
     def set_memory(self, memory: MemoryTokens) -> None:
