@@ -60,10 +60,8 @@ def run_once(
     Raises:
         MemobenchError: the command failed, or another one stands beside the log.
     """
-    kept = log.with_suffix(".json")
-    spent = Cost(0.0, 0.0)
-    if kept.is_file():
-        told = read_json(kept, dict[str, object], "remove it, and the command is run again")
+    kept, spent = log.with_suffix(".json"), Cost(0.0, 0.0)
+    if told := kept_of(log):
         if told.get("words") != list(words):
             raise MemobenchError(
                 f"{kept} is of another command; name another --out, or remove the file and what the command has made"
