@@ -118,20 +118,22 @@ class Cell:
 
     def training_words(self) -> list[str]:
         """Return the command that trains its policy."""
-        row, data = self.grid.rows[self.row], Demonstrations(self.grid, self.suite, self.out).folder
+        row, suite = self.grid.rows[self.row], self.grid.suites[self.suite]
+        data = Demonstrations(self.grid, self.suite, self.out).folder
         rate = self.tuned or chosen_rate(self.out, self.suite, self.row)
         tuned = [] if rate is None else [f"policy.optimizer_lr={rate:g}"]
         short = [] if self.tuned is None else [f"steps={self.grid.tuning.steps}"]
-        told = [*(row.policy or self.grid.policy), *self.grid.training, *row.training, *tuned, *short]
+        policy = row.policy or [*self.grid.policy, *suite.weight_words]
+        told = [*policy, *self.grid.training, *row.training, *tuned, *short]
         rest = [f"dataset={data}", f"seed={self.seed}", f"output_dir={self.policy}"]
         return ["lerobot", "train", *_last_of_each(told), *rest]
 
     def evaluation_words(self, part: str) -> list[str]:
         """Return the command that rolls its policy out."""
-        row = self.grid.rows[self.row]
+        row, suite = self.grid.rows[self.row], self.grid.suites[self.suite]
         own = [] if part == ROLLOUTS else self.grid.controls[part]
         short = [] if self.tuned is None else [f"episodes={self.grid.tuning.episodes}"]
-        told = [*self.grid.evaluation, *self.grid.suites[self.suite].evaluation, *row.evaluation, *own, *short]
+        told = [*self.grid.evaluation, *suite.evaluation, *suite.task_words, *row.evaluation, *own, *short]
         return [
             *("lerobot", "eval", "env=memobench", f"policy={self.policy}"),
             *_last_of_each(told),

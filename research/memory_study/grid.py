@@ -10,14 +10,33 @@ from pathlib import Path
 import draccus
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 
 @dataclass(frozen=True)
 class Suite:
-    """Words of ``memobench generate`` for its demonstrations, and of ``lerobot eval env=memobench``."""
+    """What is learned and rolled out.
+
+    Attributes:
+        demonstrations: words of ``memobench generate``. evaluation: of ``lerobot eval env=memobench``.
+        tasks: tasks or memory types that count; none: all of the demonstrations'.
+    """
 
     demonstrations: list[str]
     evaluation: list[str] = field(default_factory=list)
+    tasks: list[str] = field(default_factory=list)
+
+    @property
+    def task_words(self) -> list[str]:
+        """Return the words of an evaluation of these tasks."""
+        return [f"tasks={','.join(self.tasks)}"] if self.tasks else []
+
+    @property
+    def weight_words(self) -> list[str]:
+        """Return the words of a training of ``memobench_mem`` that draws these tasks alone."""
+        weights = {kind: 0 for kind in MEMORY_TYPES} | dict.fromkeys(self.tasks, 1)
+        told = ", ".join(f"{name}: {weights[name]}" for name in {**dict.fromkeys(self.tasks), **weights})
+        return [f"policy.task_weights={{{told}}}"] if self.tasks else []
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,15 @@ def test_the_first_training_seed_alone_runs_controls(grid: Grid, tmp_path: Path)
     assert second.parts == [ROLLOUTS]
 
 
+def test_the_tasks_of_a_suite_alone_are_drawn_and_rolled_out(tmp_path: Path) -> None:
+    some = SMALL.replace("evaluation: [suite=strict]", "evaluation: [suite=strict], tasks: [object, find_it]")
+    (tmp_path / "grid.yaml").write_text(some)
+    cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "no memory", 0)
+    weights = "policy.task_weights={object: 1, find_it: 1, temporal: 0, spatial: 0, procedural: 0}"
+    assert weights in cell.training_words()
+    assert "tasks=object,find_it" in cell.evaluation_words(ROLLOUTS)
+
+
 def test_words_choose_cells(grid: Grid) -> None:
     assert chosen(grid, []) == [
         ("strict", "no memory", 0),
