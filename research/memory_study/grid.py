@@ -34,8 +34,9 @@ class Suite:
     @property
     def weight_words(self) -> list[str]:
         """Return the words of a training of ``memobench_mem`` that draws these tasks alone."""
-        weights = {kind: 0 for kind in MEMORY_TYPES} | dict.fromkeys(self.tasks, 1)
-        told = ", ".join(f"{name}: {weights[name]}" for name in {**dict.fromkeys(self.tasks), **weights})
+        others = (kind for kind in MEMORY_TYPES if kind not in self.tasks)
+        weights = dict.fromkeys(self.tasks, 1) | dict.fromkeys(others, 0)
+        told = ", ".join(f"{name}: {weight}" for name, weight in weights.items())
         return [f"policy.task_weights={{{told}}}"] if self.tasks else []
 
 
