@@ -20,6 +20,7 @@ from pathlib import Path
 
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.evidence_controls import AVERAGE, Evidence
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, mean_row, percent
 from lerobot_memobench.evaluation.records import CARD_FILE, read_runs
 from lerobot_memobench.evaluation.report import write_report
@@ -34,6 +35,8 @@ PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmark" / "results.md")
 CLAIMS = NOTES / "figures.md"
 NOT_KEPT = "log not kept"
 ROLLOUTS = "rollouts"
+FOLLOWS, CHANCE = "follows", "chance"
+"""Columns of an evaluation by evidence."""
 INTERVAL = re.compile(r"[\d.]+\s\[[\d.]+–[\d.]+\]")
 
 Figures = Mapping[str, str]
@@ -72,12 +75,20 @@ def figures_of_tasks(tasks: Mapping[str, Row]) -> Figures:
 def of_log(folder: Path) -> Figures:
     """Return the figures of a kept log, by the report's own sums."""
     (run,) = read_runs([folder])
-    summary = run.summary
+    summary, found = run.summary, run.evidence.rates[AVERAGE].get(AVERAGE) if run.evidence else None
     return {
+        **(of_evidence(found) if found else {}),
         **{metric: in_words(summary.average[metric]) for metric in METRICS},
         **{name: f"{percent(row['SR'].value):.1f}" for name, row in summary.memory_types.items()},
         ROLLOUTS: f"{summary.rollouts:,}",
     }
+
+
+def of_evidence(found: Evidence) -> Figures:
+    """Return how often choices followed the evidence, and how often they could have without the past."""
+    rate = found.rates[FOLLOWS]
+    told = [f"{percent(part):.1f}" for part in (rate.value, rate.low, rate.high, found.chance)]
+    return {FOLLOWS: "{} [{}–{}]".format(*told[:3]), CHANCE: told[3]}
 
 
 def of_card(page: Path) -> Figures:
@@ -144,7 +155,7 @@ def rows_of(page: Path) -> Iterator[tuple[list[str], Figures, str]]:
     A row of results is one with an interval, or of a table of SR or of memory types.
     """
     for head, rows in tables(page):
-        known = [name for name in head if name in (*METRICS, *MEMORY_TYPES, ROLLOUTS)]
+        known = [name for name in head if name in (*METRICS, *MEMORY_TYPES, ROLLOUTS, FOLLOWS, CHANCE)]
         for row in rows:
             if {"SR", "temporal"} & set(known) or any(map(INTERVAL.search, row)):
                 told = {name: row[head.index(name)] for name in known}
