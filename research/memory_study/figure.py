@@ -56,6 +56,6 @@ def _draw_row(axis: Any, place: int, of_seeds: list[float], chance: float | None
     mean = sum(of_seeds) / len(of_seeds)
     axis.barh(place, mean, 0.7, color=COLOURS[list(MEASURES).index(measure)], alpha=0.75)
     axis.plot(of_seeds, [place] * len(of_seeds), "o", color="black", markersize=3)
-    axis.text(1, place, f"{mean:.0f}", va="center", fontsize=8, color="white" if mean > 8 else "black")
+    axis.text(1, place, f"{mean:.0f}", va="center", fontsize=8)
     if measure == "follows" and chance is not None:
         axis.plot([chance, chance], [place - 0.42, place + 0.42], color=CHANCE_COLOUR, linewidth=2)
