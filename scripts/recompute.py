@@ -52,8 +52,13 @@ def in_words(rate: Rate) -> str:
     """Return a rate as documents write it: ``97.9 [96.9–98.5]``; 0 and 100 without a decimal."""
     if rate.value is None or rate.interval is None:
         return "–"
-    parts = [percent(part) for part in (rate.value, *rate.interval)]
-    value, low, high = (f"{part:.0f}" if part in (0, 100) else f"{part:.1f}" for part in parts)
+    return with_interval(rate.value, *rate.interval)
+
+
+def with_interval(*parts: float) -> str:
+    """Return a value and the ends of its interval, of 0 to 1, as documents write them."""
+    told = map(percent, parts)
+    value, low, high = (f"{part:.0f}" if part in (0, 100) else f"{part:.1f}" for part in told)
     return f"{value} [{low}–{high}]"
 
 
@@ -87,8 +92,7 @@ def of_log(folder: Path) -> Figures:
 def of_evidence(found: Evidence) -> Figures:
     """Return how often choices followed the evidence, and how often they could have without the past."""
     rate = found.rates[FOLLOWS]
-    told = [f"{percent(part):.1f}" for part in (rate.value, rate.low, rate.high, found.chance)]
-    return {FOLLOWS: "{} [{}–{}]".format(*told[:3]), CHANCE: told[3]}
+    return {FOLLOWS: with_interval(rate.value, rate.low, rate.high), CHANCE: f"{percent(found.chance):.1f}"}
 
 
 def of_card(page: Path) -> Figures:
