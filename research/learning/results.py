@@ -17,8 +17,17 @@ import numpy as np
 from scipy.stats import ttest_1samp
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import Rate, Record, by_task, mean_rate, success_rate
-from lerobot_memobench.evaluation.statistics import DRAWS, Array, detectable, difference_interval, holm, sign_flip
+from lerobot_memobench.evaluation.metrics import Rate, Record, by_task, mean_rate, success_rate, wilson
+from lerobot_memobench.evaluation.statistics import (
+    DRAWS,
+    Array,
+    Estimate,
+    detectable,
+    difference_interval,
+    holm,
+    percentiles,
+    sign_flip,
+)
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.tasks.failures import REFERENCE_DRIFT, WRONG_ORDER
 from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT_FAILURES
@@ -118,15 +127,32 @@ def _weights(records: Sequence[Record], episodes: Sequence[Key]) -> tuple[Array,
     return weights, list(places.values())
 
 
+def average_success(rollouts: Runs) -> Estimate:
+    """Return an arm's success, averaged as the report averages, with its 95 % interval over seeds and episodes."""
+    episodes = _episodes(rollouts)
+    weights, tasks = _weights(rollouts[0], episodes)
+    table = _table(rollouts, episodes, "training seeds")
+    value = float((table @ weights).mean())
+    low, high = percentiles(_draws(table, weights, tasks, np.random.default_rng(0)))
+    least, most = wilson(value, 1 / float(np.sum(weights**2)))  # an episode counts once, whoever rolls it out
+    return Estimate(value, min(low, least), max(high, most))
+
+
+def _draws(table: Array, weights: Array, tasks: Sequence[Sequence[int]], rng: np.random.Generator) -> Array:
+    """Return bootstrap draws of the weighted mean of a table (training seeds, episodes)."""
+    draws = np.empty(DRAWS)
+    for draw in range(DRAWS):
+        seeds = rng.integers(0, len(table), len(table))
+        chosen = np.concatenate([rng.choice(places, len(places)) for places in tasks])
+        draws[draw] = float(table[seeds].mean(axis=0)[chosen] @ weights[chosen])
+    return draws
+
+
 def _interval(
     gap: Array, weights: Array, tasks: Sequence[Sequence[int]], rng: np.random.Generator, base: Array
 ) -> tuple[float, float]:
     """Return the 95 % interval of the weighted mean of differences from ``base`` (training seeds, episodes)."""
-    draws = np.empty(DRAWS)
-    for draw in range(DRAWS):
-        seeds = rng.integers(0, len(gap), len(gap))
-        chosen = np.concatenate([rng.choice(places, len(places)) for places in tasks])
-        draws[draw] = float(gap[seeds].mean(axis=0)[chosen] @ weights[chosen])
+    draws = _draws(gap, weights, tasks, rng)
     before = base.mean(axis=0)  # an episode counts once, however many policies were trained
     return difference_interval(draws, before, before + gap.mean(axis=0), weights)
 

@@ -5,6 +5,7 @@ A command is run as a user would; its output is in a file and its cost known.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
@@ -104,9 +105,17 @@ def remove_unfinished(policy: Path, log: Path) -> None:
 
 
 def _run(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> tuple[int, Cost]:
-    """Run a command to its end; return its exit status and what it and its own processes took."""
+    """Run a command to its end; return its exit status and what it and its own processes took.
+
+    Raises:
+        MemobenchError: it is running already: whoever started it was killed, and it was not.
+    """
     started = time.monotonic()
     with log.open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the command inherits it, and holds it to its end
+        except BlockingIOError:
+            raise MemobenchError(f"a command from before still writes {log}; wait for its end, or end it") from None
         process = subprocess.Popen(
             [sys.executable, "-m", MODULES[words[0]], *words[1:]],
             stdout=file,

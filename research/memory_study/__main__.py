@@ -13,14 +13,15 @@ import typer
 
 from lerobot_memobench.cli.console import console, counting, say
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.io import write_file
 from lerobot_memobench.jobs.executors import read_options, run_jobs
 from lerobot_memobench.jobs.processes import Advance, Job
 from research.command import run
 from research.memory_study.cells import Cell, Demonstrations, choose_rates, tuning
-from research.memory_study.figure import draw
+from research.memory_study.figure import draw_all
 from research.memory_study.grid import chosen, read_grid
-from research.memory_study.tables import tables
+from research.memory_study.tables import named_rollouts, tables
 
 GRID = Path(__file__).with_name("grid.yaml")
 
@@ -35,11 +36,12 @@ def study(
         bool, typer.Option("--plan", help="Say what would be run, and about how long; run nothing.")
     ] = False,
     tune: Annotated[bool, typer.Option("--tune", help="Choose learning rates first, by short trainings.")] = False,
+    browse: Annotated[bool, typer.Option("--html", help="Make reports for the browser, one per suite.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
     executor: Annotated[str, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")] = "processes",
     executor_option: Annotated[list[str] | None, typer.Option(help="key=value for datatrove's; repeatable.")] = None,
 ) -> None:
-    """Train and evaluate every cell that is not done, then print and keep the tables and the figure."""
+    """Train and evaluate every cell that is not done, then print and keep the tables and figures."""
     read = read_grid(grid)
     places = chosen(read, only or [])
     if not places:
@@ -66,7 +68,11 @@ def study(
             say("; ".join(f"{suite}, {row}: learning rate {rate:g}" for (suite, row), rate in rates.items()))
     text = "\n\n".join(filter(None, (tables(read, out, suite) for suite in read.suites)))
     write_file(out / "study.md", text + "\n")
-    draw(read, out, out / "study.png")
+    draw_all(read, out)
+    if browse:
+        for suite in read.suites:
+            if folders := [f"{name}={folder}" for name, folder in named_rollouts(read, out, suite)]:
+                say(f"open {write_html(folders, out / 'report' / suite).page}")
     say(text)
 
 

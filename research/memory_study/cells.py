@@ -17,6 +17,12 @@ from research.memory_study.grid import Grid, folder_name
 
 ROLLOUTS = "rollouts"
 """The evaluation itself, beside a cell's controls."""
+TRAINING = "training"
+
+
+def after(updates: int) -> str:
+    """Return what the evaluation of the checkpoint of so many updates is called."""
+    return f"after {updates}"
 
 
 @dataclass(frozen=True)
@@ -90,27 +96,34 @@ class Cell:
 
     @property
     def parts(self) -> list[str]:
-        """The evaluation, and of a row's first training seed its controls."""
-        return [ROLLOUTS, *(self.grid.rows[self.row].controls if self.tuned is None and self.seed == 0 else ())]
+        """The evaluation, those of earlier checkpoints, and of a row's first training seed its controls."""
+        if self.tuned is not None:
+            return [ROLLOUTS]
+        row = self.grid.rows[self.row]
+        return [ROLLOUTS, *map(after, row.after), *(row.controls if self.seed == 0 else ())]
 
     def evaluation(self, part: str) -> Path:
         """The folder of the evaluation or of a control."""
-        return self.folder / part
+        return self.folder / folder_name(part)
+
+    def log(self, part: str) -> Path:
+        """Where the output of the training or of an evaluation goes."""
+        return self.folder / f"{folder_name(part)}.log"
 
     def run(self) -> None:
         """Train, then evaluate, whatever of this is left to do."""
         begun = self.policy / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
         going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
-        log = self.folder / "training.log"
+        log = self.log(TRAINING)
         if going_on is None:
             remove_unfinished(self.policy, log)
         run_once(self.training_words(), log, going_on=going_on)
         for part in self.parts:
-            run_once(self.evaluation_words(part), self.folder / f"{part}.log", how=["resume=true"])
+            run_once(self.evaluation_words(part), self.log(part), how=["resume=true"])
 
     def finished(self) -> bool:
         """Whether nothing is left to do."""
-        return all(ended(self.folder / f"{name}.log") for name in ("training", *self.parts))
+        return all(ended(self.log(part)) for part in (TRAINING, *self.parts))
 
     def failure(self) -> str | None:
         """Nothing: what fails ends the study, and says why."""
@@ -131,20 +144,21 @@ class Cell:
     def evaluation_words(self, part: str) -> list[str]:
         """Return the command that rolls its policy out."""
         row, suite = self.grid.rows[self.row], self.grid.suites[self.suite]
-        own = [] if part == ROLLOUTS else self.grid.controls[part]
+        kept = {after(updates): self.policy / "checkpoints" / f"{updates:06}" for updates in row.after}
+        own = self.grid.controls.get(part, [])
         short = [] if self.tuned is None else [f"episodes={self.grid.tuning.episodes}"]
         told = [*self.grid.evaluation, *suite.evaluation, *suite.task_words, *row.evaluation, *own, *short]
         return [
-            *("lerobot", "eval", "env=memobench", f"policy={self.policy}"),
+            *("lerobot", "eval", "env=memobench", f"policy={kept.get(part, self.policy)}"),
             *_last_of_each(told),
             f"output_dir={self.evaluation(part)}",
         ]
 
     def costs(self) -> dict[str, Cost]:
         """Return what each part has taken so far."""
-        found = {name: kept_of(self.folder / f"{name}.log") for name in ("training", *self.parts)}
+        found = {part: kept_of(self.log(part)) for part in (TRAINING, *self.parts)}
         return {
-            name: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for name, told in found.items() if told
+            part: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for part, told in found.items() if told
         }
 
 

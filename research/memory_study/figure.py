@@ -1,17 +1,31 @@
-"""The study's figure: what each row solves, and how often it follows the evidence, beside chance."""
+"""Figures of the study: what each row solves and follows, what of each task, and how that grew with updates."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from statistics import mean
+from textwrap import shorten
 from typing import Any
 
+from lerobot_memobench.evaluation.metrics import METRICS
 from lerobot_memobench.io import draft_of
 from research.learning.results import COLOURS
+from research.memory_study.cells import ROLLOUTS
 from research.memory_study.grid import Grid
-from research.memory_study.tables import figures_of_rows
+from research.memory_study.tables import curves, evaluated_rows, figures_of_rows, report
 
 CHANCE_COLOUR = "#d55e00"
 MEASURES = {"solved": "solved, %", "follows": "follows the evidence, %"}
+
+
+def draw_all(grid: Grid, out: Path) -> list[Path]:
+    """Draw what has been evaluated into ``out``; return the files."""
+    found = [draw(grid, out, out / "study.png")]
+    for suite in grid.suites:
+        found.append(draw_tasks(grid, out, suite, out / f"tasks_{suite}.png"))
+        found.append(draw_curves(grid, out, suite, out / f"updates_{suite}.png"))
+    return [path for path in found if path]
 
 
 def draw(grid: Grid, out: Path, path: Path) -> Path | None:
@@ -19,11 +33,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
 
     A bar is the mean of training seeds, a dot one of them; an orange line is the best rate without the past.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    plt = _pyplot()
     suites = {suite: found for suite in grid.suites if (found := figures_of_rows(grid, out, suite))}
     if not suites:
         return None
@@ -44,18 +54,81 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     names = [row + (" (privileged)" if grid.rows[row].privileged else "") for row in rows]
     axes[0][0].set_yticks(range(len(rows)), names)
     axes[0][0].invert_yaxis()
+    return _save(figure, path)
+
+
+def draw_tasks(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
+    """Draw the success of each row in each task of a suite to ``path``, beside the best found without a memory."""
+    rows = evaluated_rows(grid, out, suite)
+    if not rows:
+        return None
+    ceilings = grid.suites[suite].ceilings
+    reports = {row: [report(cell, ROLLOUTS)["tasks"] for cell in cells] for row, cells in rows.items()}
+    tasks = list(next(iter(reports.values()))[0])
+    columns = {"best found without": [ceilings.get(task, math.nan) for task in tasks]} if ceilings else {}
+    columns |= {row: [mean(one[task]["SR"] for one in told) for task in tasks] for row, told in reports.items()}
+    figure, axis = _pyplot().subplots(
+        figsize=(4.4 + 0.46 * len(columns), 1.9 + 0.27 * len(tasks)), constrained_layout=True
+    )
+    axis.imshow(
+        [list(line) for line in zip(*columns.values(), strict=True)], cmap="Blues", vmin=0, vmax=100, aspect="auto"
+    )
+    for x, values in enumerate(columns.values()):
+        for y, value in enumerate(values):
+            if not math.isnan(value):
+                axis.text(x, y, f"{value:.0f}", ha="center", va="center", fontsize=7, color="wk"[value < 60])
+    axis.set_xticks(range(len(columns)), list(columns), rotation=45, ha="right", fontsize=8)
+    axis.set_yticks(
+        range(len(tasks)), [shorten(task.replace("_", " "), 52, placeholder="…") for task in tasks], fontsize=8
+    )
+    axis.tick_params(length=0)
+    axis.set_title(f"{suite}: solved, %", fontsize=10)
+    return _save(figure, path)
+
+
+def draw_curves(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
+    """Draw success and satisfied checkpoints against updates to ``path``, of the rows with earlier checkpoints."""
+    found = curves(grid, evaluated_rows(grid, out, suite))
+    if not found:
+        return None
+    figure, axes = _pyplot().subplots(
+        1, len(METRICS), figsize=(2.6 * len(METRICS), 2.9), sharey=True, constrained_layout=True
+    )
+    for axis, metric in zip(axes, METRICS, strict=True):
+        for colour, (row, points) in zip(COLOURS, found.items(), strict=False):
+            seeds = [(updates, value) for updates, told in points for one in told if (value := one[metric]) is not None]
+            means = {n: mean(value for updates, value in seeds if updates == n) for n, _ in seeds}
+            axis.plot(list(means), list(means.values()), "-", color=colour, label=row)
+            axis.plot(*zip(*seeds, strict=True), "o", color=colour, markersize=3)
+        axis.set(ylim=(0, 100), title=metric, xlabel="updates")
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0].set_ylabel(f"{suite}, %")
+    axes[0].legend(fontsize=7, frameon=False, loc="upper left")
+    return _save(figure, path)
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
+
+
+def _save(figure: Any, path: Path) -> Path:
     with draft_of(path) as draft:
         figure.savefig(draft, dpi=130)
-    plt.close(figure)
+    _pyplot().close(figure)
     return path
 
 
 def _draw_row(axis: Any, place: int, of_seeds: list[float], chance: float | None, measure: str) -> None:
     if not of_seeds:
         return
-    mean = sum(of_seeds) / len(of_seeds)
-    axis.barh(place, mean, 0.7, color=COLOURS[list(MEASURES).index(measure)], alpha=0.75)
+    average = mean(of_seeds)
+    axis.barh(place, average, 0.7, color=COLOURS[list(MEASURES).index(measure)], alpha=0.75)
     axis.plot(of_seeds, [place] * len(of_seeds), "o", color="black", markersize=3)
-    axis.text(1, place, f"{mean:.0f}", va="center", fontsize=8)
+    axis.text(1, place, f"{average:.0f}", va="center", fontsize=8)
     if measure == "follows" and chance is not None:
         axis.plot([chance, chance], [place - 0.42, place + 0.42], color=CHANCE_COLOUR, linewidth=2)

@@ -20,11 +20,13 @@ class Suite:
     Attributes:
         demonstrations: words of ``memobench generate``. evaluation: of ``lerobot eval env=memobench``.
         tasks: tasks or memory types that count; none: all of the demonstrations'.
+        ceilings: task -> best success found without a memory, per cent (``research.necessity``).
     """
 
     demonstrations: list[str]
     evaluation: list[str] = field(default_factory=list)
     tasks: list[str] = field(default_factory=list)
+    ceilings: dict[str, float] = field(default_factory=dict)
 
     @property
     def task_words(self) -> list[str]:
@@ -48,6 +50,7 @@ class Row:
         training: words of ``lerobot train``. evaluation: of ``lerobot eval env=memobench``.
         policy: which policy is trained, in words of ``lerobot train``; none: the grid's.
         seeds: training seeds, the first so many numbers. controls: names of those that its first one runs.
+        after: updates after which each training is evaluated too, from the checkpoint that it kept then.
         privileged: whether it is given what the others are not, in training or in rollouts.
     """
 
@@ -56,6 +59,7 @@ class Row:
     policy: list[str] = field(default_factory=list)
     seeds: int = 1
     controls: list[str] = field(default_factory=list)
+    after: list[int] = field(default_factory=list)
     privileged: bool = False
 
 

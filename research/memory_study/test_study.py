@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+import random
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +16,18 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records import read_rollouts
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.run.arguments import read_arguments, split_arguments
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.training import take_training_options
+from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
-from research.learning.stages import Cost
+from research.learning.stages import Cost, ended
 from research.memory_study.__main__ import GRID, planned
 from research.memory_study.cells import ROLLOUTS, Cell, Demonstrations, choose_rates, chosen_rate, tuning
-from research.memory_study.figure import draw
+from research.memory_study.figure import draw_all
 from research.memory_study.grid import Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
 from tests.support.logs import rollout
@@ -133,6 +141,71 @@ def test_a_killed_cell_goes_on_where_it_was(grid: Grid, tmp_path: Path, monkeypa
     assert planned([], [], [cell], 1) == "0 of 1 are left"
 
 
+def test_a_command_that_outlived_its_study_is_not_run_beside_itself(tmp_path: Path) -> None:
+    """As when the study alone was killed: its command holds the log's lock."""
+    log = tmp_path / "training.log"
+    with log.open("a") as file:
+        left = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, stdout=file)
+        fcntl.flock(file, fcntl.LOCK_EX)
+    with pytest.raises(MemobenchError, match="still writes"):
+        stages.run_once(["memobench", "--version"], log)
+    left.communicate(b"\n")
+    stages.run_once(["memobench", "--version"], log)
+    assert ended(log)
+
+
+TINY = """
+policy: [policy=memobench_mem, size=small, perception=objects]
+training: [steps=8, save_freq=2]
+evaluation: [split=validation, episodes=2, videos=0, env.horizon=120]
+suites:
+  strict:
+    demonstrations:
+      [--suite, strict, --tasks, find_the_artichoke_hidden_in_one_of_the_drawers, --episodes, "3", --no-images]
+    evaluation: [suite=strict]
+    tasks: [find_the_artichoke_hidden_in_one_of_the_drawers]
+rows:
+  frames: {training: [], after: [4]}
+"""
+
+
+@pytest.mark.slow
+def test_a_study_killed_at_ten_random_moments_ends_as_one_that_was_not(tmp_path: Path) -> None:
+    (tmp_path / "grid.yaml").write_text(TINY)
+    command = [sys.executable, "-m", "research.memory_study", "--grid", str(tmp_path / "grid.yaml"), "--out"]
+    subprocess.run([*command, str(tmp_path / "whole")], check=True, capture_output=True)
+    rng, killed = random.Random(0), 0
+    while True:
+        study = subprocess.Popen(
+            [*command, str(tmp_path / "killed")], start_new_session=True, stdout=subprocess.DEVNULL
+        )
+        try:
+            study.wait(rng.uniform(4, 40) if killed < 10 else None)
+        except subprocess.TimeoutExpired:
+            os.killpg(study.pid, signal.SIGKILL)
+            study.wait()
+            killed += 1
+            continue
+        break
+    assert study.returncode == 0
+    assert killed >= 5, "the machine was so fast that little was killed; draw shorter times"
+    whole, other = (
+        Cell(read_grid(tmp_path / "grid.yaml"), tmp_path / name, "strict", "frames", 0) for name in ("whole", "killed")
+    )
+    assert _weights(other) == _weights(whole)
+    for part in whole.parts:
+        assert _outcomes(other.evaluation(part)) == _outcomes(whole.evaluation(part))
+
+
+def _weights(cell: Cell) -> bytes:
+    return (cell.policy / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").read_bytes()
+
+
+def _outcomes(folder: Path) -> list[dict[str, Any]]:
+    """Return the rollouts but for when, and how fast, they were run."""
+    return [{k: v for k, v in one.items() if k not in ("wall_s", "run", "policy")} for one in read_rollouts(folder)[0]]
+
+
 def test_a_learning_rate_is_chosen_once_and_then_used(grid: Grid, tmp_path: Path) -> None:
     tried = tuning(grid, tmp_path, chosen(grid, ["no memory"]))
     assert [cell.tuned for cell in tried] == [0.0005, 0.001, 0.002]
@@ -196,36 +269,63 @@ def test_a_training_that_failed_before_its_first_checkpoint_begins_anew(
             cell.run()
 
 
-def test_tables_and_figure_show_what_is_evaluated(grid: Grid, tmp_path: Path) -> None:
-    path = tmp_path / "study.png"
-    assert draw(grid, tmp_path, path) is None
-    for row, parts in (("no memory", [ROLLOUTS]), ("frames, no time", [ROLLOUTS, "evidence"])):
-        cell = Cell(grid, tmp_path, "strict", row, 0)
-        for part in parts:
-            episodes = [_rollout(episode, part == "evidence") for episode in range(10)]
-            write_episodes(cell.evaluation(part), episodes)
-            write_report(cell.evaluation(part))
-            (cell.folder / f"{part}.json").write_text(json.dumps({"ended": True}))
+def _evaluate(cell: Cell, *parts: str) -> None:
+    """Let these parts of a cell be evaluated: ten rollouts each, of which four succeed; half of them early on."""
+    for part in parts:
+        solved = 2 if part.startswith("after") else 4
+        episodes = [_rollout(episode, part == "evidence", solved) for episode in range(10)]
+        write_episodes(cell.evaluation(part), episodes)
+        write_report(cell.evaluation(part))
+        cell.log(part).with_suffix(".json").write_text(json.dumps({"ended": True, "wall_s": 60.0, "cpu_s": 50.0}))
+
+
+def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
+    more = SMALL.replace("controls: [evidence]}", "controls: [evidence, replan 5], after: [2]}").replace(
+        "controls: {", "controls: {replan 5: [replan=5], "
+    )
+    (tmp_path / "grid.yaml").write_text(more.replace("[suite=strict]}", "[suite=strict], ceilings: {bowl: 33.3}}"))
+    grid = read_grid(tmp_path / "grid.yaml")
+    assert draw_all(grid, tmp_path) == []
+    _evaluate(Cell(grid, tmp_path, "strict", "no memory", 0), ROLLOUTS)
+    _evaluate(Cell(grid, tmp_path, "strict", "frames, no time", 0), ROLLOUTS, "after 2", "evidence", "replan 5")
     assert figures_of_rows(grid, tmp_path, "strict") == {
         "no memory": {"solved": [40.0], "follows": [], "chance": None},
         "frames, no time": {"solved": [40.0], "follows": [80.0], "chance": 50.0},
     }
-    told = tables(grid, tmp_path, "strict")
-    assert "| no memory | 1 |" in told
-    assert "| frames, no time | 1 |" in told
-    assert "80.0 (50.0)" in told
-    assert draw(grid, tmp_path, path) == path
-    assert path.stat().st_size > 5_000
+    told = tables(grid, tmp_path, "strict").splitlines()
+    assert "| no memory | 1 | **40.0** | 10.0–70.0 | 40 | 100.0 | – | 100.0 | – | – |" in told
+    assert "| frames, no time | 1 | **40.0** | 10.0–70.0 | 40 | 100.0 | – | 100.0 | 80.0 (50.0) | – |" in told
+    assert "| `bowl` | 33.3 | 40.0 | 40.0 |" in told
+    assert "| frames, no time | 40.0 | 40.0 |" in told, "as it is, and with replan=5"
+    assert "| frames, no time | 2 | 1 | 20.0 | 100.0 | – | 100.0 |" in told, "after 2 updates"
+    assert "| frames, no time | 4 | 1 | 40.0 | 100.0 | – | 100.0 |" in told
+    drawn = draw_all(grid, tmp_path)
+    assert [path.name for path in drawn] == ["study.png", "tasks_strict.png", "updates_strict.png"]
+    assert all(path.stat().st_size > 5_000 for path in drawn)
 
 
-def _rollout(episode: int, evidence: bool) -> dict[str, Any]:
-    """Return one of ten rollouts: four succeed; in four of five scenes with two variants the choice is right."""
+def test_checkpoints_are_evaluated_by_their_own_weights(tmp_path: Path) -> None:
+    (tmp_path / "grid.yaml").write_text(SMALL.replace("controls: [evidence]}", "after: [3000]}"))
+    cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "frames, no time", 0)
+    assert cell.parts == [ROLLOUTS, "after 3000"]
+    assert f"policy={cell.policy}/checkpoints/003000" in cell.evaluation_words("after 3000")
+    assert f"policy={cell.policy}" in cell.evaluation_words(ROLLOUTS)
+
+
+def test_ceilings_are_of_the_tasks_that_are_rolled_out() -> None:
+    for name, suite in read_grid(GRID).suites.items():
+        assert sorted(suite.ceilings) == sorted(resolve_tasks(suite.tasks, name))
+
+
+def _rollout(episode: int, evidence: bool, solved: int = 4) -> dict[str, Any]:
+    """Return one of ten rollouts: the first ``solved`` succeed; of two variants four scenes in five choose rightly."""
     variant, right = episode % 2, episode < 8
     told: dict[str, Any] = {}
     if evidence:
         told = {"seed": 7 + episode // 2, "variant": variant, "choice": variant if right else None}
         told |= {"variants": 2, "chance": 0.5}
-    return rollout("bowl", "object", "SC", [True, True], episode < 4, episode, **told)
+    told |= {"wall_s": 1.0, "steps": 80, "prompt_steps": 20}
+    return rollout("bowl", "object", "SC", [True, True], episode < solved, episode, **told)
 
 
 def test_evidence_without_a_chance_is_in_no_table(grid: Grid, tmp_path: Path) -> None:
@@ -233,6 +333,6 @@ def test_evidence_without_a_chance_is_in_no_table(grid: Grid, tmp_path: Path) ->
     for part in (ROLLOUTS, "evidence"):
         write_episodes(cell.evaluation(part), [{**_rollout(k, part == "evidence"), "chance": None} for k in range(10)])
         write_report(cell.evaluation(part))
-        (cell.folder / f"{part}.json").write_text(json.dumps({"ended": True}))
+        cell.log(part).with_suffix(".json").write_text(json.dumps({"ended": True, "wall_s": 1.0, "cpu_s": 1.0}))
     assert figures_of_rows(grid, tmp_path, "strict")["frames, no time"]["follows"] == []
     assert "frames, no time" in tables(grid, tmp_path, "strict")
