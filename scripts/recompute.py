@@ -12,7 +12,6 @@ compressed, and prints its row.
 
 from __future__ import annotations
 
-import gzip
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -22,9 +21,9 @@ from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.evidence_controls import AVERAGE, Evidence
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, mean_row, percent
-from lerobot_memobench.evaluation.records import CARD_FILE, read_runs
-from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.io import file_bytes, packed, write_file
+from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.report import keep_log
+from lerobot_memobench.io import packed
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
@@ -125,7 +124,7 @@ def of_demonstrations(page: Path) -> Figures:
 
 
 SOURCES: dict[str, Callable[[Path], Figures]] = {
-    r"logs/[\w-]+(?=/)": of_log,
+    r"(logs/[\w-]+|study/cells/[\w/-]+)(?=/)": of_log,
     r"\w+/README\.md": of_card,
     r"\w+/tables\.md": of_demonstrations,
 }
@@ -224,10 +223,7 @@ def _flat(text: str) -> str:
 def keep(folder: Path, name: str) -> str:
     """Compress the log and the card of an evaluation into the notes; return its row."""
     kept = LOGS / name
-    write_report(folder)  # merges the workers' files
-    kept.mkdir(parents=True, exist_ok=True)
-    for file in (MERGED_FILE, CARD_FILE):
-        write_file(packed(kept / file), gzip.compress(file_bytes(folder / file), mtime=0))
+    keep_log(folder, kept)
     row = of_log(kept)
     if row != of_log(folder):
         raise MemobenchError(f"the log in {kept} does not tell what the one in {folder} does")

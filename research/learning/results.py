@@ -140,12 +140,12 @@ def average_success(rollouts: Runs) -> Estimate:
 
 def _draws(table: Array, weights: Array, tasks: Sequence[Sequence[int]], rng: np.random.Generator) -> Array:
     """Return bootstrap draws of the weighted mean of a table (training seeds, episodes)."""
-    draws = np.empty(DRAWS)
-    for draw in range(DRAWS):
-        seeds = rng.integers(0, len(table), len(table))
-        chosen = np.concatenate([rng.choice(places, len(places)) for places in tasks])
-        draws[draw] = float(table[seeds].mean(axis=0)[chosen] @ weights[chosen])
-    return draws
+    seeds = rng.multinomial(len(table), np.full(len(table), 1 / len(table)), DRAWS) / len(table)
+    times = np.empty((DRAWS, table.shape[1]))  # how often each episode is drawn
+    for places in tasks:
+        times[:, places] = rng.multinomial(len(places), np.full(len(places), 1 / len(places)), DRAWS)
+    found: Array = np.einsum("ds,se,de,e->d", seeds, table, times, weights, optimize=True)
+    return found
 
 
 def _interval(

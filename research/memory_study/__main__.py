@@ -14,16 +14,18 @@ import typer
 from lerobot_memobench.cli.console import console, counting, say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.write import write_html
-from lerobot_memobench.io import write_file
+from lerobot_memobench.io import count_of, write_file
 from lerobot_memobench.jobs.executors import read_options, run_jobs
 from lerobot_memobench.jobs.processes import Advance, Job
 from research.command import run
 from research.memory_study.cells import Cell, Demonstrations, choose_rates, tuning
 from research.memory_study.figure import draw_all
-from research.memory_study.grid import chosen, read_grid
+from research.memory_study.grid import Grid, chosen, read_grid
 from research.memory_study.tables import named_rollouts, tables
+from research.pages import put_into
 
 GRID = Path(__file__).with_name("grid.yaml")
+STUDY = "memory_study"
 
 
 def study(
@@ -35,6 +37,14 @@ def study(
     plan: Annotated[
         bool, typer.Option("--plan", help="Say what would be run, and about how long; run nothing.")
     ] = False,
+    keep: Annotated[
+        Path | None,
+        typer.Option(help="Keep logs, cards and costs of what is evaluated there, compressed; run nothing."),
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="Markdown page whose tables are made anew, between its marks; run nothing.")
+    ] = None,
+    figures: Annotated[Path | None, typer.Option(help="Folder of the figures; --out when left out.")] = None,
     tune: Annotated[bool, typer.Option("--tune", help="Choose learning rates first, by short trainings.")] = False,
     browse: Annotated[bool, typer.Option("--html", help="Make reports for the browser, one per suite.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
@@ -48,6 +58,14 @@ def study(
         raise MemobenchError(f"--only {' '.join(only or [])} leaves no cell; a row has fewer training seeds, perhaps")
     data = [Demonstrations(read, suite, out, workers) for suite in dict.fromkeys(suite for suite, _, _ in places)]
     cells = [Cell(read, out, *place) for place in places]
+    if keep is not None:
+        kept = [folder for cell in cells for folder in cell.keep(keep)]
+        say(f"{count_of(len(kept), 'log')} are kept in {keep}")
+    if page is not None:
+        put_into(page, STUDY, tell(read, out, figures or out))
+        say(f"the tables of {page} are made")
+    if keep or page:
+        return
     tried = tuning(read, out, places) if tune else []
     if plan:
         say(planned(data, tried, cells, workers))
@@ -66,14 +84,20 @@ def study(
         if what == "tuning" and tried:
             rates = choose_rates(tried)
             say("; ".join(f"{suite}, {row}: learning rate {rate:g}" for (suite, row), rate in rates.items()))
-    text = "\n\n".join(filter(None, (tables(read, out, suite) for suite in read.suites)))
+    text = tell(read, out, figures or out)
     write_file(out / "study.md", text + "\n")
-    draw_all(read, out)
     if browse:
         for suite in read.suites:
             if folders := [f"{name}={folder}" for name, folder in named_rollouts(read, out, suite)]:
                 say(f"open {write_html(folders, out / 'report' / suite).page}")
     say(text)
+
+
+def tell(grid: Grid, out: Path, figures: Path) -> str:
+    """Draw the figures of what is evaluated, and return its tables."""
+    figures.mkdir(parents=True, exist_ok=True)
+    draw_all(grid, out, figures)
+    return "\n\n".join(filter(None, (tables(grid, out, suite) for suite in grid.suites)))
 
 
 def planned(data: Sequence[Demonstrations], tried: Sequence[Cell], cells: Sequence[Cell], workers: int) -> str:
@@ -89,7 +113,7 @@ def planned(data: Sequence[Demonstrations], tried: Sequence[Cell], cells: Sequen
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return the exit status."""
-    return run("memory_study", study, argv)
+    return run(STUDY, study, argv)
 
 
 if __name__ == "__main__":

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.report import keep_log
 from lerobot_memobench.io import read_json, write_file
 from research.learning.stages import Cost, ended, kept_of, remove_unfinished, run_once
 from research.memory_study.grid import Grid, folder_name
@@ -124,6 +125,21 @@ class Cell:
     def finished(self) -> bool:
         """Whether nothing is left to do."""
         return all(ended(self.log(part)) for part in (TRAINING, *self.parts))
+
+    def keep(self, out: Path) -> list[Path]:
+        """Keep of what is evaluated the logs, the cards and what they cost, compressed, in another study's folder.
+
+        Tables and figures of that folder are those of this one. Return the folders of the logs.
+        """
+        kept, found = replace(self, out=out), []
+        for part in self.parts:
+            if ended(self.log(part)):
+                keep_log(self.evaluation(part), kept.evaluation(part))
+                found.append(kept.evaluation(part))
+        for part in (TRAINING, *self.parts):
+            if found and ended(self.log(part)):
+                write_file(kept.log(part).with_suffix(".json"), self.log(part).with_suffix(".json").read_text())
+        return found
 
     def failure(self) -> str | None:
         """Nothing: what fails ends the study, and says why."""

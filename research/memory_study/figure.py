@@ -19,12 +19,12 @@ CHANCE_COLOUR = "#d55e00"
 MEASURES = {"solved": "solved, %", "follows": "follows the evidence, %"}
 
 
-def draw_all(grid: Grid, out: Path) -> list[Path]:
-    """Draw what has been evaluated into ``out``; return the files."""
-    found = [draw(grid, out, out / "study.png")]
+def draw_all(grid: Grid, out: Path, figures: Path) -> list[Path]:
+    """Draw what has been evaluated in ``out`` into the folder ``figures``; return the files."""
+    found = [draw(grid, out, figures / "study.png")]
     for suite in grid.suites:
-        found.append(draw_tasks(grid, out, suite, out / f"tasks_{suite}.png"))
-        found.append(draw_curves(grid, out, suite, out / f"updates_{suite}.png"))
+        found.append(draw_tasks(grid, out, suite, figures / f"study_tasks_{suite}.png"))
+        found.append(draw_curves(grid, out, suite, figures / f"study_updates_{suite}.png"))
     return [path for path in found if path]
 
 

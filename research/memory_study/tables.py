@@ -9,9 +9,9 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from lerobot_memobench.evaluation.metrics import METRICS, Record
-from lerobot_memobench.evaluation.records import read_rollouts
-from lerobot_memobench.io import read_json
+from lerobot_memobench.evaluation.metrics import METRICS, Record, report_values
+from lerobot_memobench.evaluation.records import read_rollouts, read_runs
+from lerobot_memobench.evaluation.report import control_data
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.learning.results import average_success, contrasts, contrasts_table, markdown
 from research.learning.stages import ended
@@ -81,8 +81,14 @@ def evaluated(cell: Cell, part: str) -> bool:
 
 
 def report(cell: Cell, part: str) -> dict[str, Any]:
-    """Return the figures of an evaluation."""
-    return read_json(cell.evaluation(part) / "report.json", dict[str, Any], "evaluate the cell again")
+    """Return the figures of an evaluation, counted from its log."""
+    return _figures(cell.evaluation(part))
+
+
+@cache
+def _figures(folder: Path) -> dict[str, Any]:
+    (run,) = read_runs([folder])
+    return {**report_values(run.summary), **control_data(run)}
 
 
 def named_rollouts(grid: Grid, out: Path, suite: str) -> list[tuple[str, Path]]:

@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,11 +26,12 @@ from lerobot_memobench.run.training import take_training_options
 from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
-from research.memory_study.__main__ import GRID, planned
+from research.memory_study.__main__ import GRID, STUDY, planned
 from research.memory_study.cells import ROLLOUTS, Cell, Demonstrations, choose_rates, chosen_rate, tuning
 from research.memory_study.figure import draw_all
 from research.memory_study.grid import Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
+from research.pages import around
 from tests.support.logs import rollout
 
 SMALL = """
@@ -285,7 +287,7 @@ def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
     )
     (tmp_path / "grid.yaml").write_text(more.replace("[suite=strict]}", "[suite=strict], ceilings: {bowl: 33.3}}"))
     grid = read_grid(tmp_path / "grid.yaml")
-    assert draw_all(grid, tmp_path) == []
+    assert draw_all(grid, tmp_path, tmp_path) == []
     _evaluate(Cell(grid, tmp_path, "strict", "no memory", 0), ROLLOUTS)
     _evaluate(Cell(grid, tmp_path, "strict", "frames, no time", 0), ROLLOUTS, "after 2", "evidence", "replan 5")
     assert figures_of_rows(grid, tmp_path, "strict") == {
@@ -299,8 +301,8 @@ def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
     assert "| frames, no time | 40.0 | 40.0 |" in told, "as it is, and with replan=5"
     assert "| frames, no time | 2 | 1 | 20.0 | 100.0 | – | 100.0 |" in told, "after 2 updates"
     assert "| frames, no time | 4 | 1 | 40.0 | 100.0 | – | 100.0 |" in told
-    drawn = draw_all(grid, tmp_path)
-    assert [path.name for path in drawn] == ["study.png", "tasks_strict.png", "updates_strict.png"]
+    drawn = draw_all(grid, tmp_path, tmp_path)
+    assert [path.name for path in drawn] == ["study.png", "study_tasks_strict.png", "study_updates_strict.png"]
     assert all(path.stat().st_size > 5_000 for path in drawn)
 
 
@@ -326,6 +328,30 @@ def _rollout(episode: int, evidence: bool, solved: int = 4) -> dict[str, Any]:
         told |= {"variants": 2, "chance": 0.5}
     told |= {"wall_s": 1.0, "steps": 80, "prompt_steps": 20}
     return rollout("bowl", "object", "SC", [True, True], episode < solved, episode, **told)
+
+
+NOTES = Path(__file__).parents[2] / "docs" / "research"
+
+
+def test_logs_are_kept_as_they_are(tmp_path: Path) -> None:
+    cell = Cell(read_grid(GRID), tmp_path / "out", "strict", "frames", 0)
+    kept = Cell(cell.grid, NOTES / "study", "strict", "frames", 0).folder
+    shutil.copytree(kept, cell.folder)
+    again = tmp_path / "kept" / "cells" / "strict" / "frames-0"
+    assert again / ROLLOUTS in cell.keep(tmp_path / "kept")
+    files = sorted(path.relative_to(again) for path in again.glob("**/*") if path.is_file())
+    assert Path(ROLLOUTS, "episodes.jsonl.gz") in files
+    for file in files:
+        assert (again / file).read_bytes() == (kept / file).read_bytes()
+
+
+def test_the_page_is_of_the_kept_logs() -> None:
+    """Each figure of its tables is counted again."""
+    before, after = around(NOTES / "study.md", STUDY)
+    made = (NOTES / "study.md").read_text().removeprefix(before).removesuffix(after).strip()
+    grid = read_grid(GRID)
+    assert made == "\n\n".join(filter(None, (tables(grid, NOTES / "study", suite) for suite in grid.suites)))
+    assert sum(file.stat().st_size for file in (NOTES / "study").glob("**/*")) < 5_000_000
 
 
 def test_evidence_without_a_chance_is_in_no_table(grid: Grid, tmp_path: Path) -> None:

@@ -62,8 +62,9 @@ def necessity(
 ) -> None:
     """Find frames that look alike and need different answers: lower bounds of what a policy without memory reaches."""
     from lerobot_memobench.tasks.task import REFERENTS
+    from research import pages
     from research.necessity.report import (
-        around_table,
+        STUDY,
         put_into_page,
         read_results,
         terminal_table,
@@ -77,7 +78,7 @@ def necessity(
     published = None if beside is None else read_results(beside)
     evaluated = read_evaluations(memoryless or [])
     if page is not None:
-        around_table(page)
+        pages.around(page, STUDY)
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
     studies = _studies([get_task(name) for name in resolve_tasks(tasks, suite)], referents, settings, out)

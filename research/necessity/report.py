@@ -15,6 +15,7 @@ from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import DRAWN, REFERENTS
+from research import pages
 from research.necessity.study import KeptResult, Result, pictures_path
 from research.necessity.trained import in_words as rate_in_words
 
@@ -351,7 +352,8 @@ def _ways(results: Sequence[Result]) -> list[str]:
 
 # --- files ---
 
-PAGE_BEGIN, PAGE_END = "<!-- made by `python -m research.necessity --page`: -->", "<!-- end of what it made -->"
+STUDY = "necessity"
+"""As in ``python -m research.necessity``."""
 
 
 def read_results(path: Path) -> list[Result]:
@@ -368,26 +370,6 @@ def read_results(path: Path) -> list[Result]:
     return found
 
 
-def around_table(page: Path) -> tuple[str, str]:
-    """Return what stands before and after the table of a Markdown page, its marks included.
-
-    Raises:
-        MemobenchError: there is no such page, or it lacks the marks.
-    """
-    try:
-        text = page.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise MemobenchError(f"the page {page} cannot be read ({reason}); name a Markdown file") from None
-    before, begin, rest = text.partition(PAGE_BEGIN)
-    _, end, after = rest.partition(PAGE_END)
-    if not begin or not end:
-        raise MemobenchError(
-            f"the page {page} lacks the lines {PAGE_BEGIN!r} and {PAGE_END!r}; put them where the table goes"
-        )
-    return before + begin, end + after
-
-
 def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result] | None = None) -> Path:
     """Put the table into a Markdown page, between its two marks; return the page.
 
@@ -395,11 +377,10 @@ def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result
         beside: results of the published tasks; then the table shows those beside the strict tasks of ``results``.
 
     Raises:
-        MemobenchError: see `around_table`.
+        MemobenchError: see `pages.around`.
     """
-    before, after = around_table(page)
     table = markdown(results) if beside is None else side_by_side(beside, results)
-    return write_file(page, f"{before}\n\n{table}\n{after}")
+    return pages.put_into(page, STUDY, table.rstrip("\n"))
 
 
 def write(out: Path, results: Sequence[Result]) -> list[Path]:

@@ -13,8 +13,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from research.necessity.__main__ import necessity
 from research.necessity.report import (
-    PAGE_BEGIN,
-    PAGE_END,
+    STUDY,
     bounds,
     in_words,
     put_into_page,
@@ -24,15 +23,16 @@ from research.necessity.report import (
 )
 from research.necessity.settings import settings_of, variants_of
 from research.necessity.trained import read_evaluations, with_evaluations
+from research.pages import END, begin
 from tests.support import logs
 
 
 def test_a_page_gets_the_table_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    page.write_text(f"before\n{PAGE_BEGIN}\nan old table\n{PAGE_END}\nafter\n")
+    page.write_text(f"before\n{begin(STUDY)}\nan old table\n{END}\nafter\n")
     text = put_into_page(page, []).read_text()
-    assert text.startswith(f"before\n{PAGE_BEGIN}\n\n| task |")
-    assert text.endswith(f"{PAGE_END}\nafter\n")
+    assert text.startswith(f"before\n{begin(STUDY)}\n\n| task |")
+    assert text.endswith(f"{END}\nafter\n")
     assert "an old table" not in text
     assert put_into_page(page, []).read_text() == text
     page.write_text("no marks")
@@ -125,7 +125,7 @@ def test_a_page_shows_both_when_it_is_told_of_the_published_results(tmp_path: Pa
     kept = tmp_path / "necessity.json"
     kept.write_text(json.dumps([result(STOVE, "fixed", None)]))
     page = tmp_path / "page.md"
-    page.write_text(f"{PAGE_BEGIN}{PAGE_END}")
+    page.write_text(f"{begin(STUDY)}{END}")
     text = put_into_page(page, [result(STRICT_TASK, "drawn", 0.0)], read_results(kept)).read_text()
     assert f"| `{STOVE}` | 100.0 | no |" in text
     with pytest.raises(MemobenchError, match="there is no"):

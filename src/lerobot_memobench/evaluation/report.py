@@ -7,6 +7,7 @@ formats the same keys stand with more beside them: intervals, prefix completion 
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ from typing import Any
 
 from rich.console import RenderableType
 
-from lerobot_memobench.envs.episode_log import POLICY, not_run, notes_on_not_run, read_log, write_episodes
+from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, not_run, notes_on_not_run, read_log, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.evidence_controls import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
@@ -30,7 +31,7 @@ from lerobot_memobench.evaluation.metrics import (
     report_values,
 )
 from lerobot_memobench.evaluation.pacing_controls import kept_changes, pacing_section
-from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol, sweeps, unlike
+from lerobot_memobench.evaluation.records import CARD_FILE, Run, asked_for, read_protocol, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     PAPER_INPUTS,
     beside_paper,
@@ -48,7 +49,7 @@ from lerobot_memobench.evaluation.report_tables import (
     tasks_table,
 )
 from lerobot_memobench.evaluation.tables import WRITERS, Report, Section, csv_tables, csv_text, markdown, terminal_table
-from lerobot_memobench.io import write_file
+from lerobot_memobench.io import file_bytes, packed, write_file
 from lerobot_memobench.paper import PublishedRow, published_rows
 
 REPORT_JSON = "report.json"
@@ -110,6 +111,18 @@ def table(summary: Summary) -> RenderableType:
 def evaluation_markdown(run: Run) -> str:
     """Return the report of one evaluation as Markdown."""
     return markdown(Report(headline([run]), (_section(run), *control_sections(run))))
+
+
+def keep_log(folder: Path, kept: Path) -> None:
+    """Compress the log and the card of an evaluation into another folder, which reads as the evaluation does.
+
+    Raises:
+        MemobenchError: there is no rollout. FileNotFoundError: there is no card.
+    """
+    write_report(folder)  # merges the workers' files
+    kept.mkdir(parents=True, exist_ok=True)
+    for file in (MERGED_FILE, CARD_FILE):
+        write_file(packed(kept / file), gzip.compress(file_bytes(folder / file), mtime=0))
 
 
 # --- documents ---
