@@ -45,6 +45,9 @@ def study(
         Path | None, typer.Option(help="Markdown page whose tables are made anew, between its marks; run nothing.")
     ] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder of the figures; --out when left out.")] = None,
+    sealed: Annotated[
+        bool, typer.Option("--sealed", help="Run the sealed test of the cells too: once, when all is chosen.")
+    ] = False,
     tune: Annotated[bool, typer.Option("--tune", help="Choose learning rates first, by short trainings.")] = False,
     browse: Annotated[bool, typer.Option("--html", help="Make reports for the browser, one per suite.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
@@ -57,7 +60,7 @@ def study(
     if not places:
         raise MemobenchError(f"--only {' '.join(only or [])} leaves no cell; a row has fewer training seeds, perhaps")
     data = [Demonstrations(read, suite, out, workers) for suite in dict.fromkeys(suite for suite, _, _ in places)]
-    cells = [Cell(read, out, *place) for place in places]
+    cells = [Cell(read, out, *place, sealed=sealed) for place in places]
     if keep is not None:
         kept = [folder for cell in cells for folder in cell.keep(keep)]
         say(f"{count_of(len(kept), 'log')} are kept in {keep}")

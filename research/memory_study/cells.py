@@ -18,6 +18,8 @@ from research.memory_study.grid import Grid, folder_name
 
 ROLLOUTS = "rollouts"
 """The evaluation itself, beside a cell's controls."""
+SEALED = "sealed"
+"""The evaluation on sealed seeds, which is run when all else is done, and counted."""
 TRAINING = "training"
 
 
@@ -70,6 +72,7 @@ class Cell:
 
     Attributes:
         out: the study's folder. tuned: a learning rate that is tried, for a short training; None: the row's own.
+        sealed: whether the sealed test is run too.
     """
 
     grid: Grid
@@ -78,6 +81,7 @@ class Cell:
     row: str
     seed: int
     tuned: float | None = None
+    sealed: bool = False
 
     @property
     def task_name(self) -> str:
@@ -101,7 +105,8 @@ class Cell:
         if self.tuned is not None:
             return [ROLLOUTS]
         row = self.grid.rows[self.row]
-        return [ROLLOUTS, *map(after, row.after), *(row.controls if self.seed == 0 else ())]
+        last = [SEALED] if self.sealed or ended(self.log(SEALED)) else []
+        return [ROLLOUTS, *map(after, row.after), *(row.controls if self.seed == 0 else ()), *last]
 
     def evaluation(self, part: str) -> Path:
         """The folder of the evaluation or of a control."""
@@ -161,14 +166,16 @@ class Cell:
         """Return the command that rolls its policy out."""
         row, suite = self.grid.rows[self.row], self.grid.suites[self.suite]
         kept = {after(updates): self.policy / "checkpoints" / f"{updates:06}" for updates in row.after}
-        own = self.grid.controls.get(part, [])
+        own = self.grid.sealed if part == SEALED else self.grid.controls.get(part, [])
         short = [] if self.tuned is None else [f"episodes={self.grid.tuning.episodes}"]
         told = [*self.grid.evaluation, *suite.evaluation, *suite.task_words, *row.evaluation, *own, *short]
-        return [
-            *("lerobot", "eval", "env=memobench", f"policy={kept.get(part, self.policy)}"),
-            *_last_of_each(told),
-            f"output_dir={self.evaluation(part)}",
-        ]
+        if part == SEALED:
+            command = ["memobench", "test-sealed"]
+            told = [word for word in told if not word.startswith("split=")]
+        else:
+            command = ["lerobot", "eval", "env=memobench"]
+        policy = f"policy={kept.get(part, self.policy)}"
+        return [*command, policy, *_last_of_each(told), f"output_dir={self.evaluation(part)}"]
 
     def costs(self) -> dict[str, Cost]:
         """Return what each part has taken so far."""

@@ -81,6 +81,7 @@ class Grid:
     suites: dict[str, Suite]
     rows: dict[str, Row]
     controls: dict[str, list[str]] = field(default_factory=dict)
+    sealed: list[str] = field(default_factory=list)
     learning_rates: list[float] = field(default_factory=list)
     tuning: Tuning = field(default_factory=Tuning)
 

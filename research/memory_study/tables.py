@@ -12,10 +12,11 @@ from typing import Any
 from lerobot_memobench.evaluation.metrics import METRICS, Record, report_values
 from lerobot_memobench.evaluation.records import read_rollouts, read_runs
 from lerobot_memobench.evaluation.report import control_data
+from lerobot_memobench.evaluation.statistics import Estimate
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.learning.results import average_success, contrasts, contrasts_table, markdown
 from research.learning.stages import ended
-from research.memory_study.cells import ROLLOUTS, TRAINING, Cell, after
+from research.memory_study.cells import ROLLOUTS, SEALED, TRAINING, Cell, after
 from research.memory_study.grid import Grid
 
 REFERENCES = ("no memory", "clock only", "frames")
@@ -45,6 +46,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         ("Other conditions of the rollouts, first training seed", _conditions(rows)),
         ("Success and satisfied checkpoints by updates", _by_updates(grid, rows)),
         *((f"Less *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
+        ("The sealed test", _sealed(rows)),
         ("What a cell takes", _costs(rows)),
     ]
     return "\n\n".join([f"## {suite}", *(f"### {title}\n\n{table}" for title, table in parts if table)])
@@ -102,8 +104,8 @@ def _rollouts(folder: Path) -> list[Record]:
     return list(read_rollouts(folder)[0])
 
 
-def _runs(cells: Sequence[Cell]) -> list[list[Record]]:
-    return [_rollouts(cell.evaluation(ROLLOUTS)) for cell in cells]
+def _runs(cells: Sequence[Cell], part: str = ROLLOUTS) -> list[list[Record]]:
+    return [_rollouts(cell.evaluation(part)) for cell in cells]
 
 
 def _evidence(cells: Sequence[Cell]) -> list[dict[str, float]]:
@@ -123,17 +125,13 @@ def _summary(grid: Grid, rows: Rows) -> str:
 
 def _summary_line(grid: Grid, row: str, cells: Sequence[Cell]) -> list[str]:
     reports = [report(cell, ROLLOUTS) for cell in cells]
-    success, follows = average_success(_runs(cells)), _evidence(cells)
-    assert success.value is not None
-    assert success.low is not None
-    assert success.high is not None
+    follows = _evidence(cells)
     paused = [report(cell, PAUSES) for cell in cells if evaluated(cell, PAUSES)]
     chance = f"{_mean([one['follows'] for one in follows])} ({_mean([one['chance'] for one in follows])})"
     return [
         row + (" (privileged)" if grid.rows[row].privileged else ""),
         str(len(cells)),
-        f"**{100 * success.value:.1f}**",
-        f"{100 * success.low:.1f}–{100 * success.high:.1f}",
+        *_with_interval(average_success(_runs(cells))),
         ", ".join(f"{report['average']['SR']:.0f}" for report in reports),
         *(_average(reports, metric) for metric in METRICS[1:]),
         chance if follows else EMPTY,
@@ -216,6 +214,17 @@ def _by_updates(grid: Grid, rows: Rows) -> str:
     return markdown(("", "updates", "training seeds", *METRICS), lines) if lines else ""
 
 
+def _sealed(rows: Rows) -> str:
+    lines = []
+    for row, cells in rows.items():
+        if tested := [cell for cell in cells if evaluated(cell, SEALED)]:
+            success = average_success(_runs(tested, SEALED))
+            reports = [report(cell, SEALED) for cell in tested]
+            averages = [_average(reports, metric) for metric in METRICS[1:]]
+            lines.append([row, str(len(tested)), *_with_interval(success), *averages])
+    return markdown(("", "training seeds", "SR", "95 %", *METRICS[1:]), lines) if lines else ""
+
+
 def _differences(rows: Rows, reference: str) -> str:
     """Return a table of each row against a reference; rows with as many training seeds are adjusted together."""
     base = {cell.seed for cell in rows.get(reference, ())}
@@ -245,6 +254,12 @@ def _costs(rows: Rows) -> str:
 
 def _steps(records: Sequence[Record]) -> int:
     return sum(int(record["steps"]) + int(record["prompt_steps"] or 0) for record in records)
+
+
+def _with_interval(success: Estimate) -> tuple[str, str]:
+    assert None not in (success.value, success.low, success.high)
+    value, low, high = (100 * (one or 0.0) for one in (success.value, success.low, success.high))
+    return f"**{value:.1f}**", f"{low:.1f}–{high:.1f}"
 
 
 def _average(reports: Sequence[Mapping[str, Any]], metric: str) -> str:

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
 from research.memory_study.__main__ import GRID, STUDY, planned
-from research.memory_study.cells import ROLLOUTS, Cell, Demonstrations, choose_rates, chosen_rate, tuning
+from research.memory_study.cells import ROLLOUTS, SEALED, Cell, Demonstrations, choose_rates, chosen_rate, tuning
 from research.memory_study.figure import draw_all
 from research.memory_study.grid import Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
@@ -312,6 +313,19 @@ def test_checkpoints_are_evaluated_by_their_own_weights(tmp_path: Path) -> None:
     assert cell.parts == [ROLLOUTS, "after 3000"]
     assert f"policy={cell.policy}/checkpoints/003000" in cell.evaluation_words("after 3000")
     assert f"policy={cell.policy}" in cell.evaluation_words(ROLLOUTS)
+
+
+def test_the_sealed_test_is_asked_for_and_stays(grid: Grid, tmp_path: Path) -> None:
+    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
+    assert SEALED not in cell.parts
+    asked = replace(cell, sealed=True)
+    assert asked.parts == [ROLLOUTS, SEALED]
+    words = asked.evaluation_words(SEALED)
+    assert words[:3] == ["memobench", "test-sealed", f"policy={cell.policy}"]
+    assert not any(word.startswith("split=") for word in words), "its seeds are the command's"
+    _evaluate(cell, ROLLOUTS, SEALED)
+    assert cell.parts == [ROLLOUTS, SEALED], "what was tested is told, whoever reads"
+    assert "### The sealed test" in tables(grid, tmp_path, "strict")
 
 
 def test_ceilings_are_of_the_tasks_that_are_rolled_out() -> None:
