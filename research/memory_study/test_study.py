@@ -12,6 +12,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -27,6 +28,7 @@ from lerobot_memobench.run.training import take_training_options
 from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
+from research.memory_study import cells
 from research.memory_study.__main__ import GRID, STUDY, planned
 from research.memory_study.cells import ROLLOUTS, SEALED, Cell, Demonstrations, choose_rates, chosen_rate, tuning
 from research.memory_study.figure import draw_all
@@ -101,6 +103,19 @@ def test_the_tasks_of_a_suite_alone_are_drawn_and_rolled_out(tmp_path: Path) -> 
     weights = "policy.task_weights={object: 1, find_it: 1, temporal: 0, spatial: 0, procedural: 0}"
     assert weights in cell.training_words()
     assert "tasks=object,find_it" in cell.evaluation_words(ROLLOUTS)
+
+
+def test_anothers_policy_learns_the_demonstrations_of_the_same_tasks(tmp_path: Path, monkeypatch: Any) -> None:
+    some = SMALL.replace("evaluation: [suite=strict]", "evaluation: [suite=strict], tasks: [object, find_it]")
+    (tmp_path / "grid.yaml").write_text(some.replace("no memory: {", "act: {policy: [policy=act], "))
+    cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "act", 0)
+    Demonstrations(cell.grid, "strict", tmp_path).folder.mkdir(parents=True)
+    told = [("find_it", "spatial"), ("count_it", "temporal"), ("bowl", "object")]
+    places = [
+        SimpleNamespace(index=k, record=SimpleNamespace(task_name=n, memory_type=t)) for k, (n, t) in enumerate(told)
+    ]
+    monkeypatch.setattr(cells, "list_episodes", lambda folder: [*places, SimpleNamespace(index=3, record=None)])
+    assert "dataset.episodes=[0,2]" in cell.training_words()
 
 
 def test_words_choose_cells(grid: Grid) -> None:
