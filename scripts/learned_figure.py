@@ -43,7 +43,7 @@ def differences(arms: dict[str, list[Record]]) -> str:
         chosen = shared({k: [one for one in own if not tasks or one["task"] in tasks] for k, own in arms.items()})
         count = len(chosen[reference])
         if count:
-            table = contrasts_table(contrasts({k: [own] for k, own in chosen.items()}, reference), 1, reference)
+            table = contrasts_table(contrasts({k: [own] for k, own in chosen.items()}, reference), reference)
             parts.append(f"{title}, {count} shared episodes\n\n{table}")
     return "\n\n".join(parts)
 

@@ -292,8 +292,9 @@ class Measures:
         parts: dict[str, list[Tensor]] = {}
         for _, batch in self._batches(policy, before, asked):
             read = policy.read_memory(batch)
-            memory, mask = read.rows(), read.mask
+            assert read is not None
             assert read.steps is not None
+            memory, mask = read.rows(), read.mask
             last = mask & (read.steps == read.steps.masked_fill(~mask, -1).amax(dim=1, keepdim=True))
             found = {"memory": masked_mean(memory, mask), "last_frame": masked_mean(memory, last)}
             head = policy.alignment

@@ -228,7 +228,7 @@ def report(
     costs = rolled.costs | {"questions": [Cost(run["wall_s"], run["cpu_s"]) for run in runs]}
     tables = (
         outcomes_table(found),
-        contrasts_table(against, study.settings.seeds),
+        contrasts_table(against),
         measures_table(measures, baselines),
         costs_table(costs),
     )

@@ -9,7 +9,7 @@ episodes holds for these trainings only, that of training seeds for trainings at
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +45,11 @@ class Contrast:
     Attributes:
         low, high: 95 % interval over training seeds and episodes.
         p: of sign flips of the episodes' differences, each the mean over training seeds; adjusted for the number of
-            arms (Holm).
+            arms (Holm) by `adjusted`.
         episodes: how many were paired.
         detectable: smallest true difference that so many episodes show with 80 % power at 5 %; None above 1.
         of_seeds: the difference of each training seed.
-        p_of_seeds: of a paired t test over them, adjusted alike; None of one seed.
+        p_of_seeds: of a paired t test over them, adjusted alike; None of fewer than three.
     """
 
     value: float
@@ -63,37 +63,55 @@ class Contrast:
 
 
 def contrasts(arms: Mapping[str, Runs], reference: str) -> dict[str, Contrast]:
-    """Return every other arm's difference from the reference.
+    """Return every other arm's difference from the reference, by as many training seeds as both have.
 
     Raises:
         MemobenchError: arms have not rolled out the same episodes.
     """
-    episodes = _episodes(arms[reference])
-    weights, tasks = _weights(arms[reference][0], episodes)
-    base = _table(arms[reference], episodes, reference)
-    rng = np.random.default_rng(0)
-    others = [name for name in arms if name != reference]
-    gaps = {name: _table(arms[name], episodes, name) - base for name in others}
-    p = holm([sign_flip(gap.mean(axis=0), weights, rng)[0] for gap in gaps.values()])
-    p_of_seeds = holm([_p_of_seeds(gap @ weights) for gap in gaps.values()])
+    return adjusted(
+        {name: contrast(runs, arms[reference], name, reference) for name, runs in arms.items() if name != reference}
+    )
+
+
+def contrast(runs: Runs, reference: Runs, name: str = "arm", of_reference: str = "reference") -> Contrast:
+    """Return an arm's difference from a reference of the same training seeds; its p are not adjusted.
+
+    Raises:
+        MemobenchError: they have not rolled out the same episodes.
+    """
+    episodes, rng = _episodes(reference), np.random.default_rng(0)
+    weights, tasks = _weights(reference[0], episodes)
+    base = _table(reference, episodes, of_reference)
+    gap = _table(runs, episodes, name) - base
+    of_seeds = gap @ weights
+    return Contrast(
+        float(of_seeds.mean()),
+        *_interval(gap, weights, tasks, rng, base),
+        sign_flip(gap.mean(axis=0), weights, rng)[0],
+        len(episodes),
+        detectable(gap.mean(axis=0), weights),
+        tuple(of_seeds.tolist()),
+        _p_of_seeds(of_seeds),
+    )
+
+
+def adjusted(found: Mapping[str, Contrast]) -> dict[str, Contrast]:
+    """Return differences whose p are adjusted for how many there are (Holm)."""
+    of_episodes = holm([one.p for one in found.values()])
+    told = [name for name, one in found.items() if one.p_of_seeds is not None]
+    of_seeds = dict(zip(told, holm([found[name].p_of_seeds or 0.0 for name in told]), strict=True))
     return {
-        name: Contrast(
-            float((gap @ weights).mean()),
-            *_interval(gap, weights, tasks, rng, base),
-            adjusted,
-            len(episodes),
-            detectable(gap.mean(axis=0), weights),
-            tuple((gap @ weights).tolist()),
-            of_seeds if len(base) > 1 else None,
-        )
-        for (name, gap), adjusted, of_seeds in zip(gaps.items(), p, p_of_seeds, strict=True)
+        name: replace(one, p=p, p_of_seeds=of_seeds.get(name))
+        for (name, one), p in zip(found.items(), of_episodes, strict=True)
     }
 
 
-def _p_of_seeds(differences: Array) -> float:
-    """Return the two-sided p of a paired t test; 1 of no difference at all, or of one seed."""
-    if len(differences) < 2 or not differences.any():
-        return 1.0
+def _p_of_seeds(differences: Array) -> float | None:
+    """Return the two-sided p of a paired t test; None of fewer than three seeds, or where all are equal: they say
+    nothing of how seeds differ.
+    """
+    if len(differences) < 3 or np.ptp(differences) < 1e-9:
+        return None
     return float(ttest_1samp(differences, 0.0).pvalue)
 
 
@@ -330,7 +348,7 @@ def _cells(outcome: Outcome) -> list[str]:
     return [str(outcome.success.n), *rates, seeds, str(outcome.wrong), str(outcome.others)]
 
 
-def contrasts_table(found: Mapping[str, Contrast], seeds: int, reference: str = MEMORY) -> str:
+def contrasts_table(found: Mapping[str, Contrast], reference: str = MEMORY) -> str:
     """Return a table of arms against the reference."""
     rows = [
         [
@@ -343,9 +361,8 @@ def contrasts_table(found: Mapping[str, Contrast], seeds: int, reference: str = 
         ]
         for name, one in found.items()
     ]
-    trained = f"95 % interval, {seeds} training seed{'s' if seeds > 1 else ''}"
     tests = ("p of episodes (Holm)", "of training seeds", "p of training seeds (Holm)")
-    return markdown(("", "episodes", "difference, points", trained, *tests, "detectable"), rows)
+    return markdown(("", "episodes", "difference, points", "95 %", *tests, "detectable"), rows)
 
 
 def _probability(p: float | None) -> str:

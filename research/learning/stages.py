@@ -15,6 +15,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import IO
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, write_file
@@ -29,7 +30,7 @@ MODULES = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_mem
 
 @dataclass(frozen=True)
 class Cost:
-    """What a command took: seconds on the clock and of processors, over all its attempts."""
+    """What a command took, over all its attempts: seconds on the clock, and of processors in those not killed."""
 
     wall_s: float
     cpu_s: float
@@ -47,6 +48,7 @@ def run_once(
     beside: int = 1,
     accept: Sequence[int] = (0,),
     going_on: Sequence[str] | None = None,
+    makes: Path | None = None,
 ) -> Cost:
     """Run ``lerobot …`` or ``memobench …`` unless it has ended well before; return what it took.
 
@@ -57,9 +59,11 @@ def run_once(
         beside: commands that run at once, this one included; they share the cores (`jobs.threads`).
         accept: exit statuses of a command that did its work.
         going_on: what is run instead, to finish what an earlier attempt has begun.
+        makes: a folder that the command refuses to find; what an attempt left of it, that cannot be gone on with, is
+            removed.
 
     Raises:
-        MemobenchError: the command failed, or another one stands beside the log.
+        MemobenchError: the command failed, is running, or another one stands beside the log.
     """
     kept, spent = log.with_suffix(".json"), Cost(0.0, 0.0)
     if told := kept_of(log):
@@ -71,8 +75,18 @@ def run_once(
         if told["ended"]:
             return spent
     log.parent.mkdir(parents=True, exist_ok=True)
-    _keep(kept, words, False, spent)  # so that what is killed is gone on with by the same command alone
-    status, took = _run(going_on or [*words, *how], log, sharing(beside))
+    with log.open("a") as output:
+        try:
+            fcntl.flock(output, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the command inherits it, and holds it to its end
+        except BlockingIOError:
+            raise MemobenchError(f"a command from before still writes {log}; wait for its end, or end it") from None
+        if begun := told.get("began"):  # and never said what it took: it was killed, just after its last output
+            spent += Cost(round(max(log.stat().st_mtime - float(str(begun)), 0.0), 1), 0.0)
+        if makes is not None and going_on is None:
+            shutil.rmtree(makes, ignore_errors=True)
+        # So that what is killed is gone on with by the same command alone, and is not forgotten.
+        _keep(kept, words, False, spent, began=time.time())
+        status, took = _run(going_on or [*words, *how], output, sharing(beside))
     well = status in accept
     _keep(kept, words, well, spent + took)
     if not well:
@@ -81,8 +95,8 @@ def run_once(
     return spent + took
 
 
-def _keep(kept: Path, words: Sequence[str], ended: bool, spent: Cost) -> None:
-    write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent)}, indent=1))
+def _keep(kept: Path, words: Sequence[str], ended: bool, spent: Cost, **more: float) -> None:
+    write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent), **more}, indent=1))
 
 
 def kept_of(log: Path) -> dict[str, object]:
@@ -98,35 +112,31 @@ def ended(log: Path) -> bool:
     return bool(kept_of(log).get("ended"))
 
 
-def remove_unfinished(policy: Path, log: Path) -> None:
-    """Remove the folder of a training that was ended before its first checkpoint: nothing can go on with it."""
-    if not ended(log):
-        shutil.rmtree(policy, ignore_errors=True)
+def train_once(words: Sequence[str], log: Path, policy: Path, *, beside: int = 1) -> Cost:
+    """Run ``lerobot train …`` into the folder ``policy``, or go on from its last checkpoint; see `run_once`."""
+    from lerobot_memobench.run.training import TRAIN_CONFIG, last_checkpoint
+
+    try:
+        begun = last_checkpoint(policy) / TRAIN_CONFIG
+    except MemobenchError:
+        return run_once(words, log, beside=beside, makes=policy)
+    return run_once(words, log, beside=beside, going_on=["lerobot", "train", f"config_path={begun}", "resume=true"])
 
 
-def _run(words: Sequence[str], log: Path, environment: Mapping[str, str]) -> tuple[int, Cost]:
-    """Run a command to its end; return its exit status and what it and its own processes took.
-
-    Raises:
-        MemobenchError: it is running already: whoever started it was killed, and it was not.
-    """
+def _run(words: Sequence[str], output: IO[str], environment: Mapping[str, str]) -> tuple[int, Cost]:
+    """Run a command to its end; return its exit status and what it and its own processes took."""
     started = time.monotonic()
-    with log.open("a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the command inherits it, and holds it to its end
-        except BlockingIOError:
-            raise MemobenchError(f"a command from before still writes {log}; wait for its end, or end it") from None
-        process = subprocess.Popen(
-            [sys.executable, "-m", MODULES[words[0]], *words[1:]],
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            env=environment,
-        )
-        try:
-            _, status, used = os.wait4(process.pid, 0)
-        except BaseException:
-            process.terminate()
-            raise
+    process = subprocess.Popen(
+        [sys.executable, "-m", MODULES[words[0]], *words[1:]],
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        env=environment,
+    )
+    try:
+        _, status, used = os.wait4(process.pid, 0)
+    except BaseException:
+        process.terminate()
+        raise
     process.returncode = os.waitstatus_to_exitcode(status)
     wall = time.monotonic() - started
     return process.returncode, Cost(round(wall, 1), round(used.ru_utime + used.ru_stime, 1))
@@ -205,13 +215,8 @@ class Stages:
 
     def train(self, arm: str, seed: int) -> Cost:
         """Train an arm's policy with one seed; as many at once as there are workers share the cores."""
-        folder = self.policy(arm, seed)
-        begun = self.checkpoint(arm, seed) / "train_config.json"
-        going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
-        log = self.log("training", arm, seed)
-        if going_on is None:
-            remove_unfinished(folder, log)
-        return run_once(self.training_words(arm, seed), log, beside=self.workers, going_on=going_on)
+        words, log = self.training_words(arm, seed), self.log("training", arm, seed)
+        return train_once(words, log, self.policy(arm, seed), beside=self.workers)
 
     def evaluate(self, arm: str, seed: int) -> Cost:
         """Roll a trained policy out on the experiment's evaluation seeds."""

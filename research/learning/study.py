@@ -95,7 +95,7 @@ def learn(experiment: Experiment, out: Path, say: Say, *, dataset: Path | None =
     found = rolled.outcomes()
     write_file(out / "learning.json", json.dumps(as_json(found), indent=1))
     draw(found, out / "learning.png")
-    against = contrasts_table(contrasts(rolled.rollouts, MEMORY), experiment.seeds)
+    against = contrasts_table(contrasts(rolled.rollouts, MEMORY))
     seen = "; ".join(
         f"{arm}: {inputs_phrase(policy_inputs([record for run in runs for record in run]))}"
         for arm, runs in rolled.rollouts.items()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,21 @@ def test_a_difference_of_one_training_is_none_of_arms() -> None:
     assert found.high > 0.3
     assert found.of_seeds == pytest.approx((0.5, 0, 0))
     assert found.p_of_seeds == pytest.approx(0.4226, abs=1e-4), "a paired t test: t = 1 with two degrees of freedom"
+
+
+def test_equal_differences_say_nothing_of_training_seeds() -> None:
+    """A t test of them has no variance to divide by; of two seeds they are equal now and then."""
+    arms = {"a": [records([[0, 0, 1]])] * 3, "b": [records([[0, 1, 1]])] * 3, "c": [records([[0, 0, 1]])] * 3}
+    found = contrasts(arms, "a")
+    assert [one.p_of_seeds for one in found.values()] == [None, None]
+
+
+def test_an_arm_is_the_same_whoever_stands_beside_it_but_for_holm() -> None:
+    rng = np.random.default_rng(2)
+    arms = {name: [records(rng.integers(0, 2, (2, 30)).tolist())] for name in "abc"} | {"d": [records([[1] * 30] * 2)]}
+    alone, beside = contrasts({k: arms[k] for k in "ad"}, "a")["d"], contrasts(arms, "a")["d"]
+    assert replace(beside, p=alone.p) == alone
+    assert beside.p > alone.p
 
 
 @pytest.mark.parametrize("ends", [(0, 0), (1, 1), (0, 1), (1, 0)])

@@ -150,19 +150,22 @@ def test_what_training_would_refuse_is_told_before_anything_is_made(tmp_path: Pa
 
 
 def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: dict[str, Any] = {}
-    monkeypatch.setattr(stages_module, "run_once", lambda words, log, **options: given.update(options) or Cost(0, 0))
+    ran = list[list[str]]()
+    monkeypatch.setattr(stages_module, "_run", lambda words, *rest: (ran.append(words), (0, Cost(1, 1)))[1])
     stages = Stages(replace(experiment("bowl"), seeds=1), tmp_path)
     half_made = stages.policy(MEMORY, 0) / "half_made"
     half_made.mkdir(parents=True)
     stages.train(MEMORY, 0)
-    assert given["going_on"] is None
+    assert ran == [stages.training_words(MEMORY, 0)]
     assert not half_made.exists()
-    config = stages.policy(MEMORY, 0) / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-    config.parent.mkdir(parents=True)
-    config.touch()
+    stages.log("training", MEMORY, 0).with_suffix(".json").unlink()
+    last = stages.policy(MEMORY, 0) / "checkpoints" / "last"
+    for name in ("pretrained_model/train_config.json", "training_state/training_step.json"):
+        (last / name).parent.mkdir(parents=True)
+        (last / name).touch()
     stages.train(MEMORY, 0)
-    assert given["going_on"] == ["lerobot", "train", f"config_path={config}", "resume=true"]
+    config = last / "pretrained_model" / "train_config.json"
+    assert ran[1] == ["lerobot", "train", f"config_path={config}", "resume=true"]
 
 
 def test_what_is_told_in_training_is_told_in_rollouts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,10 +62,16 @@ def study(
     data = [Demonstrations(read, suite, out, workers) for suite in dict.fromkeys(suite for suite, _, _ in places)]
     cells = [Cell(read, out, *place, sealed=sealed) for place in places]
     if keep is not None:
+        if keep.resolve() == out.resolve():
+            raise MemobenchError(f"--keep {keep} is --out too; name another folder, which gets what is small")
         kept = [folder for cell in cells for folder in cell.keep(keep)]
         say(f"{count_of(len(kept), 'log')} are kept in {keep}")
     if page is not None:
-        put_into(page, STUDY, tell(read, out, figures or out))
+        text = told(read, out)
+        if not text:
+            raise MemobenchError(f"--out {out} holds no evaluated cell of this study, so {page} is left as it is")
+        put_into(page, STUDY, text)
+        draw_all(read, out, figures or out)
         say(f"the tables of {page} are made")
     if keep or page:
         return
@@ -87,7 +93,8 @@ def study(
         if what == "tuning" and tried:
             rates = choose_rates(tried)
             say("; ".join(f"{suite}, {row}: learning rate {rate:g}" for (suite, row), rate in rates.items()))
-    text = tell(read, out, figures or out)
+    text = told(read, out)
+    draw_all(read, out, figures or out)
     write_file(out / "study.md", text + "\n")
     if browse:
         for suite in read.suites:
@@ -96,10 +103,8 @@ def study(
     say(text)
 
 
-def tell(grid: Grid, out: Path, figures: Path) -> str:
-    """Draw the figures of what is evaluated, and return its tables."""
-    figures.mkdir(parents=True, exist_ok=True)
-    draw_all(grid, out, figures)
+def told(grid: Grid, out: Path) -> str:
+    """Return the tables of what is evaluated in a study's folder."""
     return "\n\n".join(filter(None, (tables(grid, out, suite) for suite in grid.suites)))
 
 

@@ -14,7 +14,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.report import keep_log
 from lerobot_memobench.io import read_json, write_file
-from research.learning.stages import Cost, ended, kept_of, remove_unfinished, run_once
+from research.learning.stages import Cost, ended, kept_of, run_once, train_once
 from research.memory_study.grid import Grid, folder_name
 
 ROLLOUTS = "rollouts"
@@ -119,12 +119,7 @@ class Cell:
 
     def run(self) -> None:
         """Train, then evaluate, whatever of this is left to do."""
-        begun = self.policy / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-        going_on = ["lerobot", "train", f"config_path={begun}", "resume=true"] if begun.is_file() else None
-        log = self.log(TRAINING)
-        if going_on is None:
-            remove_unfinished(self.policy, log)
-        run_once(self.training_words(), log, going_on=going_on)
+        train_once(self.training_words(), self.log(TRAINING), self.policy)
         for part in self.parts:
             run_once(self.evaluation_words(part), self.log(part), how=["resume=true"])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import cycle
 from pathlib import Path
 from statistics import mean
 from textwrap import shorten
@@ -21,6 +22,7 @@ MEASURES = {"solved": "solved, %", "follows": "follows the evidence, %"}
 
 def draw_all(grid: Grid, out: Path, figures: Path) -> list[Path]:
     """Draw what has been evaluated in ``out`` into the folder ``figures``; return the files."""
+    figures.mkdir(parents=True, exist_ok=True)
     found = [draw(grid, out, figures / "study.png")]
     for suite in grid.suites:
         found.append(draw_tasks(grid, out, suite, figures / f"study_tasks_{suite}.png"))
@@ -37,7 +39,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     suites = {suite: found for suite in grid.suites if (found := figures_of_rows(grid, out, suite))}
     if not suites:
         return None
-    rows = [row for row in grid.rows if any(row in found for found in suites.values())]
+    rows = list(dict.fromkeys(row for found in suites.values() for row in found))
     size = (2.0 + 2.6 * len(suites) * len(MEASURES), 1.2 + 0.3 * len(rows))
     figure, axes = plt.subplots(
         1, len(suites) * len(MEASURES), figsize=size, sharey=True, squeeze=False, constrained_layout=True
@@ -51,8 +53,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
         axis.set_title(suite, fontsize=10)
         axis.set_xlabel(MEASURES[measure])
         axis.spines[["top", "right"]].set_visible(False)
-    names = [row + (" (privileged)" if grid.rows[row].privileged else "") for row in rows]
-    axes[0][0].set_yticks(range(len(rows)), names)
+    axes[0][0].set_yticks(range(len(rows)), rows)
     axes[0][0].invert_yaxis()
     return _save(figure, path)
 
@@ -64,9 +65,9 @@ def draw_tasks(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
         return None
     ceilings = grid.suites[suite].ceilings
     reports = {row: [report(cell, ROLLOUTS)["tasks"] for cell in cells] for row, cells in rows.items()}
-    tasks = list(next(iter(reports.values()))[0])
+    tasks = list(dict.fromkeys(task for told in reports.values() for one in told for task in one))
     columns = {"best found without": [ceilings.get(task, math.nan) for task in tasks]} if ceilings else {}
-    columns |= {row: [mean(one[task]["SR"] for one in told) for task in tasks] for row, told in reports.items()}
+    columns |= {row: [_solved(told, task) for task in tasks] for row, told in reports.items()}
     figure, axis = _pyplot().subplots(
         figsize=(4.4 + 0.46 * len(columns), 1.9 + 0.27 * len(tasks)), constrained_layout=True
     )
@@ -86,16 +87,21 @@ def draw_tasks(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
     return _save(figure, path)
 
 
+def _solved(reports: list[dict[str, Any]], task: str) -> float:
+    told = [one[task]["SR"] for one in reports if task in one]
+    return mean(told) if told else math.nan
+
+
 def draw_curves(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
     """Draw success and satisfied checkpoints against updates to ``path``, of the rows with earlier checkpoints."""
-    found = curves(grid, evaluated_rows(grid, out, suite))
+    found = curves(evaluated_rows(grid, out, suite))
     if not found:
         return None
     figure, axes = _pyplot().subplots(
         1, len(METRICS), figsize=(2.6 * len(METRICS), 2.9), sharey=True, constrained_layout=True
     )
     for axis, metric in zip(axes, METRICS, strict=True):
-        for colour, (row, points) in zip(COLOURS, found.items(), strict=False):
+        for colour, (row, points) in zip(cycle(COLOURS), found.items(), strict=False):
             seeds = [(updates, value) for updates, told in points for one in told if (value := one[metric]) is not None]
             means = {n: mean(value for updates, value in seeds if updates == n) for n, _ in seeds}
             axis.plot(list(means), list(means.values()), "-", color=colour, label=row)

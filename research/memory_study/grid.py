@@ -8,9 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import draccus
+import yaml
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.tasks.task import MEMORY_TYPES
+from lerobot_memobench.tasks.catalogue import resolve_tasks
+from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
+
+RESERVED = ("rollouts", "training", "policy", "sealed", "after")
+"""How folders and files of a cell are called, or begin."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,11 @@ class Suite:
     evaluation: list[str] = field(default_factory=list)
     tasks: list[str] = field(default_factory=list)
     ceilings: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Return which suite it is of: ``published`` or ``strict``."""
+        return word_of(self.evaluation, "suite") or PUBLISHED
 
     @property
     def task_words(self) -> list[str]:
@@ -88,17 +98,34 @@ class Grid:
     def __post_init__(self) -> None:
         if not self.rows or not self.suites:
             raise MemobenchError("a study needs rows and suites, and has none; name some in its file")
+        for what, names in (("rows", self.rows), ("controls", self.controls), ("suites", self.suites)):
+            folders = [folder_name(name) for name in names]
+            if twice := [name for name, folder in zip(names, folders, strict=True) if folders.count(folder) > 1]:
+                raise MemobenchError(f"the {what} {', '.join(twice)} have one folder; rename one")
+        for name in self.controls:
+            if folder_name(name).partition("_")[0] in RESERVED:
+                raise MemobenchError(f"a control is called {name!r}, as something else of a cell; rename it")
+        for name, suite in self.suites.items():
+            known = resolve_tasks(suite.tasks or "all", suite.name)
+            if strangers := [task for task in suite.ceilings if task not in known]:
+                raise MemobenchError(f"suite {name!r} has a ceiling of {strangers[0]}; {nearest(strangers[0], known)}")
         for name, row in self.rows.items():
-            for control in row.controls:
-                if control not in self.controls:
-                    raise MemobenchError(
-                        f"row {name!r} names the control {control!r}; {nearest(control, self.controls)}"
-                    )
-            if row.seeds < 1:
-                raise MemobenchError(f"row {name!r} has seeds: {row.seeds}; expected how many trainings, at least 1")
-        folders = [folder_name(name) for name in self.rows]
-        if len({*folders}) < len(folders):
-            raise MemobenchError(f"two of the rows {', '.join(self.rows)} have one folder; rename one")
+            self._check_row(name, row)
+
+    def _check_row(self, name: str, row: Row) -> None:
+        for control in row.controls:
+            if control not in self.controls:
+                raise MemobenchError(f"row {name!r} names the control {control!r}; {nearest(control, self.controls)}")
+        if row.seeds < 1:
+            raise MemobenchError(f"row {name!r} has seeds: {row.seeds}; expected how many trainings, at least 1")
+        words = [*self.training, *row.training]
+        steps, every = (word_of(words, key) for key in ("steps", "save_freq"))
+        for updates in row.after:
+            if not steps or not every or updates < 1 or updates >= int(steps) or updates % int(every):
+                raise MemobenchError(
+                    f"row {name!r} has after: {updates}, and no checkpoint is kept then (steps={steps}, "
+                    f"save_freq={every}); name a multiple of save_freq below steps"
+                )
 
     def places(self) -> Iterator[tuple[str, str, int]]:
         """Yield suite, row and training seed of every cell: the first seeds of all rows before the second ones."""
@@ -115,6 +142,8 @@ def read_grid(path: Path) -> Grid:
     """
     try:
         with path.open(encoding="utf-8") as file:
+            _check_keys(yaml.compose(file, yaml.SafeLoader))
+            file.seek(0)
             return draccus.load(Grid, file)
     except MemobenchError:
         raise
@@ -153,6 +182,22 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
     ]
 
 
-def folder_name(row: str) -> str:
-    """Return what a row's folders are called."""
-    return re.sub(r"\W+", "_", row)
+def folder_name(name: str) -> str:
+    """Return what the folders of a row, a control or a suite are called."""
+    return re.sub(r"\W+", "_", name)
+
+
+def word_of(words: Iterable[str], key: str) -> str | None:
+    """Return the value of the last word ``key=value``; None where there is none."""
+    return next((word.partition("=")[2] for word in reversed([*words]) if word.startswith(f"{key}=")), None)
+
+
+def _check_keys(node: yaml.Node | None) -> None:
+    """Refuse a key that stands twice: YAML would take the last, and say nothing."""
+    if isinstance(node, yaml.MappingNode):
+        keys = [key.value for key, _ in node.value]
+        if twice := [key for key in keys if keys.count(key) > 1]:
+            raise MemobenchError(f"{twice[0]!r} stands twice{node.start_mark}; rename one")
+    for child in node.value if isinstance(node, yaml.CollectionNode) else ():
+        for part in child if isinstance(child, tuple) else (child,):
+            _check_keys(part)

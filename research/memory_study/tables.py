@@ -9,25 +9,26 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Record, report_values
 from lerobot_memobench.evaluation.records import read_rollouts, read_runs
 from lerobot_memobench.evaluation.report import control_data
 from lerobot_memobench.evaluation.statistics import Estimate
+from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
-from research.learning.results import average_success, contrasts, contrasts_table, markdown
+from research.learning.results import adjusted, average_success, contrast, contrasts_table, markdown
 from research.learning.stages import ended
 from research.memory_study.cells import ROLLOUTS, SEALED, TRAINING, Cell, after
-from research.memory_study.grid import Grid
+from research.memory_study.grid import Grid, word_of
 
 REFERENCES = ("no memory", "clock only", "frames")
 """Rows from which the others' differences are told."""
-EVIDENCE, PAUSES = "evidence", "pauses"
-OWN_COLUMNS = (EVIDENCE, PAUSES)
-"""Controls that stand beside the rows; the others have a table of their own."""
+EVIDENCE = "evidence"
+"""The control that stands beside the rows; the others have a table of their own."""
 EMPTY = "–"
 
 Rows = Mapping[str, Sequence[Cell]]
-"""Row -> its cells that have been evaluated, in the order of training seeds."""
+"""Title of a row -> its cells that have been evaluated, in the order of training seeds."""
 
 
 def tables(grid: Grid, out: Path, suite: str) -> str:
@@ -39,27 +40,27 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
     if not rows:
         return ""
     parts = [
-        ("What is solved, and whether it follows the evidence", _summary(grid, rows)),
+        ("What is solved, and whether it follows the evidence", _summary(rows)),
         ("Rates by memory type and operation", _by_memory_type(rows)),
         ("Success by task", _by_task(rows, grid.suites[suite].ceilings)),
         ("How rollouts ended, all training seeds together", _endings(rows)),
         ("Other conditions of the rollouts, first training seed", _conditions(rows)),
-        ("Success and satisfied checkpoints by updates", _by_updates(grid, rows)),
+        ("Success and satisfied checkpoints by updates", _by_updates(rows)),
         *((f"Less *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
         ("The sealed test", _sealed(rows)),
-        ("What a cell takes", _costs(rows)),
+        ("What a cell takes, beside other work", _costs(rows)),
     ]
     return "\n\n".join([f"## {suite}", *(f"### {title}\n\n{table}" for title, table in parts if table)])
 
 
 def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, Any]]:
-    """Return row -> SR ("solved") and rate of "follows" of each training seed, and the chance of it; per cent."""
+    """Return title of a row -> SR ("solved") and "follows" of each training seed, and the chance of that; per cent."""
     found = {}
     for row, cells in evaluated_rows(grid, out, suite).items():
         evidence = _evidence(cells)
         found[row] = {
             "solved": [report(cell, ROLLOUTS)["average"]["SR"] for cell in cells],
-            "follows": [told["follows"] for told in evidence],
+            "follows": [told["follows"]["percent"] for told in evidence],
             "chance": evidence[0]["chance"] if evidence else None,
         }
     return found
@@ -69,9 +70,11 @@ def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, An
 
 
 def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
-    """Return the rows of a suite of which a training seed is evaluated."""
+    """Return the rows of a suite of which a training seed is evaluated, by their titles."""
     cells = {
-        row: [cell for seed in range(told.seeds) if evaluated(cell := Cell(grid, out, suite, row, seed), ROLLOUTS)]
+        row + (" (privileged)" if told.privileged else ""): [
+            cell for seed in range(told.seeds) if evaluated(cell := Cell(grid, out, suite, row, seed), ROLLOUTS)
+        ]
         for row, told in grid.rows.items()
     }
     return {row: own for row, own in cells.items() if own}
@@ -90,6 +93,12 @@ def report(cell: Cell, part: str) -> dict[str, Any]:
 @cache
 def _figures(folder: Path) -> dict[str, Any]:
     (run,) = read_runs([folder])
+    asked, there = len(run.protocol["tasks"]) * run.protocol["episodes"], len(run.records)
+    if there != asked:
+        raise MemobenchError(
+            f"{folder} holds {count_of(there, 'rollout')} of the {asked} that its card asks for; remove its .json and "
+            "evaluate it again, or leave its cell out by --only"
+        )
     return {**report_values(run.summary), **control_data(run)}
 
 
@@ -108,34 +117,35 @@ def _runs(cells: Sequence[Cell], part: str = ROLLOUTS) -> list[list[Record]]:
     return [_rollouts(cell.evaluation(part)) for cell in cells]
 
 
-def _evidence(cells: Sequence[Cell]) -> list[dict[str, float]]:
-    """Return "follows" and "chance" of each training seed, per cent; [] where no task tells a chance."""
+def _evidence(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """Return "follows", "chance" and "scenes" of each training seed; [] where no task tells a chance."""
     reports = [report(cell, EVIDENCE).get("evidence") for cell in cells if evaluated(cell, EVIDENCE)]
-    averages = [told["average"] for told in reports if told and told["average"]]
-    return [{"follows": one["follows"]["percent"], "chance": one["chance"]} for one in averages]
+    return [told["average"] for told in reports if told and told["average"]]
 
 
 # -- tables -----------------------------------------------------------------------------------------------------------
 
 
-def _summary(grid: Grid, rows: Rows) -> str:
-    header = ("", "training seeds", "SR", "95 %", "of seeds", *METRICS[1:], "follows evidence (chance)", "SR in pauses")
-    return markdown(header, [_summary_line(grid, row, cells) for row, cells in rows.items()])
+def _summary(rows: Rows) -> str:
+    header = ("", "training seeds", "SR", "95 %", "of seeds", *METRICS[1:])
+    more = ("follows evidence, first seed", "chance", "scenes")
+    return markdown((*header, *more), [_summary_line(row, cells) for row, cells in rows.items()])
 
 
-def _summary_line(grid: Grid, row: str, cells: Sequence[Cell]) -> list[str]:
+def _summary_line(row: str, cells: Sequence[Cell]) -> list[str]:
     reports = [report(cell, ROLLOUTS) for cell in cells]
-    follows = _evidence(cells)
-    paused = [report(cell, PAUSES) for cell in cells if evaluated(cell, PAUSES)]
-    chance = f"{_mean([one['follows'] for one in follows])} ({_mean([one['chance'] for one in follows])})"
+    told = [EMPTY] * 3
+    if evidence := _evidence(cells):
+        follows = evidence[0]["follows"]
+        rate = f"{follows['percent']:.1f} ({follows['low']:.1f}–{follows['high']:.1f})"
+        told = [rate, f"{evidence[0]['chance']:.1f}", str(evidence[0]["scenes"])]
     return [
-        row + (" (privileged)" if grid.rows[row].privileged else ""),
+        row,
         str(len(cells)),
         *_with_interval(average_success(_runs(cells))),
         ", ".join(f"{report['average']['SR']:.0f}" for report in reports),
         *(_average(reports, metric) for metric in METRICS[1:]),
-        chance if follows else EMPTY,
-        _average(paused, "SR"),
+        *told,
     ]
 
 
@@ -154,7 +164,7 @@ def _by_memory_type(rows: Rows) -> str:
 
 def _by_task(rows: Rows, ceilings: Mapping[str, float]) -> str:
     found = {row: [report(cell, ROLLOUTS)["tasks"] for cell in cells] for row, cells in rows.items()}
-    names = list(next(iter(found.values()))[0])
+    names = dict.fromkeys(name for own in found.values() for one in own for name in one)
     lines = [
         [
             f"`{name}`",
@@ -180,7 +190,7 @@ def _conditions(rows: Rows) -> str:
     """Return SR in each control that has no column beside the rows."""
     first = {row: cells[0] for row, cells in rows.items() if cells[0].seed == 0}
     parts = dict.fromkeys(part for cell in first.values() for part in cell.grid.rows[cell.row].controls)
-    wanted = [part for part in parts if part not in OWN_COLUMNS]
+    wanted = [part for part in parts if part != EVIDENCE]
     there = {row: [part for part in wanted if evaluated(cell, part)] for row, cell in first.items()}
     lines = [
         [row, _average([report(first[row], ROLLOUTS)], "SR")]
@@ -191,24 +201,24 @@ def _conditions(rows: Rows) -> str:
     return markdown(("", "as it is", *wanted), lines) if lines else ""
 
 
-def curves(grid: Grid, rows: Rows) -> dict[str, list[tuple[int, list[dict[str, float | None]]]]]:
+def curves(rows: Rows) -> dict[str, list[tuple[int, list[dict[str, float | None]]]]]:
     """Return row -> updates and the averages of each training seed then, of the rows with earlier checkpoints."""
     found = {}
     for row, cells in rows.items():
         points = []
-        for updates in grid.rows[row].after:
+        for updates in cells[0].grid.rows[cells[0].row].after:
             told = [report(cell, part)["average"] for cell in cells if evaluated(cell, part := after(updates))]
             points += [(updates, told)] if told else []
         if points:
-            whole = int(_word(cells[0].training_words(), "steps"))
+            whole = int(word_of(cells[0].training_words(), "steps") or 0)
             found[row] = [*points, (whole, [report(cell, ROLLOUTS)["average"] for cell in cells])]
     return found
 
 
-def _by_updates(grid: Grid, rows: Rows) -> str:
+def _by_updates(rows: Rows) -> str:
     lines = [
         [row, str(updates), str(len(told)), *(_mean([one[metric] for one in told]) for metric in METRICS)]
-        for row, points in curves(grid, rows).items()
+        for row, points in curves(rows).items()
         for updates, told in points
     ]
     return markdown(("", "updates", "training seeds", *METRICS), lines) if lines else ""
@@ -226,18 +236,14 @@ def _sealed(rows: Rows) -> str:
 
 
 def _differences(rows: Rows, reference: str) -> str:
-    """Return a table of each row against a reference; rows with as many training seeds are adjusted together."""
-    base = {cell.seed for cell in rows.get(reference, ())}
-    groups: dict[tuple[int, ...], list[str]] = {}
+    """Return a table of each row against a reference, by the training seeds that both have."""
+    base = {cell.seed: cell for cell in rows.get(reference, ())}
+    found = {}
     for row, own in rows.items():
-        shared = tuple(cell.seed for cell in own if cell.seed in base)
+        shared = [cell for cell in own if cell.seed in base]
         if row != reference and shared:
-            groups.setdefault(shared, []).append(row)
-    found = []
-    for seeds, names in sorted(groups.items(), key=lambda group: -len(group[0])):
-        arms = {name: _runs([cell for cell in rows[name] if cell.seed in seeds]) for name in (reference, *names)}
-        found.append(contrasts_table(contrasts(arms, reference), len(seeds), reference))
-    return "\n\n".join(found)
+            found[row] = contrast(_runs(shared), _runs([base[cell.seed] for cell in shared]), row, reference)
+    return contrasts_table(adjusted(found), reference) if found else ""
 
 
 def _costs(rows: Rows) -> str:
@@ -249,7 +255,7 @@ def _costs(rows: Rows) -> str:
         lines.append(
             [row, _mean(trained), _mean([1000 * sum(one["wall_s"] for one in run) / _steps(run) for run in runs])]
         )
-    return markdown(("", "training, min", "a control step, ms"), lines)
+    return markdown(("", "training, min", "a simulated step, prompt included, ms"), lines)
 
 
 def _steps(records: Sequence[Record]) -> int:
@@ -269,7 +275,3 @@ def _average(reports: Sequence[Mapping[str, Any]], metric: str) -> str:
 def _mean(values: Sequence[float | None]) -> str:
     known = [value for value in values if value is not None]
     return f"{mean(known):.1f}" if known else EMPTY
-
-
-def _word(words: Sequence[str], name: str) -> str:
-    return next(word.partition("=")[2] for word in words if word.startswith(f"{name}="))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import fcntl
+import gzip
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -13,7 +15,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import IO, Any
 
 import pytest
 
@@ -29,7 +31,7 @@ from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
 from research.memory_study import cells
-from research.memory_study.__main__ import GRID, STUDY, planned
+from research.memory_study.__main__ import GRID, STUDY, main, planned, study
 from research.memory_study.cells import ROLLOUTS, SEALED, Cell, Demonstrations, choose_rates, chosen_rate, tuning
 from research.memory_study.figure import draw_all
 from research.memory_study.grid import Grid, chosen, read_grid
@@ -37,9 +39,10 @@ from research.memory_study.tables import figures_of_rows, tables
 from research.pages import around
 from tests.support.logs import rollout
 
+FIND = "find_the_artichoke_hidden_in_one_of_the_drawers"
 SMALL = """
 policy: [policy=memobench_mem, size=small, perception=objects]
-training: [steps=4]
+training: [steps=4, save_freq=2]
 evaluation: [split=validation, episodes=2, videos=0]
 suites: {strict: {demonstrations: [--suite, strict], evaluation: [suite=strict]}}
 controls: {evidence: [evidence=true, episodes=12]}
@@ -82,6 +85,14 @@ def test_the_study_has_every_mechanism_and_its_commands_are_understood(tmp_path:
         ("frames, no time", "no_memory", "have one folder"),
         ("seeds: 2", "seeds: 0", "'no memory' has seeds: 0"),
         ("suites: {", "suites: {}\nnone: {", "needs rows and suites|no study's file"),
+        ("controls: {evidence:", "controls: {sealed:", "a control is called 'sealed'"),
+        ("controls: {evidence:", "controls: {after 3: [], evidence:", "a control is called 'after 3'"),
+        ("controls: {evidence:", "controls: {a b: [], a_b: [], evidence:", "controls a b, a_b have one folder"),
+        ("frames, no time:", "no memory:", "'no memory' stands twice"),
+        ("controls: [evidence]}", "after: [3]}", "after: 3, and no checkpoint is kept then"),
+        ("controls: [evidence]}", "after: [4]}", "after: 4, and no checkpoint"),
+        ("[suite=strict]}", "[suite=strict], tasks: [objects]}", "did you mean 'object'"),
+        ("[suite=strict]}", "[suite=strict], ceilings: {find_it: 3.0}}", "a ceiling of find_it"),
     ],
 )
 def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, old: str, new: str, told: str) -> None:
@@ -97,20 +108,30 @@ def test_the_first_training_seed_alone_runs_controls(grid: Grid, tmp_path: Path)
 
 
 def test_the_tasks_of_a_suite_alone_are_drawn_and_rolled_out(tmp_path: Path) -> None:
-    some = SMALL.replace("evaluation: [suite=strict]", "evaluation: [suite=strict], tasks: [object, find_it]")
+    some = SMALL.replace(
+        "evaluation: [suite=strict]",
+        f"evaluation: [suite=strict], tasks: [object, {FIND}]",
+    )
     (tmp_path / "grid.yaml").write_text(some)
     cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "no memory", 0)
-    weights = "policy.task_weights={object: 1, find_it: 1, temporal: 0, spatial: 0, procedural: 0}"
+    weights = f"policy.task_weights={{object: 1, {FIND}: 1, temporal: 0, spatial: 0, procedural: 0}}"
     assert weights in cell.training_words()
-    assert "tasks=object,find_it" in cell.evaluation_words(ROLLOUTS)
+    assert f"tasks=object,{FIND}" in cell.evaluation_words(ROLLOUTS)
 
 
 def test_anothers_policy_learns_the_demonstrations_of_the_same_tasks(tmp_path: Path, monkeypatch: Any) -> None:
-    some = SMALL.replace("evaluation: [suite=strict]", "evaluation: [suite=strict], tasks: [object, find_it]")
+    some = SMALL.replace(
+        "evaluation: [suite=strict]",
+        f"evaluation: [suite=strict], tasks: [object, {FIND}]",
+    )
     (tmp_path / "grid.yaml").write_text(some.replace("no memory: {", "act: {policy: [policy=act], "))
     cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "act", 0)
     Demonstrations(cell.grid, "strict", tmp_path).folder.mkdir(parents=True)
-    told = [("find_it", "spatial"), ("count_it", "temporal"), ("bowl", "object")]
+    told = [
+        ("find_the_artichoke_hidden_in_one_of_the_drawers", "spatial"),
+        ("count_it", "temporal"),
+        ("bowl", "object"),
+    ]
     places = [
         SimpleNamespace(index=k, record=SimpleNamespace(task_name=n, memory_type=t)) for k, (n, t) in enumerate(told)
     ]
@@ -133,14 +154,12 @@ def test_a_killed_cell_goes_on_where_it_was(grid: Grid, tmp_path: Path, monkeypa
     """Commands that die at every moment in turn; what has ended well is never run again."""
     cell, ran, dies = Cell(grid, tmp_path, "strict", "frames, no time", 0), list[str](), [True] * 3
 
-    def fake(words: list[str], log: Path, environment: object) -> tuple[int, Cost]:
+    def fake(words: list[str], output: IO[str], environment: object) -> tuple[int, Cost]:
         ran.append(words[1] if words[1] == "eval" else "resume" if "resume=true" in words else "train")
-        log.write_text("…")
+        print("…", file=output)
         if dies and dies.pop():
             if words[1] == "train":
-                kept = cell.policy / "checkpoints" / "last" / "pretrained_model"
-                kept.mkdir(parents=True, exist_ok=True)
-                (kept / "train_config.json").write_text("{}")
+                _keep_checkpoint(cell.policy / "checkpoints" / "last")
             return 1, Cost(1.0, 1.0)
         return 0, Cost(1.0, 1.0)
 
@@ -159,6 +178,49 @@ def test_a_killed_cell_goes_on_where_it_was(grid: Grid, tmp_path: Path, monkeypa
     assert planned([], [], [cell], 1) == "0 of 1 are left"
 
 
+def _keep_checkpoint(folder: Path) -> None:
+    for name in ("pretrained_model/train_config.json", "training_state/training_step.json"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("{}")
+
+
+def test_nothing_is_removed_that_may_be_gone_on_with(
+    grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a training that runs, of one of another command, or of one that was killed as it moved the link."""
+    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
+    mark = cell.policy / "mark"
+    mark.parent.mkdir(parents=True)
+    mark.touch()
+    with cell.log("training").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(MemobenchError, match="still writes"):
+            cell.run()
+    cell.log("training").with_suffix(".json").write_text('{"words": ["other"], "ended": false}')
+    with pytest.raises(MemobenchError, match="of another command"):
+        cell.run()
+    assert mark.exists()
+    cell.log("training").with_suffix(".json").unlink()
+    for updates in ("000002", "000004"):
+        _keep_checkpoint(cell.policy / "checkpoints" / updates)
+    (cell.policy / "checkpoints" / "000002" / "training_state" / "optimizer_param_groups.json").touch()
+    ran = list[list[str]]()
+    monkeypatch.setattr(stages, "_run", lambda words, *rest: (ran.append(words), (1, Cost(1.0, 1.0)))[1])
+    with pytest.raises(MemobenchError, match="ended with status 1"):
+        cell.run()
+    assert ran[0][2].endswith("checkpoints/000002/pretrained_model/train_config.json"), "the last whole one"
+    assert mark.exists()
+
+
+def test_a_killed_attempt_counts_till_its_last_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log, words = tmp_path / "a.log", ["memobench", "--version"]
+    log.touch()
+    told = {"words": words, "ended": False, "wall_s": 5.0, "cpu_s": 4.0, "began": log.stat().st_mtime - 60}
+    log.with_suffix(".json").write_text(json.dumps(told))
+    monkeypatch.setattr(stages, "_run", lambda *given: (0, Cost(1.0, 1.0)))
+    assert stages.run_once(words, log) == Cost(66.0, 5.0)
+
+
 def test_a_command_that_outlived_its_study_is_not_run_beside_itself(tmp_path: Path) -> None:
     """As when the study alone was killed: its command holds the log's lock."""
     log = tmp_path / "training.log"
@@ -172,6 +234,7 @@ def test_a_command_that_outlived_its_study_is_not_run_beside_itself(tmp_path: Pa
     assert ended(log)
 
 
+BUTTER = "put_only_the_butter_picked_up_in_the_prompt_video_on_the_plate"
 TINY = """
 policy: [policy=memobench_mem, size=small, perception=objects]
 training: [steps=8, save_freq=2]
@@ -257,10 +320,8 @@ def test_an_interrupted_training_is_gone_on_with_by_its_own_command_alone(
 ) -> None:
     cell = Cell(grid, tmp_path, "strict", "frames, no time", 0)
 
-    def interrupted(words: list[str], log: Path, environment: object) -> tuple[int, Cost]:
-        kept = cell.policy / "checkpoints" / "last" / "pretrained_model"
-        kept.mkdir(parents=True)
-        (kept / "train_config.json").write_text("{}")
+    def interrupted(words: list[str], output: IO[str], environment: object) -> tuple[int, Cost]:
+        _keep_checkpoint(cell.policy / "checkpoints" / "last")
         raise KeyboardInterrupt
 
     monkeypatch.setattr(stages, "_run", interrupted)
@@ -276,9 +337,10 @@ def test_a_training_that_failed_before_its_first_checkpoint_begins_anew(
 ) -> None:
     cell = Cell(grid, tmp_path, "strict", "no memory", 0)
 
-    def failing(words: list[str], log: Path, environment: object) -> tuple[int, Cost]:
+    def failing(words: list[str], output: IO[str], environment: object) -> tuple[int, Cost]:
         cell.policy.mkdir(parents=True)  # as LeRobot makes it, which refuses one that is there
-        log.write_text("out of memory")
+        output.write("out of memory")
+        output.flush()
         return 1, Cost(1.0, 1.0)
 
     monkeypatch.setattr(stages, "_run", failing)
@@ -301,7 +363,9 @@ def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
     more = SMALL.replace("controls: [evidence]}", "controls: [evidence, replan 5], after: [2]}").replace(
         "controls: {", "controls: {replan 5: [replan=5], "
     )
-    (tmp_path / "grid.yaml").write_text(more.replace("[suite=strict]}", "[suite=strict], ceilings: {bowl: 33.3}}"))
+    (tmp_path / "grid.yaml").write_text(
+        more.replace("[suite=strict]}", f"[suite=strict], tasks: [object], ceilings: {{{BUTTER}: 33.3}}}}")
+    )
     grid = read_grid(tmp_path / "grid.yaml")
     assert draw_all(grid, tmp_path, tmp_path) == []
     _evaluate(Cell(grid, tmp_path, "strict", "no memory", 0), ROLLOUTS)
@@ -311,9 +375,10 @@ def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
         "frames, no time": {"solved": [40.0], "follows": [80.0], "chance": 50.0},
     }
     told = tables(grid, tmp_path, "strict").splitlines()
-    assert "| no memory | 1 | **40.0** | 10.0–70.0 | 40 | 100.0 | – | 100.0 | – | – |" in told
-    assert "| frames, no time | 1 | **40.0** | 10.0–70.0 | 40 | 100.0 | – | 100.0 | 80.0 (50.0) | – |" in told
-    assert "| `bowl` | 33.3 | 40.0 | 40.0 |" in told
+    assert "| no memory | 1 | **40.0** | 10.0–70.0 | 40 | 100.0 | – | 100.0 | – | – | – |" in told
+    (line,) = (one for one in told if one.startswith("| frames, no time | 1 | **40.0** |"))
+    assert re.search(r"\| 80.0 \(\d+\.\d–100\.0\) \| 50\.0 \| 5 \|$", line)
+    assert f"| `{BUTTER}` | 33.3 | 40.0 | 40.0 |" in told
     assert "| frames, no time | 40.0 | 40.0 |" in told, "as it is, and with replan=5"
     assert "| frames, no time | 2 | 1 | 20.0 | 100.0 | – | 100.0 |" in told, "after 2 updates"
     assert "| frames, no time | 4 | 1 | 40.0 | 100.0 | – | 100.0 |" in told
@@ -323,10 +388,10 @@ def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
 
 
 def test_checkpoints_are_evaluated_by_their_own_weights(tmp_path: Path) -> None:
-    (tmp_path / "grid.yaml").write_text(SMALL.replace("controls: [evidence]}", "after: [3000]}"))
+    (tmp_path / "grid.yaml").write_text(SMALL.replace("controls: [evidence]}", "after: [2]}"))
     cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "frames, no time", 0)
-    assert cell.parts == [ROLLOUTS, "after 3000"]
-    assert f"policy={cell.policy}/checkpoints/003000" in cell.evaluation_words("after 3000")
+    assert cell.parts == [ROLLOUTS, "after 2"]
+    assert f"policy={cell.policy}/checkpoints/000002" in cell.evaluation_words("after 2")
     assert f"policy={cell.policy}" in cell.evaluation_words(ROLLOUTS)
 
 
@@ -356,10 +421,25 @@ def _rollout(episode: int, evidence: bool, solved: int = 4) -> dict[str, Any]:
         told = {"seed": 7 + episode // 2, "variant": variant, "choice": variant if right else None}
         told |= {"variants": 2, "chance": 0.5}
     told |= {"wall_s": 1.0, "steps": 80, "prompt_steps": 20}
-    return rollout("bowl", "object", "SC", [True, True], episode < solved, episode, **told)
+    return rollout(BUTTER, "object", "SC", [True, True], episode < solved, episode, **told)
 
 
 NOTES = Path(__file__).parents[2] / "docs" / "research"
+
+
+def test_a_page_is_not_emptied_and_a_cut_log_is_told(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    shutil.copy(NOTES / "study.md", page)
+    shutil.copytree(NOTES / "study", tmp_path / "out")
+    assert main(["--out", str(tmp_path / "nothing"), "--page", str(page)]) == 2
+    assert page.read_text() == (NOTES / "study.md").read_text()
+    log = Cell(read_grid(GRID), tmp_path / "out", "strict", "frames", 0).evaluation(ROLLOUTS) / "episodes.jsonl.gz"
+    lines = gzip.decompress(log.read_bytes()).splitlines(keepends=True)
+    log.write_bytes(gzip.compress(b"".join(lines[:50])))
+    with pytest.raises(MemobenchError, match=r"frames-0/rollouts holds 50 rollouts of the 144 that its card asks for"):
+        tables(read_grid(GRID), tmp_path / "out", "strict")
+    with pytest.raises(MemobenchError, match="is --out too"):
+        study(tmp_path / "out", keep=tmp_path / "out")
 
 
 def test_logs_are_kept_as_they_are(tmp_path: Path) -> None:

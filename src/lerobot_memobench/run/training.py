@@ -75,6 +75,8 @@ They lie in main memory, where no loader would be quicker."""
 TRAIN_CONFIG = "train_config.json"
 """LeRobot's file of a training's whole configuration, in each of its checkpoints."""
 TRAINING_STEP = Path("training_state") / "training_step.json"
+OPTIMIZER_GROUPS = "optimizer_param_groups.json"
+"""Written behind an optimizer's state, which is behind nearly all of a checkpoint."""
 LEAST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0, "eval.n_episodes": 1}
 """Setting -> the smallest number with which LeRobot trains and evaluates."""
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
@@ -299,9 +301,10 @@ def last_checkpoint(run: Path) -> Path:
     numbered = sorted(
         (path for path in checkpoints.glob("*") if path.name.isdecimal()), key=lambda path: int(path.name)
     )
-    # The link is set once a checkpoint is whole; a copy of the run may lack it.
+    # The link is set once a checkpoint is whole; a copy of the run may lack it, and so does one killed at that moment.
     for folder in (checkpoints / "last", *reversed(numbered)):
-        if (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file():
+        told = (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file()
+        if told and (folder.name == "last" or any(folder.glob("training_state/**/" + OPTIMIZER_GROUPS))):
             return folder / "pretrained_model"
     what = "holds no whole checkpoint" if run.is_dir() else "does not exist"
     raise MemobenchError(
