@@ -243,8 +243,7 @@ suites:
   strict:
     demonstrations:
       [--suite, strict, --tasks, find_the_artichoke_hidden_in_one_of_the_drawers, --episodes, "3", --no-images]
-    evaluation: [suite=strict]
-    tasks: [find_the_artichoke_hidden_in_one_of_the_drawers]
+    evaluation: [suite=strict, tasks=find_the_artichoke_hidden_in_one_of_the_drawers]
 rows:
   frames: {training: [], after: [4]}
 """
