@@ -67,7 +67,7 @@ def study(
         kept = [folder for cell in cells for folder in cell.keep(keep)]
         say(f"{count_of(len(kept), 'log')} are kept in {keep}")
     if page is not None:
-        text = told(read, out)
+        text = tables_of(read, out)
         if not text:
             raise MemobenchError(f"--out {out} holds no evaluated cell of this study, so {page} is left as it is")
         put_into(page, STUDY, text)
@@ -93,7 +93,7 @@ def study(
         if what == "tuning" and tried:
             rates = choose_rates(tried)
             say("; ".join(f"{suite}, {row}: learning rate {rate:g}" for (suite, row), rate in rates.items()))
-    text = told(read, out)
+    text = tables_of(read, out)
     draw_all(read, out, figures or out)
     write_file(out / "study.md", text + "\n")
     if browse:
@@ -103,7 +103,7 @@ def study(
     say(text)
 
 
-def told(grid: Grid, out: Path) -> str:
+def tables_of(grid: Grid, out: Path) -> str:
     """Return the tables of what is evaluated in a study's folder."""
     return "\n\n".join(filter(None, (tables(grid, out, suite) for suite in grid.suites)))
 

@@ -337,6 +337,7 @@ def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80
         (place / "pretrained_model").mkdir(parents=True)
         (place / "training_state").mkdir()
         (place / "training_state" / "training_step.json").write_text(json.dumps({"step": step}))
+        (place / "training_state" / "optimizer_param_groups.json").write_text("[]")
         config.save_pretrained(place / "pretrained_model")
         policy.save_pretrained(place / "pretrained_model")
         (place.parent / "last").unlink(missing_ok=True)
@@ -367,10 +368,11 @@ def test_a_training_goes_on_by_its_folder(training: Called, capsys: pytest.Captu
             assert resumed(given) == given  # LeRobot's own form
 
 
-def test_a_copy_of_a_run_has_no_link(training: Called) -> None:
+@pytest.mark.parametrize("missing", ["training_step.json", "optimizer_param_groups.json"])
+def test_a_copy_of_a_run_has_no_link(training: Called, missing: str) -> None:
     folder = training_run(Path("run"), done=(40, 80, 120), steps=200)
     (Path("run") / "checkpoints" / "last").unlink()
-    (folder.parent / "training_state" / "training_step.json").unlink()  # killed while it was saved
+    (folder.parent / "training_state" / missing).unlink()  # killed while it was saved
     assert main(["train", "output_dir=run", "resume=true"]) == 0
     assert training.value("config_path") == "run/checkpoints/000080/pretrained_model/train_config.json"
 
