@@ -139,6 +139,7 @@ def test_another_instruction_is_named(ours, tmp_path):
     assert all(each.startswith("task at frame 0: recorded 'do what must be done', replayed") for each in found)
 
 
+@pytest.mark.slow
 def test_with_images_it_caches_and_trains(filmed, demos, tmp_path):
     """An episode deleted, the rest merged with the whole, its videos written anew; training makes the cache."""
     edited = delete(filmed, tmp_path / "edited", 0)

@@ -189,6 +189,7 @@ def ranks(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(len(rank_case.CASES)), ids=lambda n: f"{n}-{rank_case.CASES[n][0]}")
 def test_two_ranks_are_one_batch(ranks: Any, number: int) -> None:
     joint = rank_case.step(*rank_case.CASES[number], slice(None))

@@ -116,6 +116,7 @@ class BindingShim:
         return jacobian
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(control.MUJOCO >= (3, 10), reason="robosuite's controllers do not run on MuJoCo 3.10 or later")
 @pytest.mark.filterwarnings("ignore")
 def test_torques_equal_robosuites_controller(arm_model: mujoco.MjModel) -> None:
