@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.io import draft_of
 from research.alignment.measures import mean_and_deviation
+from research.drawing import pyplot, save
 from research.learning.results import COLOURS, WRONG_COLOUR, markdown
 
 MEASURES = {
@@ -77,11 +77,7 @@ PANELS = {
 
 def draw(summary: dict[str, Any], path: Path) -> Path:
     """Draw every panel with every training seed to ``path``; return it."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    plt = pyplot()
     figure, axes = plt.subplots(2, 3, figsize=(9.2, 6.2), constrained_layout=True)
     _draw_solved(axes.flat[0], {arm: found["all"] for arm, found in summary["outcomes"].items()})
     for axis, (name, title) in zip(axes.flat[1:], PANELS.items(), strict=True):
@@ -94,10 +90,7 @@ def draw(summary: dict[str, Any], path: Path) -> Path:
     handles = [label for axis in axes.flat[:2] for label in zip(*axis.get_legend_handles_labels(), strict=True)]
     figure.legend(*zip(*handles, strict=True), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     figure.suptitle(_headline(summary), fontsize=10)
-    with draft_of(path) as draft:
-        figure.savefig(draft, dpi=130)
-    plt.close(figure)
-    return path
+    return save(figure, path)
 
 
 def _draw_solved(axis: Any, arms: dict[str, Any]) -> None:

@@ -28,9 +28,9 @@ from lerobot_memobench.evaluation.statistics import (
     percentiles,
     sign_flip,
 )
-from lerobot_memobench.io import draft_of
 from lerobot_memobench.tasks.failures import REFERENCE_DRIFT, WRONG_ORDER
 from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT_FAILURES
+from research.drawing import pyplot, save
 from research.learning.experiments import MEMORY
 from research.learning.stages import Costs
 
@@ -280,11 +280,7 @@ def draw(arms: Mapping[str, Mapping[str, Outcome]], path: Path) -> Path:
     Args:
         arms: arm -> scope -> outcome, as `outcomes.outcomes_of` finds them.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    plt = pyplot()
     scopes = scopes_of(next(iter(arms.values())))
     figure, axis = plt.subplots(figsize=(7.0, 0.9 + 0.32 * len(scopes) * len(arms)), constrained_layout=True)
     for row, scope in enumerate(scopes):
@@ -300,10 +296,7 @@ def draw(arms: Mapping[str, Mapping[str, Outcome]], path: Path) -> Path:
     labels = [*arms, "failed at a wrong referent, order, place or count"]
     columns = len(labels) if sum(map(len, labels)) < 72 else 2  # what the figure is wide enough for
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, fontsize=9, frameon=False)
-    with draft_of(path) as draft:
-        figure.savefig(draft, dpi=130)
-    plt.close(figure)
-    return path
+    return save(figure, path)
 
 
 def scopes_of(found: Mapping[str, Outcome]) -> list[str]:

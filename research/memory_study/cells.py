@@ -15,18 +15,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.report import keep_log
 from lerobot_memobench.io import read_json, write_file
 from research.learning.stages import Cost, ended, kept_of, run_once, train_once
-from research.memory_study.grid import Grid, folder_name
-
-ROLLOUTS = "rollouts"
-"""The evaluation itself, beside a cell's controls."""
-SEALED = "sealed"
-"""The evaluation on sealed seeds, which is run when all else is done, and counted."""
-TRAINING = "training"
-
-
-def after(updates: int) -> str:
-    """Return what the evaluation of the checkpoint of so many updates is called."""
-    return f"after {updates}"
+from research.memory_study.grid import POLICY, ROLLOUTS, SEALED, TRAINING, Grid, after, folder_name
 
 
 @dataclass(frozen=True)
@@ -98,7 +87,7 @@ class Cell:
     @property
     def policy(self) -> Path:
         """The training run's folder."""
-        return self.folder / "policy"
+        return self.folder / POLICY
 
     @property
     def parts(self) -> list[str]:

@@ -10,11 +10,10 @@ from textwrap import shorten
 from typing import Any
 
 from lerobot_memobench.evaluation.metrics import METRICS
-from lerobot_memobench.io import draft_of
+from research.drawing import pyplot, save
 from research.learning.results import COLOURS
-from research.memory_study.cells import ROLLOUTS
 from research.memory_study.grid import Grid
-from research.memory_study.tables import curves, evaluated_rows, figures_of_rows, report
+from research.memory_study.tables import by_task, curves, evaluated_rows, figures_of_rows
 
 CHANCE_COLOUR = "#d55e00"
 MEASURES = {"solved": "solved, %", "follows": "follows the evidence, %"}
@@ -35,7 +34,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
 
     A bar is the mean of training seeds, a dot one of them; an orange line is the best rate without the past.
     """
-    plt = _pyplot()
+    plt = pyplot()
     suites = {suite: found for suite in grid.suites if (found := figures_of_rows(grid, out, suite))}
     if not suites:
         return None
@@ -55,7 +54,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
         axis.spines[["top", "right"]].set_visible(False)
     axes[0][0].set_yticks(range(len(rows)), rows)
     axes[0][0].invert_yaxis()
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def draw_tasks(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
@@ -64,19 +63,17 @@ def draw_tasks(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
     if not rows:
         return None
     ceilings = grid.suites[suite].ceilings
-    reports = {row: [report(cell, ROLLOUTS)["tasks"] for cell in cells] for row, cells in rows.items()}
-    tasks = list(dict.fromkeys(task for told in reports.values() for one in told for task in one))
-    columns = {"best found without": [ceilings.get(task, math.nan) for task in tasks]} if ceilings else {}
-    columns |= {row: [_solved(told, task) for task in tasks] for row, told in reports.items()}
-    figure, axis = _pyplot().subplots(
+    tasks, solved = by_task(rows)
+    columns = {"best found without": [ceilings.get(task) for task in tasks]} if ceilings else {}
+    columns |= solved
+    figure, axis = pyplot().subplots(
         figsize=(4.4 + 0.46 * len(columns), 1.9 + 0.27 * len(tasks)), constrained_layout=True
     )
-    axis.imshow(
-        [list(line) for line in zip(*columns.values(), strict=True)], cmap="Blues", vmin=0, vmax=100, aspect="auto"
-    )
+    lines = [[math.nan if value is None else value for value in line] for line in zip(*columns.values(), strict=True)]
+    axis.imshow(lines, cmap="Blues", vmin=0, vmax=100, aspect="auto")
     for x, values in enumerate(columns.values()):
         for y, value in enumerate(values):
-            if not math.isnan(value):
+            if value is not None:
                 axis.text(x, y, f"{value:.0f}", ha="center", va="center", fontsize=7, color="wk"[value < 60])
     axis.set_xticks(range(len(columns)), list(columns), rotation=45, ha="right", fontsize=8)
     axis.set_yticks(
@@ -84,12 +81,7 @@ def draw_tasks(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
     )
     axis.tick_params(length=0)
     axis.set_title(f"{suite}: solved, %", fontsize=10)
-    return _save(figure, path)
-
-
-def _solved(reports: list[dict[str, Any]], task: str) -> float:
-    told = [one[task]["SR"] for one in reports if task in one]
-    return mean(told) if told else math.nan
+    return save(figure, path)
 
 
 def draw_curves(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
@@ -97,7 +89,7 @@ def draw_curves(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
     found = curves(evaluated_rows(grid, out, suite))
     if not found:
         return None
-    figure, axes = _pyplot().subplots(
+    figure, axes = pyplot().subplots(
         1, len(METRICS), figsize=(2.6 * len(METRICS), 2.9), sharey=True, constrained_layout=True
     )
     for axis, metric in zip(axes, METRICS, strict=True):
@@ -110,23 +102,7 @@ def draw_curves(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel(f"{suite}, %")
     axes[0].legend(fontsize=7, frameon=False, loc="upper left")
-    return _save(figure, path)
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt
-
-
-def _save(figure: Any, path: Path) -> Path:
-    with draft_of(path) as draft:
-        figure.savefig(draft, dpi=130)
-    _pyplot().close(figure)
-    return path
+    return save(figure, path)
 
 
 def _draw_row(axis: Any, place: int, of_seeds: list[float], chance: float | None, measure: str) -> None:

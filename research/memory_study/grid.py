@@ -14,8 +14,18 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.catalogue import resolve_tasks
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
-RESERVED = ("rollouts", "training", "policy", "sealed", "after")
+ROLLOUTS = "rollouts"
+"""The evaluation itself, beside a cell's controls."""
+SEALED = "sealed"
+"""The evaluation on sealed seeds, which is run when all else is done, and counted."""
+TRAINING, POLICY, AFTER = "training", "policy", "after"
+RESERVED = (ROLLOUTS, SEALED, TRAINING, POLICY, AFTER)
 """How folders and files of a cell are called, or begin."""
+
+
+def after(updates: int) -> str:
+    """Return what the evaluation of the checkpoint of so many updates is called."""
+    return f"{AFTER} {updates}"
 
 
 @dataclass(frozen=True)

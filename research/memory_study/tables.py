@@ -18,8 +18,8 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.learning.results import adjusted, average_success, contrast, contrasts_table, markdown
 from research.learning.stages import ended
-from research.memory_study.cells import ROLLOUTS, SEALED, TRAINING, Cell, after
-from research.memory_study.grid import Grid, word_of
+from research.memory_study.cells import Cell
+from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid, after, word_of
 
 REFERENCES = ("no memory", "clock only", "frames")
 """Rows from which the others' differences are told."""
@@ -96,8 +96,8 @@ def _figures(folder: Path) -> dict[str, Any]:
     asked, there = len(run.protocol["tasks"]) * run.protocol["episodes"], len(run.records)
     if there != asked:
         raise MemobenchError(
-            f"{folder} holds {count_of(there, 'rollout')} of the {asked} that its card asks for; remove its .json and "
-            "evaluate it again, or leave its cell out by --only"
+            f"{folder} holds {count_of(there, 'rollout')} of the {asked} that its card asks for; remove "
+            f"{folder}.json and evaluate it again"
         )
     return {**report_values(run.summary), **control_data(run)}
 
@@ -162,16 +162,20 @@ def _by_memory_type(rows: Rows) -> str:
     return markdown(header, lines)
 
 
-def _by_task(rows: Rows, ceilings: Mapping[str, float]) -> str:
+def by_task(rows: Rows) -> tuple[list[str], dict[str, list[float | None]]]:
+    """Return tasks, and of each row its success in them: per cent, of all training seeds; None where it has none."""
     found = {row: [report(cell, ROLLOUTS)["tasks"] for cell in cells] for row, cells in rows.items()}
-    names = dict.fromkeys(name for own in found.values() for one in own for name in one)
+    names = list(dict.fromkeys(name for own in found.values() for one in own for name in one))
+    return names, {
+        row: [_mean_of([one[name]["SR"] for one in own if name in one]) for name in names] for row, own in found.items()
+    }
+
+
+def _by_task(rows: Rows, ceilings: Mapping[str, float]) -> str:
+    names, solved = by_task(rows)
     lines = [
-        [
-            f"`{name}`",
-            f"{ceilings[name]:.1f}" if name in ceilings else EMPTY,
-            *(_mean([one[name]["SR"] for one in own if name in one]) for own in found.values()),
-        ]
-        for name in names
+        [f"`{name}`", *map(_figure, (ceilings.get(name), *values))]
+        for name, *values in zip(names, *solved.values(), strict=True)
     ]
     return markdown(("", "best found without a memory", *rows), lines)
 
@@ -272,6 +276,14 @@ def _average(reports: Sequence[Mapping[str, Any]], metric: str) -> str:
     return _mean([one["average"][metric] for one in reports])
 
 
-def _mean(values: Sequence[float | None]) -> str:
+def _mean_of(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
-    return f"{mean(known):.1f}" if known else EMPTY
+    return mean(known) if known else None
+
+
+def _mean(values: Sequence[float | None]) -> str:
+    return _figure(_mean_of(values))
+
+
+def _figure(value: float | None) -> str:
+    return EMPTY if value is None else f"{value:.1f}"

@@ -31,10 +31,10 @@ from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
 from research.memory_study import cells
-from research.memory_study.__main__ import GRID, STUDY, main, planned, study
-from research.memory_study.cells import ROLLOUTS, SEALED, Cell, Demonstrations, choose_rates, chosen_rate, tuning
+from research.memory_study.__main__ import GRID, STUDY, main, planned, study, tables_of
+from research.memory_study.cells import Cell, Demonstrations, choose_rates, chosen_rate, tuning
 from research.memory_study.figure import draw_all
-from research.memory_study.grid import Grid, chosen, read_grid
+from research.memory_study.grid import ROLLOUTS, SEALED, Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
 from research.pages import around
 from tests.support.logs import rollout
@@ -128,7 +128,7 @@ def test_anothers_policy_learns_the_demonstrations_of_the_same_tasks(tmp_path: P
     cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "act", 0)
     Demonstrations(cell.grid, "strict", tmp_path).folder.mkdir(parents=True)
     told = [
-        ("find_the_artichoke_hidden_in_one_of_the_drawers", "spatial"),
+        (FIND, "spatial"),
         ("count_it", "temporal"),
         ("bowl", "object"),
     ]
@@ -457,8 +457,7 @@ def test_the_page_is_of_the_kept_logs() -> None:
     """Each figure of its tables is counted again."""
     before, after = around(NOTES / "study.md", STUDY)
     made = (NOTES / "study.md").read_text().removeprefix(before).removesuffix(after).strip()
-    grid = read_grid(GRID)
-    assert made == "\n\n".join(filter(None, (tables(grid, NOTES / "study", suite) for suite in grid.suites)))
+    assert made == tables_of(read_grid(GRID), NOTES / "study")
     assert sum(file.stat().st_size for file in (NOTES / "study").glob("**/*")) < 5_000_000
 
 
