@@ -16,7 +16,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import object_slots, simulation
 from lerobot_memobench.sim.gl.rasterizer import Highlight
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS, WIDTH
-from lerobot_memobench.sim.object_slots import QUANTUM, ObjectSlots, classes, layout
+from lerobot_memobench.sim.object_slots import POINTS, QUANTUM, ObjectSlots, classes, layout
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -150,6 +150,24 @@ def test_what_stands_behind_something_is_absent() -> None:
     kind = sim.assets[TOMATO].class_name.partition("__")[0]
     put(sim, TOMATO, np.array([-0.6, 0.0, 0.3]))  # below the table, where no camera looks
     assert kind not in names(table(sim, slots))
+
+
+def test_points_tried_in_turn_answer_as_all_of_them_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The arm and the drawers hide parts of things in many ways while the expert is at work."""
+    episode = Episode(get_task(DRAWERS))
+    episode.reset(20_000)
+    slots = ObjectSlots(episode.sim)
+    partly = 0
+    for _ in range(60):
+        for _ in range(4):
+            episode.step(episode.expert_action())
+        in_turn = slots.observe()
+        with monkeypatch.context() as patch:
+            patch.setattr(object_slots, "TURNS", (slice(0, POINTS),))
+            np.testing.assert_array_equal(in_turn, slots.observe())
+            patch.setattr(object_slots, "TURNS", (slice(0, 3),))
+            partly += not np.array_equal(in_turn, slots.observe())
+    assert partly, "three points told as much as all; the scenes are too easy"
 
 
 def test_equal_things_may_change_places() -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import Any, get_args, get_type_hints
 
 import mujoco
@@ -32,6 +33,8 @@ QUANTUM = 1e-4
 empty one, and a difference like that would say what is inside, or change the order of slots."""
 VISIBLE_POINTS = 2
 """Rays that must arrive: one may slip through a gap between drawer and frame."""
+TURNS = (slice(0, 3), slice(3, 8), slice(8, POINTS))
+"""Which points of a thing are tried in turn, by each camera, until so many rays have arrived."""
 
 Array = NDArray[np.float64]
 
@@ -90,7 +93,6 @@ class ObjectSlots:
                 self._owner[body] = self._owner[sim.model.body_parentid[body]]
         self._points = np.concatenate([self._surface(index, thing.body) for index, thing in enumerate(self.things)])
         self._bodies = np.repeat([thing.body for thing in self.things], POINTS)
-        self._of_point = np.repeat(np.arange(len(self.things)), POINTS)
         self._cameras = [sim.model.camera(name).id for name in MJCF_CAMERAS.values()]
         self._group = np.zeros(6, np.uint8)
         self._group[VISUAL_GROUP] = 1
@@ -133,9 +135,10 @@ class ObjectSlots:
         frames = data.xmat[self._bodies].reshape(-1, 3, 3)
         targets = np.einsum("nij,nj->ni", frames, self._points) + data.xpos[self._bodies]
         hits = np.zeros(len(self.things), dtype=int)
-        for camera in self._cameras:
+        for turn, camera in product(TURNS, self._cameras):
+            tried = np.arange(len(self.things) * POINTS).reshape(-1, POINTS)[hits < VISIBLE_POINTS, turn].ravel()
             origin = data.cam_xpos[camera].copy()
-            rays = targets - origin
+            rays = targets[tried] - origin
             inside = in_picture(rays @ data.cam_xmat[camera].reshape(3, 3), float(model.cam_fovy[camera]))
             count = int(inside.sum())
             if not count:
@@ -145,8 +148,7 @@ class ObjectSlots:
                 model, data, origin, rays[inside].ravel(), self._group, True, -1, geoms, distances, None, count,
                 mujoco.mjMAXVAL,
             )  # fmt: skip
-            owners = self.owners(geoms)
-            mine = self._of_point[inside]
+            owners, mine = self.owners(geoms), tried[inside] // POINTS
             hits += np.bincount(mine[owners == mine], minlength=len(hits))
         return hits >= VISIBLE_POINTS
 
