@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.report import keep_log
 from lerobot_memobench.io import read_json, write_file
@@ -44,7 +43,9 @@ class Demonstrations:
 
     def run(self) -> None:
         """Generate them."""
-        words = ["memobench", "generate", *self.grid.suites[self.suite].demonstrations, "--out", str(self.folder)]
+        suite = self.grid.suites[self.suite]
+        tasks = ["--tasks", ",".join(suite.tasks)] if suite.tasks else []
+        words = ["memobench", "generate", *suite.demonstrations, *tasks, "--out", str(self.folder)]
         run_once(words, self._log, how=["--workers", str(self.workers)], accept=(0, 1))
 
     def finished(self) -> bool:
@@ -137,15 +138,12 @@ class Cell:
 
     def training_words(self) -> list[str]:
         """Return the command that trains its policy."""
-        row, suite = self.grid.rows[self.row], self.grid.suites[self.suite]
+        row = self.grid.rows[self.row]
         data = Demonstrations(self.grid, self.suite, self.out).folder
         rate = self.tuned or chosen_rate(self.out, self.suite, self.row)
         tuned = [] if rate is None else [f"policy.optimizer_lr={rate:g}"]
         short = [] if self.tuned is None else [f"steps={self.grid.tuning.steps}"]
-        policy = row.policy or [*self.grid.policy, *suite.weight_words]
-        if row.policy and suite.tasks:
-            policy = [*policy, *episode_words(data, suite.tasks)]
-        told = [*policy, *self.grid.training, *row.training, *tuned, *short]
+        told = [*(row.policy or self.grid.policy), *self.grid.training, *row.training, *tuned, *short]
         rest = [f"dataset={data}", f"seed={self.seed}", f"output_dir={self.policy}"]
         return ["lerobot", "train", *_last_of_each(told), *rest]
 
@@ -170,19 +168,6 @@ class Cell:
         return {
             part: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for part, told in found.items() if told
         }
-
-
-def episode_words(data: Path, tasks: Sequence[str]) -> list[str]:
-    """Return which demonstrations another's policy learns, which cannot draw tasks by weights; [] before there are any.
-
-    Args:
-        tasks: their names, or memory types.
-    """
-    if not data.is_dir():
-        return []
-    records = [(place.index, place.record) for place in list_episodes(data) if place.record is not None]
-    chosen = [index for index, record in records if {record.task_name, record.memory_type} & {*tasks}]
-    return [f"dataset.episodes={json.dumps(chosen, separators=(',', ':'))}"]
 
 
 def _last_of_each(words: Sequence[str]) -> list[str]:

@@ -12,7 +12,7 @@ import yaml
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.catalogue import resolve_tasks
-from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
+from lerobot_memobench.tasks.task import PUBLISHED
 
 ROLLOUTS = "rollouts"
 """The evaluation itself, beside a cell's controls."""
@@ -34,7 +34,7 @@ class Suite:
 
     Attributes:
         demonstrations: words of ``memobench generate``. evaluation: of ``lerobot eval env=memobench``.
-        tasks: tasks or memory types that count; none: all of the demonstrations'.
+        tasks: tasks or memory types that are learned and rolled out; none: all.
         ceilings: task -> best success found without a memory, per cent (``research.necessity``).
     """
 
@@ -52,14 +52,6 @@ class Suite:
     def task_words(self) -> list[str]:
         """Return the words of an evaluation of these tasks."""
         return [f"tasks={','.join(self.tasks)}"] if self.tasks else []
-
-    @property
-    def weight_words(self) -> list[str]:
-        """Return the words of a training of ``memobench_mem`` that draws these tasks alone."""
-        others = (kind for kind in MEMORY_TYPES if kind not in self.tasks)
-        weights = dict.fromkeys(self.tasks, 1) | dict.fromkeys(others, 0)
-        told = ", ".join(f"{name}: {weight}" for name, weight in weights.items())
-        return [f"policy.task_weights={{{told}}}"] if self.tasks else []
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import IO, Any
 
 import pytest
@@ -107,36 +106,16 @@ def test_the_first_training_seed_alone_runs_controls(grid: Grid, tmp_path: Path)
     assert second.parts == [ROLLOUTS]
 
 
-def test_the_tasks_of_a_suite_alone_are_drawn_and_rolled_out(tmp_path: Path) -> None:
-    some = SMALL.replace(
-        "evaluation: [suite=strict]",
-        f"evaluation: [suite=strict], tasks: [object, {FIND}]",
-    )
+def test_the_tasks_of_a_suite_alone_are_shown_and_rolled_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    some = SMALL.replace("evaluation: [suite=strict]", f"evaluation: [suite=strict], tasks: [object, {FIND}]")
     (tmp_path / "grid.yaml").write_text(some)
-    cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "no memory", 0)
-    weights = f"policy.task_weights={{object: 1, {FIND}: 1, temporal: 0, spatial: 0, procedural: 0}}"
-    assert weights in cell.training_words()
+    grid = read_grid(tmp_path / "grid.yaml")
+    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
     assert f"tasks=object,{FIND}" in cell.evaluation_words(ROLLOUTS)
-
-
-def test_anothers_policy_learns_the_demonstrations_of_the_same_tasks(tmp_path: Path, monkeypatch: Any) -> None:
-    some = SMALL.replace(
-        "evaluation: [suite=strict]",
-        f"evaluation: [suite=strict], tasks: [object, {FIND}]",
-    )
-    (tmp_path / "grid.yaml").write_text(some.replace("no memory: {", "act: {policy: [policy=act], "))
-    cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "act", 0)
-    Demonstrations(cell.grid, "strict", tmp_path).folder.mkdir(parents=True)
-    told = [
-        (FIND, "spatial"),
-        ("count_it", "temporal"),
-        ("bowl", "object"),
-    ]
-    places = [
-        SimpleNamespace(index=k, record=SimpleNamespace(task_name=n, memory_type=t)) for k, (n, t) in enumerate(told)
-    ]
-    monkeypatch.setattr(cells, "list_episodes", lambda folder: [*places, SimpleNamespace(index=3, record=None)])
-    assert "dataset.episodes=[0,2]" in cell.training_words()
+    ran = list[list[str]]()
+    monkeypatch.setattr(cells, "run_once", lambda words, *_, **__: ran.append(words))
+    Demonstrations(grid, "strict", tmp_path).run()
+    assert ran[0][:6] == ["memobench", "generate", "--suite", "strict", "--tasks", f"object,{FIND}"]
 
 
 def test_words_choose_cells(grid: Grid) -> None:
@@ -241,9 +220,9 @@ training: [steps=8, save_freq=2]
 evaluation: [split=validation, episodes=2, videos=0, env.horizon=120]
 suites:
   strict:
-    demonstrations:
-      [--suite, strict, --tasks, find_the_artichoke_hidden_in_one_of_the_drawers, --episodes, "3", --no-images]
-    evaluation: [suite=strict, tasks=find_the_artichoke_hidden_in_one_of_the_drawers]
+    demonstrations: [--suite, strict, --episodes, "3", --no-images]
+    evaluation: [suite=strict]
+    tasks: [find_the_artichoke_hidden_in_one_of_the_drawers]
 rows:
   frames: {training: [], after: [4]}
 """
