@@ -15,14 +15,24 @@ from research.command import run
 
 
 def clock(
-    dataset: Annotated[Path, typer.Argument(help="Demonstrations of strict tasks, without pictures.")],
+    dataset: Annotated[
+        Path, typer.Argument(help="Demonstrations of strict tasks, without pictures; with --prompts of any.")
+    ],
     idle: Annotated[
         list[int] | None,
         typer.Option(min=0, help="Most control steps that the robot idles, 0 and as it does if left out; repeatable."),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder of clock.json and clock.md.")] = Path("outputs/clock"),
+    prompts: Annotated[
+        bool, typer.Option("--prompts", help="Print what the lengths of prompts tell instead; no file is written.")
+    ] = False,
 ) -> None:
     """Measure how often a classifier decides rightly from the present observation and the step, beside chance."""
+    if prompts:
+        from research.clock.prompts import prompt_lengths, prompts_table
+
+        print(prompts_table([*prompt_lengths(dataset)]))
+        return
     from research.clock.study import markdown, study
 
     results = []

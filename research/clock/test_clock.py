@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -110,3 +111,39 @@ def test_a_dataset_without_strict_tasks_is_refused(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(decisions_module, "list_episodes", lambda folder: [])
     with pytest.raises(MemobenchError, match="no demonstrations of strict tasks; generate some: --suite strict"):
         decisions_module.read_decisions(Path("folder"))
+
+
+def test_a_prompt_whose_length_differs_by_variant_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sklearn", reason="the environment is older than requirements.lock: make setup")
+    from research.clock import prompts as module
+
+    told = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+    rng = np.random.default_rng(0)
+
+    def shown(episodes: int, apart: int, referent: str = "random") -> list[SimpleNamespace]:
+        variants = rng.integers(2, size=episodes)
+        return [
+            SimpleNamespace(
+                record=SimpleNamespace(
+                    task_name=told,
+                    referent=referent,
+                    variant=int(variant),
+                    exec_start_index=int(100 + apart * variant + rng.integers(10)),
+                )
+            )
+            for variant in variants
+        ]
+
+    def measured(places: list[SimpleNamespace]) -> list[module.PromptLengths]:
+        monkeypatch.setattr(module, "list_episodes", lambda folder: places)
+        return list(module.prompt_lengths(Path("folder")))
+
+    (apart,) = measured(shown(60, 40))
+    (alike,) = measured(shown(600, 0))
+    assert (apart.demonstrations, apart.variants, apart.chance, apart.right) == (60, 2, 0.5, 1.0)
+    assert abs(alike.right - 0.5) < 0.08
+    assert f"| `{told}` | 60 | 2 | {apart.shortest}–{apart.longest} | 50 | 100 |" in module.prompts_table([apart])
+    with pytest.raises(MemobenchError, match=r"4 demonstrations of put_the_milk.*at least 5 are needed"):
+        measured(shown(4, 40))
+    with pytest.raises(MemobenchError, match=r"no prompts that show one of several variants; generate some: --tasks"):
+        measured(shown(60, 40, referent="fixed"))
