@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.report import keep_log
 from lerobot_memobench.io import read_json, write_file
@@ -44,7 +45,7 @@ class Demonstrations:
     def run(self) -> None:
         """Generate them."""
         suite = self.grid.suites[self.suite]
-        tasks = ["--tasks", ",".join(suite.tasks)] if suite.tasks else []
+        tasks = ["--tasks", ",".join(suite.tasks)] if suite.tasks and not suite.whole else []
         words = ["memobench", "generate", *suite.demonstrations, *tasks, "--out", str(self.folder)]
         run_once(words, self._log, how=["--workers", str(self.workers)], accept=(0, 1))
 
@@ -138,12 +139,15 @@ class Cell:
 
     def training_words(self) -> list[str]:
         """Return the command that trains its policy."""
-        row = self.grid.rows[self.row]
+        row, suite = self.grid.rows[self.row], self.grid.suites[self.suite]
         data = Demonstrations(self.grid, self.suite, self.out).folder
         rate = self.tuned or chosen_rate(self.out, self.suite, self.row)
         tuned = [] if rate is None else [f"policy.optimizer_lr={rate:g}"]
         short = [] if self.tuned is None else [f"steps={self.grid.tuning.steps}"]
-        told = [*(row.policy or self.grid.policy), *self.grid.training, *row.training, *tuned, *short]
+        policy = row.policy or [*self.grid.policy, *suite.weight_words]
+        if row.policy and suite.tasks and suite.whole:
+            policy = [*policy, *episode_words(data, suite.tasks)]
+        told = [*policy, *self.grid.training, *row.training, *tuned, *short]
         rest = [f"dataset={data}", f"seed={self.seed}", f"output_dir={self.policy}"]
         return ["lerobot", "train", *_last_of_each(told), *rest]
 
@@ -168,6 +172,19 @@ class Cell:
         return {
             part: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for part, told in found.items() if told
         }
+
+
+def episode_words(data: Path, tasks: Sequence[str]) -> list[str]:
+    """Return which demonstrations another's policy learns, which cannot draw tasks by weights; [] before there are any.
+
+    Args:
+        tasks: their names, or memory types.
+    """
+    if not data.is_dir():
+        return []
+    records = [(place.index, place.record) for place in list_episodes(data) if place.record is not None]
+    chosen = [index for index, record in records if {record.task_name, record.memory_type} & {*tasks}]
+    return [f"dataset.episodes={json.dumps(chosen, separators=(',', ':'))}"]
 
 
 def _last_of_each(words: Sequence[str]) -> list[str]:

@@ -12,7 +12,7 @@ import yaml
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.catalogue import resolve_tasks
-from lerobot_memobench.tasks.task import PUBLISHED
+from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 ROLLOUTS = "rollouts"
 """The evaluation itself, beside a cell's controls."""
@@ -35,12 +35,14 @@ class Suite:
     Attributes:
         demonstrations: words of ``memobench generate``. evaluation: of ``lerobot eval env=memobench``.
         tasks: tasks or memory types that are learned and rolled out; none: all.
+        whole: whether the demonstrations are of all tasks, others' frames not drawn, and count in normalisation alone.
         ceilings: task -> best success found without a memory, per cent (``research.necessity``).
     """
 
     demonstrations: list[str]
     evaluation: list[str] = field(default_factory=list)
     tasks: list[str] = field(default_factory=list)
+    whole: bool = False
     ceilings: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -52,6 +54,14 @@ class Suite:
     def task_words(self) -> list[str]:
         """Return the words of an evaluation of these tasks."""
         return [f"tasks={','.join(self.tasks)}"] if self.tasks else []
+
+    @property
+    def weight_words(self) -> list[str]:
+        """Return the words of a training of ``memobench_mem`` that draws these tasks alone, of a whole suite's."""
+        others = (kind for kind in MEMORY_TYPES if kind not in self.tasks)
+        weights = dict.fromkeys(self.tasks, 1) | dict.fromkeys(others, 0)
+        told = ", ".join(f"{name}: {weight}" for name, weight in weights.items())
+        return [f"policy.task_weights={{{told}}}"] if self.tasks and self.whole else []
 
 
 @dataclass(frozen=True)

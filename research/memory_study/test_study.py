@@ -14,6 +14,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any
 
 import pytest
@@ -106,16 +107,49 @@ def test_the_first_training_seed_alone_runs_controls(grid: Grid, tmp_path: Path)
     assert second.parts == [ROLLOUTS]
 
 
-def test_the_tasks_of_a_suite_alone_are_shown_and_rolled_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    some = SMALL.replace("evaluation: [suite=strict]", f"evaluation: [suite=strict], tasks: [object, {FIND}]")
+def test_the_tasks_of_a_suite_alone_are_drawn_and_rolled_out(tmp_path: Path) -> None:
+    some = SMALL.replace(
+        "evaluation: [suite=strict]",
+        f"evaluation: [suite=strict], tasks: [object, {FIND}], whole: true",
+    )
     (tmp_path / "grid.yaml").write_text(some)
-    grid = read_grid(tmp_path / "grid.yaml")
-    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
+    cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "no memory", 0)
+    weights = f"policy.task_weights={{object: 1, {FIND}: 1, temporal: 0, spatial: 0, procedural: 0}}"
+    assert weights in cell.training_words()
     assert f"tasks=object,{FIND}" in cell.evaluation_words(ROLLOUTS)
+
+
+def test_demonstrations_are_of_the_tasks_alone_that_are_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "grid.yaml").write_text(SMALL.replace("[suite=strict]}", f"[suite=strict], tasks: [object, {FIND}]}}"))
+    grid = read_grid(tmp_path / "grid.yaml")
     ran = list[list[str]]()
     monkeypatch.setattr(cells, "run_once", lambda words, *_, **__: ran.append(words))
     Demonstrations(grid, "strict", tmp_path).run()
     assert ran[0][:6] == ["memobench", "generate", "--suite", "strict", "--tasks", f"object,{FIND}"]
+    words = Cell(grid, tmp_path, "strict", "no memory", 0).training_words()
+    assert not any(word.startswith("policy.task_weights=") for word in words)
+
+
+def test_anothers_policy_learns_the_demonstrations_of_the_same_tasks(tmp_path: Path, monkeypatch: Any) -> None:
+    some = SMALL.replace(
+        "evaluation: [suite=strict]",
+        f"evaluation: [suite=strict], tasks: [object, {FIND}], whole: true",
+    )
+    (tmp_path / "grid.yaml").write_text(some.replace("no memory: {", "act: {policy: [policy=act], "))
+    cell = Cell(read_grid(tmp_path / "grid.yaml"), tmp_path, "strict", "act", 0)
+    Demonstrations(cell.grid, "strict", tmp_path).folder.mkdir(parents=True)
+    told = [
+        (FIND, "spatial"),
+        ("count_it", "temporal"),
+        ("bowl", "object"),
+    ]
+    places = [
+        SimpleNamespace(index=k, record=SimpleNamespace(task_name=n, memory_type=t)) for k, (n, t) in enumerate(told)
+    ]
+    monkeypatch.setattr(cells, "list_episodes", lambda folder: [*places, SimpleNamespace(index=3, record=None)])
+    assert "dataset.episodes=[0,2]" in cell.training_words()
 
 
 def test_words_choose_cells(grid: Grid) -> None:
