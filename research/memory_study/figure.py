@@ -38,7 +38,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     suites = {suite: found for suite in grid.suites if (found := figures_of_rows(grid, out, suite))}
     if not suites:
         return None
-    rows = list(dict.fromkeys(row for found in suites.values() for row in found))
+    rows = [row for row in grid.rows if any(row in found for found in suites.values())]
     size = (2.0 + 2.6 * len(suites) * len(MEASURES), 1.2 + 0.3 * len(rows))
     figure, axes = plt.subplots(
         1, len(suites) * len(MEASURES), figsize=size, sharey=True, squeeze=False, constrained_layout=True
