@@ -252,7 +252,8 @@ def test_actions_begin_without_hindsight_and_learn_with_it(trained: tuple[Any, d
     assert foreseen[-1] < 0.9 * foreseen[0]
     learned = policy.model.memory_parameters().items()
     still = [name for name, weights in learned if weights.grad is None or not weights.grad.any()]
-    assert not [name for name in still if name.startswith(("memory.", "foresight."))]
+    unseen = "memory.pool.score.bias"  # softmax does not see it: its gradient is rounding, or nothing
+    assert not [name for name in still if name.startswith(("memory.", "foresight.")) and name != unseen]
     one, other = losses()
     assert one != pytest.approx(other)
 
