@@ -14,7 +14,7 @@ from sklearn.tree import DecisionTreeClassifier
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
-from research.clock.study import FOLDS
+from research.clock.study import FOLDS, check_enough
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,7 @@ def prompt_lengths(folder: Path, seed: int = 0) -> Iterator[PromptLengths]:
             "--referent random"
         )
     for name, found in sorted(shown.items()):
-        if len(found) < FOLDS:
-            raise MemobenchError(f"{folder} holds {len(found)} demonstrations of {name}; at least {FOLDS} are needed")
+        check_enough(folder, name, len(found))
         lengths, variants = np.array(found).T
         right, kinds = 0, len(get_task(name).random_variants)
         for train, test in KFold(FOLDS, shuffle=True, random_state=seed).split(lengths):

@@ -61,8 +61,7 @@ def study(folder: Path, idles: Sequence[int], seed: int = 0) -> Iterator[Result]
     """
     for name, found in read_decisions(folder).items():
         episodes = len({one.episode for one in found})
-        if episodes < FOLDS:
-            raise MemobenchError(f"{folder} holds {episodes} demonstrations of {name}; at least {FOLDS} are needed")
+        check_enough(folder, name, episodes)
         fitted = {idle: _fitted_right(found, idle, seed) for idle in idles}
         task = get_task(name)
         yield Result(
@@ -77,6 +76,16 @@ def study(folder: Path, idles: Sequence[int], seed: int = 0) -> Iterator[Result]
                 BOUND: {idle: bound(found, idle) for idle in idles},
             },
         )
+
+
+def check_enough(folder: Path, name: str, episodes: int) -> None:
+    """Refuse fewer demonstrations of a task than there are folds.
+
+    Raises:
+        MemobenchError: there are.
+    """
+    if episodes < FOLDS:
+        raise MemobenchError(f"{folder} holds {episodes} demonstrations of {name}; at least {FOLDS} are needed")
 
 
 def bound(found: Sequence[Decision], idle: int) -> float:

@@ -44,9 +44,8 @@ class Demonstrations:
 
     def run(self) -> None:
         """Generate them."""
-        suite = self.grid.suites[self.suite]
-        tasks = ["--tasks", ",".join(suite.tasks)] if suite.tasks and not suite.whole else []
-        words = ["memobench", "generate", *suite.demonstrations, *tasks, "--out", str(self.folder)]
+        words = self.grid.suites[self.suite].demonstration_words
+        words = ["memobench", "generate", *words, "--out", str(self.folder)]
         run_once(words, self._log, how=["--workers", str(self.workers)], accept=(0, 1))
 
     def finished(self) -> bool:

@@ -13,7 +13,7 @@ from lerobot_memobench.evaluation.metrics import METRICS
 from research.drawing import pyplot, save
 from research.learning.results import COLOURS
 from research.memory_study.grid import Grid
-from research.memory_study.tables import by_task, curves, evaluated_rows, figures_of_rows
+from research.memory_study.tables import by_task, curves, evaluated_rows, figures_of_rows, titles
 
 CHANCE_COLOUR = "#d55e00"
 MEASURES = {"solved": "solved, %", "follows": "follows the evidence, %"}
@@ -38,7 +38,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     suites = {suite: found for suite in grid.suites if (found := figures_of_rows(grid, out, suite))}
     if not suites:
         return None
-    rows = [row for row in grid.rows if any(row in found for found in suites.values())]
+    rows = [row for row in titles(grid) if any(row in found for found in suites.values())]
     size = (2.0 + 2.6 * len(suites) * len(MEASURES), 1.2 + 0.3 * len(rows))
     figure, axes = plt.subplots(
         1, len(suites) * len(MEASURES), figsize=size, sharey=True, squeeze=False, constrained_layout=True

@@ -51,6 +51,11 @@ class Suite:
         return word_of(self.evaluation, "suite") or PUBLISHED
 
     @property
+    def demonstration_words(self) -> list[str]:
+        """Return the words of ``memobench generate``, the tasks among them unless the whole suite is shown."""
+        return [*self.demonstrations, *(["--tasks", ",".join(self.tasks)] if self.tasks and not self.whole else [])]
+
+    @property
     def task_words(self) -> list[str]:
         """Return the words of an evaluation of these tasks."""
         return [f"tasks={','.join(self.tasks)}"] if self.tasks else []

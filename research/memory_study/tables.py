@@ -10,7 +10,7 @@ from statistics import mean
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import METRICS, Record, report_values
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import read_rollouts, read_runs
 from lerobot_memobench.evaluation.report import control_data
 from lerobot_memobench.evaluation.statistics import Estimate
@@ -69,13 +69,16 @@ def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, An
 # -- what there is ----------------------------------------------------------------------------------------------------
 
 
+def titles(grid: Grid) -> list[str]:
+    """Return what the rows are called in tables and figures, in their order."""
+    return [name + (" (privileged)" if row.privileged else "") for name, row in grid.rows.items()]
+
+
 def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
     """Return the rows of a suite of which a training seed is evaluated, by their titles."""
     cells = {
-        row + (" (privileged)" if told.privileged else ""): [
-            cell for seed in range(told.seeds) if evaluated(cell := Cell(grid, out, suite, row, seed), ROLLOUTS)
-        ]
-        for row, told in grid.rows.items()
+        title: [cell for seed in range(told.seeds) if evaluated(cell := Cell(grid, out, suite, row, seed), ROLLOUTS)]
+        for title, (row, told) in zip(titles(grid), grid.rows.items(), strict=True)
     }
     return {row: own for row, own in cells.items() if own}
 
@@ -99,7 +102,18 @@ def _figures(folder: Path) -> dict[str, Any]:
             f"{folder} holds {count_of(there, 'rollout')} of the {asked} that its card asks for; remove "
             f"{folder}.json and evaluate it again"
         )
-    return {**report_values(run.summary), **control_data(run)}
+    summary = run.summary
+    types, tasks = (
+        {name: _percentages(row) for name, row in rows.items()} for rows in (summary.memory_types, summary.tasks)
+    )
+    counted = {"tasks": tasks, "memory_types": types, "average": _percentages(summary.average)}
+    return {**counted, "failures": dict(summary.failures), **control_data(run)}
+
+
+def _percentages(row: Mapping[str, Rate]) -> dict[str, Any]:
+    """Return a report's figures, not rounded: means of training seeds are taken of them."""
+    rates = {metric: None if (value := row[metric].value) is None else 100 * value for metric in METRICS}
+    return {"n": row["SR"].n, **rates}
 
 
 def named_rollouts(grid: Grid, out: Path, suite: str) -> list[tuple[str, Path]]:

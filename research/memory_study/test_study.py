@@ -30,7 +30,7 @@ from lerobot_memobench.run.training import take_training_options
 from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
-from research.memory_study import cells
+from research.memory_study import cells, figure
 from research.memory_study.__main__ import GRID, STUDY, main, planned, study, tables_of
 from research.memory_study.cells import Cell, Demonstrations, choose_rates, chosen_rate, tuning
 from research.memory_study.figure import draw_all
@@ -361,11 +361,11 @@ def test_a_training_that_failed_before_its_first_checkpoint_begins_anew(
             cell.run()
 
 
-def _evaluate(cell: Cell, *parts: str) -> None:
-    """Let these parts of a cell be evaluated: ten rollouts each, of which four succeed; half of them early on."""
+def _evaluate(cell: Cell, *parts: str, rollouts: int = 10, solved: int = 4) -> None:
+    """Let these parts of a cell be evaluated, by so many rollouts each; half of the solved ones are solved early on."""
     for part in parts:
-        solved = 2 if part.startswith("after") else 4
-        episodes = [_rollout(episode, part == "evidence", solved) for episode in range(10)]
+        right = solved // 2 if part.startswith("after") else solved
+        episodes = [_rollout(episode, part == "evidence", right) for episode in range(rollouts)]
         write_episodes(cell.evaluation(part), episodes)
         write_report(cell.evaluation(part))
         cell.log(part).with_suffix(".json").write_text(json.dumps({"ended": True, "wall_s": 60.0, "cpu_s": 50.0}))
@@ -397,6 +397,24 @@ def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
     drawn = draw_all(grid, tmp_path, tmp_path)
     assert [path.name for path in drawn] == ["study.png", "study_tasks_strict.png", "study_updates_strict.png"]
     assert all(path.stat().st_size > 5_000 for path in drawn)
+
+
+def test_means_of_training_seeds_are_of_figures_that_are_not_rounded(grid: Grid, tmp_path: Path) -> None:
+    """1/6 and 1/4 are 20.83 %; of 16.7 and 25.0 it would be 20.9."""
+    for seed, solved in enumerate((2, 3)):
+        _evaluate(Cell(grid, tmp_path, "strict", "no memory", seed), ROLLOUTS, rollouts=12, solved=solved)
+    assert f"| `{BUTTER}` | – | 20.8 |" in tables(grid, tmp_path, "strict").splitlines()
+
+
+def test_a_privileged_row_is_drawn_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "grid.yaml").write_text(SMALL.replace("controls: [evidence]}", "privileged: true}"))
+    grid, drawn = read_grid(tmp_path / "grid.yaml"), list[Any]()
+    for row in ("frames, no time", "no memory"):
+        _evaluate(Cell(grid, tmp_path, "strict", row, 0), ROLLOUTS)
+    monkeypatch.setattr(figure, "save", lambda drawing, path: drawn.append(drawing))
+    figure.draw(grid, tmp_path, tmp_path / "study.png")
+    labels = [label.get_text() for label in drawn[0].axes[0].get_yticklabels()]
+    assert labels == ["no memory", "frames, no time (privileged)"]
 
 
 def test_checkpoints_are_evaluated_by_their_own_weights(tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ class ObjectSlots:
                 self._owner[body] = self._owner[sim.model.body_parentid[body]]
         self._points = np.concatenate([self._surface(index, thing.body) for index, thing in enumerate(self.things)])
         self._bodies = np.repeat([thing.body for thing in self.things], POINTS)
+        self._numbers = np.arange(len(self._points)).reshape(-1, POINTS)  # of a thing's points
         self._cameras = [sim.model.camera(name).id for name in MJCF_CAMERAS.values()]
         self._group = np.zeros(6, np.uint8)
         self._group[VISUAL_GROUP] = 1
@@ -136,7 +137,7 @@ class ObjectSlots:
         targets = np.einsum("nij,nj->ni", frames, self._points) + data.xpos[self._bodies]
         hits = np.zeros(len(self.things), dtype=int)
         for turn, camera in product(TURNS, self._cameras):
-            tried = np.arange(len(self.things) * POINTS).reshape(-1, POINTS)[hits < VISIBLE_POINTS, turn].ravel()
+            tried = self._numbers[hits < VISIBLE_POINTS, turn].ravel()
             origin = data.cam_xpos[camera].copy()
             rays = targets[tried] - origin
             inside = in_picture(rays @ data.cam_xmat[camera].reshape(3, 3), float(model.cam_fovy[camera]))
