@@ -15,6 +15,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from research.clock.study import FOLDS, check_enough
+from research.learning.results import markdown
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,15 @@ def prompt_lengths(folder: Path, seed: int = 0) -> Iterator[PromptLengths]:
 
 def prompts_table(results: Sequence[PromptLengths]) -> str:
     """Return them as a Markdown table, shares in per cent."""
-    lines = ["| task | demonstrations | variants | prompt, steps | chance | by length |", "|---" + "|---:" * 5 + "|"]
-    lines += [
-        f"| `{one.task}` | {one.demonstrations} | {one.variants} | {one.shortest}–{one.longest} "
-        f"| {100 * one.chance:.0f} | {100 * one.right:.0f} |"
+    rows = [
+        [
+            f"`{one.task}`",
+            f"{one.demonstrations}",
+            f"{one.variants}",
+            f"{one.shortest}–{one.longest}",
+            f"{100 * one.chance:.0f}",
+            f"{100 * one.right:.0f}",
+        ]
         for one in results
     ]
-    return "\n".join(lines)
+    return markdown(["task", "demonstrations", "variants", "prompt, steps", "chance", "by length"], rows)

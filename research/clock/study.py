@@ -20,6 +20,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.tasks.catalogue import get_task
 from research.clock.decisions import Decision, chance, read_decisions
+from research.learning.results import markdown as table
 
 DRAWS = 10
 """Idlings drawn for each demonstration."""
@@ -137,12 +138,12 @@ def markdown(results: Sequence[Result]) -> str:
     """Return a table, per cent, and below it what exceeds chance by more than `MARGIN` with the present idling."""
     idles = list(results[0]["right"][STEP])
     heads = [f"idle {idle}: {kind}" for idle in idles for kind in KINDS]
-    lines = ["| task | demonstrations | decisions | chance | " + " | ".join(heads) + " |"]
-    lines.append("|---" + "|---:" * (3 + len(heads)) + "|")
+    rows = []
     for one in results:
-        cells = [one["right"][kind][idle] for idle in idles for kind in KINDS]
-        figures = " | ".join(f"{100 * value:.0f}" for value in (one["chance"], *cells))
-        lines.append(f"| {one['family']}: `{one['task']}` | {one['demonstrations']} | {one['decisions']} | {figures} |")
+        shares = [one["chance"], *(one["right"][kind][idle] for idle in idles for kind in KINDS)]
+        counts = [f"{one['demonstrations']}", f"{one['decisions']}"]
+        rows.append([f"{one['family']}: `{one['task']}`", *counts, *(f"{100 * share:.0f}" for share in shares)])
+    lines = [table(["task", "demonstrations", "decisions", "chance", *heads], rows)]
     return "\n".join([*lines, "", *_verdict(results)])
 
 
