@@ -345,7 +345,7 @@ def contrasts_table(found: Mapping[str, Contrast], reference: str = MEMORY) -> s
     """Return a table of arms against the reference."""
     rows = [
         [
-            f"{name} less {reference}",
+            f"{name} minus {reference}",
             str(one.episodes),
             *(f"{100 * one.value:+.1f}", f"{100 * one.low:+.1f} to {100 * one.high:+.1f}", _probability(one.p)),
             ", ".join(f"{100 * each:+.0f}" for each in one.of_seeds),

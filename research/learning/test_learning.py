@@ -106,7 +106,7 @@ def test_the_figure_of_two_evaluations_tells_differences_on_what_both_have(
     with pytest.raises(SystemExit, match="no task in common"):
         load_script("learned_figure").main()
     assert "prompted tasks, 10 shared episodes" in told
-    assert "| without less with | 10 | -60.0 |" in told
+    assert "| without minus with | 10 | -60.0 |" in told
     assert (tmp_path / "figure.png").is_file()
 
 
@@ -131,7 +131,7 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     assert all("seed=7" in words and "referent=random" in words for words in ran[5:])
     assert f"| {BOWL}, {MEMORY} | 20 | 90.0 |" in text
     assert f"| {BOWL}, {MEMORYLESS} | 20 | 30.0 |" in text
-    assert f"| {MEMORYLESS} less {MEMORY} | 10 | -60.0 | " in text
+    assert f"| {MEMORYLESS} minus {MEMORY} | 10 | -60.0 | " in text
     assert "| training | 4 | 1.0 | 6.0 |" in text
     assert f"{MEMORY}: policy inputs: not recorded" in text
     assert (tmp_path / "out" / "learning.md").read_text() == text

@@ -46,7 +46,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         ("How rollouts ended, all training seeds together", _endings(rows)),
         ("Other conditions of the rollouts, first training seed", _conditions(rows)),
         ("Success and satisfied checkpoints by updates", _by_updates(rows)),
-        *((f"Less *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
+        *((f"Minus *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
         ("The sealed test", _sealed(rows)),
         ("What a cell takes, beside other work", _costs(rows)),
     ]

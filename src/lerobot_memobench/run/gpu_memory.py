@@ -3,7 +3,7 @@
 The policy is built on torch's meta device, so every weight is counted and none is made. Weights, gradients, AdamW's
 state, average, buckets and shards are exact. Activations are an estimate from layers and tokens, and from what a sample
 leaves behind in the memory (`memory_use`). What was measured on one GPU with ``memory=frames``
-(docs/research/full_size_on_one_gpu.md) is 0 to 3 % below the count; tests hold that.
+(docs/research/full_size_on_one_gpu.md) is at most 4 % below the count; tests hold that.
 """
 
 from __future__ import annotations
