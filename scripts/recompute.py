@@ -124,7 +124,7 @@ def of_demonstrations(page: Path) -> Figures:
 
 
 SOURCES: dict[str, Callable[[Path], Figures]] = {
-    r"(logs/[\w-]+|study/cells/[\w/-]+)(?=/)": of_log,
+    r"(logs/[\w-]+|study/[\w/-]+)(?=/)": of_log,
     r"\w+/README\.md": of_card,
     r"\w+/tables\.md": of_demonstrations,
 }

@@ -77,11 +77,12 @@ def contrast(runs: Runs, reference: Runs, name: str = "arm", of_reference: str =
     """Return an arm's difference from a reference of the same training seeds; its p are not adjusted.
 
     Raises:
-        MemobenchError: they have not rolled out the same episodes.
+        MemobenchError: they have not rolled out the same episodes of the same scenes.
     """
     episodes, rng = _episodes(reference), np.random.default_rng(0)
     weights, tasks = _weights(reference[0], episodes)
     base = _table(reference, episodes, of_reference)
+    _check_scenes(runs, reference, name, of_reference)
     gap = _table(runs, episodes, name) - base
     of_seeds = gap @ weights
     return Contrast(
@@ -126,6 +127,20 @@ def _episodes(runs: Runs) -> list[Key]:
     return sorted(_key(record) for record in runs[0])
 
 
+def _check_scenes(runs: Runs, reference: Runs, name: str, of_reference: str) -> None:
+    """Refuse episodes whose scene or variant is another one than the reference's, where both tell it."""
+    told = ("suite", "referent", "variant", "scene_hash")
+    there = {_key(record): record for records in reference for record in records}
+    for record in (record for records in runs for record in records):
+        other = there.get(_key(record), {})
+        for what in told:
+            if None not in (a := record.get(what), b := other.get(what)) and a != b:
+                raise MemobenchError(
+                    f"{record['task']}, seed {record['seed']}: {what} is {a} for {name!r} and {b} for "
+                    f"{of_reference!r}; compare rollouts of the same scenes"
+                )
+
+
 def _table(runs: Runs, episodes: Sequence[Key], name: str) -> Array:
     """Return success (training seeds, episodes), 0 or 1."""
     found = [{_key(record): float(bool(record["success"])) for record in records} for records in runs]
@@ -152,7 +167,7 @@ def average_success(rollouts: Runs) -> Estimate:
     table = _table(rollouts, episodes, "training seeds")
     value = float((table @ weights).mean())
     low, high = percentiles(_draws(table, weights, tasks, np.random.default_rng(0)))
-    least, most = wilson(value, 1 / float(np.sum(weights**2)))  # an episode counts once, whoever rolls it out
+    least, most = wilson(min(value, 1.0), 1 / float(np.sum(weights**2)))  # an episode counts once, whoever rolls it out
     return Estimate(value, min(low, least), max(high, most))
 
 

@@ -15,7 +15,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, NotRequired, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, write_file
@@ -40,6 +40,21 @@ class Cost:
         return Cost(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
 
 
+class Kept(TypedDict):
+    """What is kept of a command, in a file beside its log.
+
+    Attributes:
+        words: the command. ended: whether it ended well. wall_s, cpu_s: see `Cost`.
+        began: when the attempt that runs, or was killed, began; seconds since 1970.
+    """
+
+    words: list[str]
+    ended: bool
+    wall_s: float
+    cpu_s: float
+    began: NotRequired[float]
+
+
 def run_once(
     words: Sequence[str],
     log: Path,
@@ -49,6 +64,7 @@ def run_once(
     accept: Sequence[int] = (0,),
     going_on: Sequence[str] | None = None,
     makes: Path | None = None,
+    proof: Path | None = None,
 ) -> Cost:
     """Run ``lerobot …`` or ``memobench …`` unless it has ended well before; return what it took.
 
@@ -61,17 +77,18 @@ def run_once(
         going_on: what is run instead, to finish what an earlier attempt has begun.
         makes: a folder that the command refuses to find; what an attempt left of it, that cannot be gone on with, is
             removed.
+        proof: what it leaves behind when it did its work, where a status that is accepted does not tell.
 
     Raises:
         MemobenchError: the command failed, is running, or another one stands beside the log.
     """
     kept, spent = log.with_suffix(".json"), Cost(0.0, 0.0)
     if told := kept_of(log):
-        if told.get("words") != list(words):
+        if told["words"] != list(words):
             raise MemobenchError(
                 f"{kept} is of another command; name another --out, or remove the file and what the command has made"
             )
-        spent = Cost(float(str(told["wall_s"])), float(str(told["cpu_s"])))
+        spent = Cost(told["wall_s"], told["cpu_s"])
         if told["ended"]:
             return spent
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -80,14 +97,14 @@ def run_once(
             fcntl.flock(output, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the command inherits it, and holds it to its end
         except BlockingIOError:
             raise MemobenchError(f"a command from before still writes {log}; wait for its end, or end it") from None
-        if begun := told.get("began"):  # and never said what it took: it was killed, just after its last output
-            spent += Cost(round(max(log.stat().st_mtime - float(str(begun)), 0.0), 1), 0.0)
+        if told and "began" in told:  # and never said what it took: it was killed, just after its last output
+            spent += Cost(round(max(log.stat().st_mtime - told["began"], 0.0), 1), 0.0)
         if makes is not None and going_on is None:
             shutil.rmtree(makes, ignore_errors=True)
         # So that what is killed is gone on with by the same command alone, and is not forgotten.
         _keep(kept, words, False, spent, began=time.time())
         status, took = _run(going_on or [*words, *how], output, sharing(beside))
-    well = status in accept
+    well = status in accept and (proof is None or proof.exists())
     _keep(kept, words, well, spent + took)
     if not well:
         *_, last = log.read_text(errors="replace").rstrip().splitlines() or [""]
@@ -99,27 +116,38 @@ def _keep(kept: Path, words: Sequence[str], ended: bool, spent: Cost, **more: fl
     write_file(kept, json.dumps({"words": list(words), "ended": ended, **asdict(spent), **more}, indent=1))
 
 
-def kept_of(log: Path) -> dict[str, object]:
-    """Return what is kept of the command of a log; {} where it has not been begun."""
+def kept_of(log: Path) -> Kept | None:
+    """Return what is kept of the command of a log; None where it has not been begun."""
     try:
-        return read_json(log.with_suffix(".json"), dict[str, object], "remove it, and the command is run again")
+        kept: Kept = read_json(log.with_suffix(".json"), Kept, "remove it, and the command is run again")
     except FileNotFoundError:
-        return {}
+        return None
+    return kept
 
 
 def ended(log: Path) -> bool:
     """Return whether the command of a log has ended well."""
-    return bool(kept_of(log).get("ended"))
+    told = kept_of(log)
+    return told is not None and told["ended"]
 
 
 def train_once(words: Sequence[str], log: Path, policy: Path, *, beside: int = 1) -> Cost:
-    """Run ``lerobot train …`` into the folder ``policy``, or go on from its last checkpoint; see `run_once`."""
+    """Run ``lerobot train …`` into the folder ``policy``, or go on from its last checkpoint; see `run_once`.
+
+    Raises:
+        MemobenchError: as `run_once`; or a checkpoint is there, and nothing says by which command.
+    """
     from lerobot_memobench.run.training import TRAIN_CONFIG, last_checkpoint
 
     try:
         begun = last_checkpoint(policy) / TRAIN_CONFIG
     except MemobenchError:
         return run_once(words, log, beside=beside, makes=policy)
+    if kept_of(log) is None:
+        raise MemobenchError(
+            f"{policy} holds a checkpoint, and {log.with_suffix('.json')}, which says by which command, is gone; "
+            "remove the folder, and it is trained anew"
+        )
     return run_once(words, log, beside=beside, going_on=["lerobot", "train", f"config_path={begun}", "resume=true"])
 
 
@@ -140,6 +168,11 @@ def _run(words: Sequence[str], output: IO[str], environment: Mapping[str, str]) 
     process.returncode = os.waitstatus_to_exitcode(status)
     wall = time.monotonic() - started
     return process.returncode, Cost(round(wall, 1), round(used.ru_utime + used.ru_stime, 1))
+
+
+def dataset_info(folder: Path) -> Path:
+    """Return the file that a dataset has once it is whole: an exit status of 1 may also be a crash's."""
+    return folder / "meta" / "info.json"
 
 
 Costs = dict[str, list[Cost | None]]
@@ -189,7 +222,7 @@ class Stages:
         words += ["--perturb", "--out", str(self.data)]
         words += [] if self._perception.pictures else ["--no-images"]
         how = ["--workers", str(self.workers)]
-        return run_once(words, self.out / "data.log", how=how, accept=(0, 1))
+        return run_once(words, self.out / "data.log", how=how, accept=(0, 1), proof=dataset_info(self.data))
 
     def check_settings(self) -> None:
         """Refuse what training would, before anything is made; LeRobot's import is left out where nothing was added.

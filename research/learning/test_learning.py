@@ -158,11 +158,16 @@ def test_a_killed_training_goes_on_from_its_checkpoint(tmp_path: Path, monkeypat
     stages.train(MEMORY, 0)
     assert ran == [stages.training_words(MEMORY, 0)]
     assert not half_made.exists()
-    stages.log("training", MEMORY, 0).with_suffix(".json").unlink()
+    kept = stages.log("training", MEMORY, 0).with_suffix(".json")
     last = stages.policy(MEMORY, 0) / "checkpoints" / "last"
     for name in ("pretrained_model/train_config.json", "training_state/training_step.json"):
         (last / name).parent.mkdir(parents=True)
         (last / name).touch()
+    told = kept.read_text()
+    kept.unlink()
+    with pytest.raises(MemobenchError, match="which says by which command, is gone"):
+        stages.train(MEMORY, 0)
+    kept.write_text(told.replace('"ended": true', '"ended": false'))
     stages.train(MEMORY, 0)
     config = last / "pretrained_model" / "train_config.json"
     assert ran[1] == ["lerobot", "train", f"config_path={config}", "resume=true"]

@@ -15,7 +15,7 @@ from lerobot_memobench.cli.console import console, counting, say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.io import count_of, write_file
-from lerobot_memobench.jobs.executors import read_options, run_jobs
+from lerobot_memobench.jobs.executors import Needs, options_text, read_options, run_jobs
 from lerobot_memobench.jobs.processes import Advance, Job
 from research.command import run
 from research.memory_study.cells import Cell, Demonstrations, choose_rates, tuning
@@ -26,6 +26,8 @@ from research.pages import put_into
 
 GRID = Path(__file__).with_name("grid.yaml")
 STUDY = "memory_study"
+NEEDS = Needs(cores=2, memory_gb=8)
+"""What a cell of a small policy takes, on Slurm."""
 
 
 def study(
@@ -60,11 +62,13 @@ def study(
     if not places:
         raise MemobenchError(f"--only {' '.join(only or [])} leaves no cell; a row has fewer training seeds, perhaps")
     data = [Demonstrations(read, suite, out, workers) for suite in dict.fromkeys(suite for suite, _, _ in places)]
-    cells = [Cell(read, out, *place, sealed=sealed) for place in places]
+    cells = [Cell(read, out, *place, sealed=sealed, beside=workers) for place in places]
     if keep is not None:
         if keep.resolve() == out.resolve():
             raise MemobenchError(f"--keep {keep} is --out too; name another folder, which gets what is small")
         kept = [folder for cell in cells for folder in cell.keep(keep)]
+        for of_suite in data:
+            of_suite.keep(keep)
         say(f"{count_of(len(kept), 'log')} are kept in {keep}")
     if page is not None:
         text = tables_of(read, out)
@@ -75,11 +79,14 @@ def study(
         say(f"the tables of {page} are made")
     if keep or page:
         return
-    tried = tuning(read, out, places) if tune else []
+    for cell in {(cell.suite, cell.row): cell for cell in reversed(cells)}.values():
+        cell.check()
+    tried = tuning(read, out, places, workers) if tune else []
     if plan:
         say(planned(data, tried, cells, workers))
         return
-    how = {"executor": executor, "options": read_options(executor_option or []), "logs": out / "logs"}
+    options = options_text(executor, read_options(executor_option or []), NEEDS)
+    how = {"executor": executor, "options": options, "logs": out / "logs"}
     for what, jobs, at_once in (("demonstrations", data, 1), ("tuning", tried, workers), ("cells", cells, workers)):
         with counting(console(), what, len(jobs)) as count:
 

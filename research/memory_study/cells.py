@@ -6,6 +6,7 @@ Whatever kills a cell, the same call goes on with it: a training from its last c
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +15,9 @@ from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.report import keep_log
 from lerobot_memobench.io import read_json, write_file
-from research.learning.stages import Cost, ended, kept_of, run_once, train_once
-from research.memory_study.grid import POLICY, ROLLOUTS, SEALED, TRAINING, Grid, after, folder_name
+from lerobot_memobench.run.arguments import split_arguments
+from research.learning.stages import Cost, dataset_info, ended, kept_of, run_once, train_once
+from research.memory_study.grid import POLICY, ROLLOUTS, SEALED, TRAINING, Grid, after, folder_name, word_of
 
 
 @dataclass(frozen=True)
@@ -42,15 +44,30 @@ class Demonstrations:
     def _log(self) -> Path:
         return self.out / "demonstrations" / f"{self.suite}.log"
 
+    @property
+    def _words(self) -> list[str]:
+        told = self.grid.suites[self.suite].demonstration_words
+        return ["memobench", "generate", *told, "--out", str(self.folder)]
+
     def run(self) -> None:
         """Generate them."""
-        words = self.grid.suites[self.suite].demonstration_words
-        words = ["memobench", "generate", *words, "--out", str(self.folder)]
-        run_once(words, self._log, how=["--workers", str(self.workers)], accept=(0, 1))
+        how = ["--workers", str(self.workers)]
+        run_once(self._words, self._log, how=how, accept=(0, 1), proof=dataset_info(self.folder))
 
     def finished(self) -> bool:
-        """Whether they are all there."""
-        return ended(self._log)
+        """Whether they are all there.
+
+        Raises:
+            MemobenchError: those that are there were made by other words than the grid's.
+        """
+        return ended_as(self._log, self._words)
+
+    def keep(self, out: Path) -> None:
+        """Keep in another study's folder by which words they were made."""
+        if self.finished():
+            kept = replace(self, out=out)._log.with_suffix(".json")
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            write_file(kept, self._log.with_suffix(".json").read_text())
 
     def failure(self) -> str | None:
         """Nothing: a scene that the expert does not solve is told by its own log."""
@@ -63,7 +80,7 @@ class Cell:
 
     Attributes:
         out: the study's folder. tuned: a learning rate that is tried, for a short training; None: the row's own.
-        sealed: whether the sealed test is run too.
+        sealed: whether the sealed test is run too. beside: cells that are run at once, this one included.
     """
 
     grid: Grid
@@ -73,6 +90,7 @@ class Cell:
     seed: int
     tuned: float | None = None
     sealed: bool = False
+    beside: int = 1
 
     @property
     def task_name(self) -> str:
@@ -108,33 +126,77 @@ class Cell:
         return self.folder / f"{folder_name(part)}.log"
 
     def run(self) -> None:
-        """Train, then evaluate, whatever of this is left to do."""
-        train_once(self.training_words(), self.log(TRAINING), self.policy)
+        """Train, then evaluate, whatever of this is left to do.
+
+        Raises:
+            MemobenchError: a command failed, or what is there was made by other words than the grid's.
+        """
+        train_once(self.training_words(), self.log(TRAINING), self.policy, beside=self.beside)
         for part in self.parts:
-            run_once(self.evaluation_words(part), self.log(part), how=["resume=true"])
+            run_once(self.evaluation_words(part), self.log(part), how=["resume=true"], beside=self.beside)
 
     def finished(self) -> bool:
-        """Whether nothing is left to do."""
-        return all(ended(self.log(part)) for part in (TRAINING, *self.parts))
+        """Whether nothing is left to do.
+
+        Raises:
+            MemobenchError: what is there was made by other words than the grid's, or evaluates a policy that is gone.
+        """
+        trained = self.done(TRAINING)
+        there = [part for part in self.parts if self.done(part)]
+        if there and not trained:
+            raise MemobenchError(
+                f"{self.evaluation(there[0])} is of a policy that is not in {self.folder} any more; remove this folder"
+            )
+        return trained and len(there) == len(self.parts)
+
+    def done(self, part: str) -> bool:
+        """Return whether the training, the evaluation or a control has ended well.
+
+        Raises:
+            MemobenchError: it was of other words than the grid's.
+        """
+        words = self.training_words() if part == TRAINING else self.evaluation_words(part)
+        return ended_as(self.log(part), words)
 
     def keep(self, out: Path) -> list[Path]:
         """Keep of what is evaluated the logs, the cards and what they cost, compressed, in another study's folder.
 
         Tables and figures of that folder are those of this one. Return the folders of the logs.
         """
-        kept, found = replace(self, out=out), []
-        for part in self.parts:
-            if ended(self.log(part)):
-                keep_log(self.evaluation(part), kept.evaluation(part))
-                found.append(kept.evaluation(part))
-        for part in (TRAINING, *self.parts):
-            if found and ended(self.log(part)):
+        kept = replace(self, out=out)
+        parts = [part for part in self.parts if self.done(part)]
+        for part in parts:
+            keep_log(self.evaluation(part), kept.evaluation(part))
+        for part in (TRAINING, *parts) if parts else ():
+            if self.done(part):
                 write_file(kept.log(part).with_suffix(".json"), self.log(part).with_suffix(".json").read_text())
-        return found
+        rate, of_kept = (_rate_file(folder, self.suite, self.row) for folder in (self.out, out))
+        if parts and rate.exists():
+            of_kept.parent.mkdir(parents=True, exist_ok=True)
+            write_file(of_kept, rate.read_text())
+        return [kept.evaluation(part) for part in parts]
 
     def failure(self) -> str | None:
         """Nothing: what fails ends the study, and says why."""
         return None
+
+    def check(self) -> None:
+        """Refuse what its commands would, before any of them is run; datasets and policies need not be there.
+
+        Raises:
+            MemobenchError: an unknown setting or value, named with the nearest known one.
+        """
+        from lerobot_memobench.run.arguments import read_arguments
+        from lerobot_memobench.run.plan import take_run_options
+        from lerobot_memobench.run.training import take_training_options
+
+        words = [word for word in self.training_words()[2:] if not word.startswith("dataset=")]
+        *_, rest = take_training_options(split_arguments(words))
+        read_arguments("train", rest)
+        for part in self.parts:
+            told = [word for word in self.evaluation_words(part)[2:] if not word.startswith(("env=", "policy="))]
+            given = ["env=memobench", f"policy={word_of(self.training_words(), 'policy')}", *told]
+            read_arguments("eval", take_run_options(split_arguments(given))[1])
 
     def training_words(self) -> list[str]:
         """Return the command that trains its policy."""
@@ -168,9 +230,33 @@ class Cell:
     def costs(self) -> dict[str, Cost]:
         """Return what each part has taken so far."""
         found = {part: kept_of(self.log(part)) for part in (TRAINING, *self.parts)}
-        return {
-            part: Cost(float(str(told["wall_s"])), float(str(told["cpu_s"]))) for part, told in found.items() if told
-        }
+        return {part: Cost(told["wall_s"], told["cpu_s"]) for part, told in found.items() if told}
+
+
+def ended_as(log: Path, words: Sequence[str]) -> bool:
+    """Return whether the command of a log has ended well.
+
+    Raises:
+        MemobenchError: it was of other words. In which folder a study is, and which episodes a dataset turned out to
+            have of the tasks that are learned, is no difference.
+    """
+    told = kept_of(log)
+    if told is None:
+        return False
+    was, wanted = (_in_any_folder(one) for one in (told["words"], words))
+    if was != wanted:
+        differ = [word for word in (*was, *wanted) if (word in was) != (word in wanted)] or ["their order"]
+        raise MemobenchError(
+            f"{log.with_suffix('.json')} is of another command than the study's file asks for: "
+            f"{differ[0][:80]!r} stands in one of them alone; name another --out or "
+            "--grid, or remove what the command has made"
+        )
+    return told["ended"]
+
+
+def _in_any_folder(words: Sequence[str]) -> list[str]:
+    told = [word for word in words if not word.startswith("dataset.episodes=")]
+    return [re.sub(r"(?s)^([\w.]+=)?.*/(?=(cells|tuning|demonstrations)/)", r"\1", word) for word in told]
 
 
 def episode_words(data: Path, tasks: Sequence[str]) -> list[str]:
@@ -194,10 +280,10 @@ def _last_of_each(words: Sequence[str]) -> list[str]:
 # -- learning rates ---------------------------------------------------------------------------------------------------
 
 
-def tuning(grid: Grid, out: Path, cells: Sequence[tuple[str, str, int]]) -> list[Cell]:
+def tuning(grid: Grid, out: Path, cells: Sequence[tuple[str, str, int]], beside: int = 1) -> list[Cell]:
     """Return the short trainings by which the learning rates of some cells' rows are chosen."""
     rows = dict.fromkeys((suite, row) for suite, row, _ in cells)
-    return [Cell(grid, out, suite, row, 0, rate) for suite, row in rows for rate in grid.learning_rates]
+    return [Cell(grid, out, suite, row, 0, rate, beside=beside) for suite, row in rows for rate in grid.learning_rates]
 
 
 def choose_rates(cells: Sequence[Cell]) -> dict[tuple[str, str], float]:

@@ -19,8 +19,12 @@ ROLLOUTS = "rollouts"
 SEALED = "sealed"
 """The evaluation on sealed seeds, which is run when all else is done, and counted."""
 TRAINING, POLICY, AFTER = "training", "policy", "after"
+SEED = r"seed=(\d+)"
+"""How a training seed is named on the command line."""
 RESERVED = (ROLLOUTS, SEALED, TRAINING, POLICY, AFTER)
 """How folders and files of a cell are called, or begin."""
+PLACES = ("output_dir", "resume", "config_path")
+"""Words of a command that say where it writes, and from where it goes on."""
 
 
 def after(updates: int) -> str:
@@ -119,17 +123,36 @@ class Grid:
             folders = [folder_name(name) for name in names]
             if twice := [name for name, folder in zip(names, folders, strict=True) if folders.count(folder) > 1]:
                 raise MemobenchError(f"the {what} {', '.join(twice)} have one folder; rename one")
+        for name in self.rows:
+            if re.search(r"[|\n]|\(privileged\)$", name) or name in self.suites or re.fullmatch(SEED, name):
+                raise MemobenchError(f"a row is called {name!r}, and --only or a table would not tell it; rename it")
         for name in self.controls:
             if folder_name(name).partition("_")[0] in RESERVED:
                 raise MemobenchError(f"a control is called {name!r}, as something else of a cell; rename it")
         for name, suite in self.suites.items():
+            self._check_suite(name, suite)
             known = resolve_tasks(suite.tasks or "all", suite.name)
             if strangers := [task for task in suite.ceilings if task not in known]:
                 raise MemobenchError(f"suite {name!r} has a ceiling of {strangers[0]}; {nearest(strangers[0], known)}")
         for name, row in self.rows.items():
             self._check_row(name, row)
 
+    def _check_suite(self, name: str, suite: Suite) -> None:
+        told = suite.demonstrations
+        shown = told[told.index("--suite") + 1] if "--suite" in told[:-1] else PUBLISHED
+        if shown != suite.name:
+            raise MemobenchError(
+                f"suite {name!r} learns from suite {shown} and is rolled out on {suite.name}; name one"
+            )
+        if own := [word for word in told if word in ("--tasks", "--out", "--workers")]:
+            raise MemobenchError(f"suite {name!r} has {own[0]} in demonstrations; the study says that itself")
+        _refuse_words(f"suite {name!r}, evaluation", suite.evaluation, (*PLACES, "tasks", "policy"))
+
     def _check_row(self, name: str, row: Row) -> None:
+        _refuse_words(f"row {name!r}, training", [*self.training, *row.training], (*PLACES, "seed", "dataset"))
+        _refuse_words(
+            f"row {name!r}, evaluation", row.evaluation, (*PLACES, "tasks", "policy", "seed", "episodes", "split")
+        )
         for control in row.controls:
             if control not in self.controls:
                 raise MemobenchError(f"row {name!r} names the control {control!r}; {nearest(control, self.controls)}")
@@ -149,6 +172,12 @@ class Grid:
         for seed in range(max(row.seeds for row in self.rows.values())):
             for suite in self.suites:
                 yield from ((suite, name, seed) for name, row in self.rows.items() if seed < row.seeds)
+
+
+def _refuse_words(where: str, words: Iterable[str], keys: Iterable[str]) -> None:
+    """Refuse what the study says itself, or what would make a row another test than its neighbours."""
+    if own := [key for key in keys if word_of(words, key) is not None]:
+        raise MemobenchError(f"{where}: {own[0]}= is the study's to say, the same for all rows; leave it out")
 
 
 def read_grid(path: Path) -> Grid:
@@ -187,7 +216,7 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
             suites.add(word)
         elif word in grid.rows:
             rows.add(word)
-        elif match := re.fullmatch(r"seed=(\d+)", word):
+        elif match := re.fullmatch(SEED, word):
             seeds.add(int(match[1]))
         else:
             known = [*grid.suites, *grid.rows, "seed=0"]

@@ -17,9 +17,8 @@ from lerobot_memobench.evaluation.statistics import Estimate
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.learning.results import adjusted, average_success, contrast, contrasts_table, markdown
-from research.learning.stages import ended
 from research.memory_study.cells import Cell
-from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid, after, word_of
+from research.memory_study.grid import AFTER, ROLLOUTS, SEALED, TRAINING, Grid, after, word_of
 
 REFERENCES = ("no memory", "clock only", "frames")
 """Rows from which the others' differences are told."""
@@ -35,10 +34,14 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
     """Return the Markdown of a suite's rows; "" where none is evaluated.
 
     A row counts as soon as one of its training seeds has been evaluated; the table says how many have.
+
+    Raises:
+        MemobenchError: what is evaluated is of another grid, or of one policy under two names.
     """
     rows = evaluated_rows(grid, out, suite)
     if not rows:
         return ""
+    _check_policies(rows)
     parts = [
         ("What is solved, and whether it follows the evidence", _summary(rows)),
         ("Rates by memory type and operation", _by_memory_type(rows)),
@@ -84,8 +87,32 @@ def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
 
 
 def evaluated(cell: Cell, part: str) -> bool:
-    """Return whether a cell's evaluation, or a control, is done."""
-    return part in cell.parts and ended(cell.log(part))
+    """Return whether a cell's evaluation, or a control, is done.
+
+    Raises:
+        MemobenchError: it, or the training, is of other words than the grid's.
+    """
+    cell.done(TRAINING)
+    return part in cell.parts and cell.done(part)
+
+
+def _check_policies(rows: Rows) -> None:
+    """Refuse a cell whose parts are of two policies, and a policy that two cells are of; a log tells its weights' hash.
+
+    An evaluation of an earlier checkpoint is of other weights.
+    """
+    of_policy: dict[str, Path] = {}
+    for cell in (cell for cells in rows.values() for cell in cells):
+        parts = [part for part in cell.parts if not part.startswith(AFTER) and evaluated(cell, part)]
+        folders = [cell.evaluation(part) for part in parts]
+        found = {one["policy"]: folder for folder in folders for one in _rollouts(folder) if one.get("policy")}
+        if len(found) > 1:
+            told = " and ".join(map(str, found.values()))
+            raise MemobenchError(f"{told} are of two policies; remove what is of the older one, and run it again")
+        for policy, folder in found.items():
+            if other := of_policy.get(policy):
+                raise MemobenchError(f"{other} and {folder} are of one policy; remove the one that is wrong")
+            of_policy[policy] = folder
 
 
 def report(cell: Cell, part: str) -> dict[str, Any]:

@@ -22,11 +22,8 @@ import pytest
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_rollouts
-from lerobot_memobench.evaluation.report import write_report
+from lerobot_memobench.jobs.threads import BESIDE
 from lerobot_memobench.policies.memobench_mem.memory import OURS
-from lerobot_memobench.run.arguments import read_arguments, split_arguments
-from lerobot_memobench.run.plan import take_run_options
-from lerobot_memobench.run.training import take_training_options
 from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
@@ -34,7 +31,7 @@ from research.memory_study import cells, figure
 from research.memory_study.__main__ import GRID, STUDY, main, planned, study, tables_of
 from research.memory_study.cells import Cell, Demonstrations, choose_rates, chosen_rate, tuning
 from research.memory_study.figure import draw_all
-from research.memory_study.grid import ROLLOUTS, SEALED, Grid, chosen, read_grid
+from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
 from research.pages import around
 from tests.support.logs import rollout
@@ -67,14 +64,7 @@ def test_the_study_has_every_mechanism_and_its_commands_are_understood(tmp_path:
         "none",
     }
     for place in chosen(grid, ["seed=0"]):
-        cell = Cell(grid, tmp_path, *place)
-        told = [word for word in cell.training_words()[2:] if not word.startswith("dataset=")]
-        *_, rest = take_training_options(split_arguments(told))
-        read_arguments("train", rest)
-        for part in cell.parts:
-            take_run_options(
-                split_arguments([w for w in cell.evaluation_words(part)[2:] if not w.startswith("policy=")])
-            )
+        Cell(grid, tmp_path, *place, sealed=True).check()
 
 
 @pytest.mark.parametrize(
@@ -93,6 +83,15 @@ def test_the_study_has_every_mechanism_and_its_commands_are_understood(tmp_path:
         ("controls: [evidence]}", "after: [4]}", "after: 4, and no checkpoint"),
         ("[suite=strict]}", "[suite=strict], tasks: [objects]}", "did you mean 'object'"),
         ("[suite=strict]}", "[suite=strict], ceilings: {find_it: 3.0}}", "a ceiling of find_it"),
+        ("[--suite, strict]", "[--referent, random]", "learns from suite published and is rolled out on strict"),
+        ("evaluation: [suite=strict]", "evaluation: []", "learns from suite strict and is rolled out on published"),
+        ("[--suite, strict]", "[--suite, strict, --tasks, object]", "has --tasks in demonstrations"),
+        ("training: [steps=4,", "training: [seed=1, steps=4,", "seed= is the study's to say"),
+        ("training: [],", "training: [], evaluation: [episodes=1],", "episodes= is the study's to say"),
+        ("frames, no time:", "frames | time:", "'frames | time', and --only or a table"),
+        ("frames, no time:", "frames (privileged):", "rename it"),
+        ("frames, no time:", "strict:", "'strict', and --only"),
+        ("frames, no time:", "seed=1:", "'seed=1', and --only"),
     ],
 )
 def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, old: str, new: str, told: str) -> None:
@@ -191,6 +190,10 @@ def test_a_killed_cell_goes_on_where_it_was(grid: Grid, tmp_path: Path, monkeypa
     assert planned([], [], [cell], 1) == "0 of 1 are left"
 
 
+TOLD = {"words": [], "ended": False, "wall_s": 60.0, "cpu_s": 50.0}
+"""What is kept of a command."""
+
+
 def _keep_checkpoint(folder: Path) -> None:
     for name in ("pretrained_model/train_config.json", "training_state/training_step.json"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -209,11 +212,11 @@ def test_nothing_is_removed_that_may_be_gone_on_with(
         fcntl.flock(file, fcntl.LOCK_EX)
         with pytest.raises(MemobenchError, match="still writes"):
             cell.run()
-    cell.log("training").with_suffix(".json").write_text('{"words": ["other"], "ended": false}')
+    cell.log("training").with_suffix(".json").write_text(json.dumps({**TOLD, "words": ["other"]}))
     with pytest.raises(MemobenchError, match="of another command"):
         cell.run()
     assert mark.exists()
-    cell.log("training").with_suffix(".json").unlink()
+    cell.log("training").with_suffix(".json").write_text(json.dumps({**TOLD, "words": cell.training_words()}))
     for updates in ("000002", "000004"):
         _keep_checkpoint(cell.policy / "checkpoints" / updates)
     (cell.policy / "checkpoints" / "000002" / "training_state" / "optimizer_param_groups.json").touch()
@@ -361,14 +364,19 @@ def test_a_training_that_failed_before_its_first_checkpoint_begins_anew(
             cell.run()
 
 
-def _evaluate(cell: Cell, *parts: str, rollouts: int = 10, solved: int = 4) -> None:
+def _evaluate(cell: Cell, *parts: str, rollouts: int = 10, solved: int = 4, **more: str) -> None:
     """Let these parts of a cell be evaluated, by so many rollouts each; half of the solved ones are solved early on."""
     for part in parts:
         right = solved // 2 if part.startswith("after") else solved
-        episodes = [_rollout(episode, part == "evidence", right) for episode in range(rollouts)]
+        episodes = [_rollout(episode, part == "evidence", right) | more for episode in range(rollouts)]
         write_episodes(cell.evaluation(part), episodes)
-        write_report(cell.evaluation(part))
-        cell.log(part).with_suffix(".json").write_text(json.dumps({"ended": True, "wall_s": 60.0, "cpu_s": 50.0}))
+        _end(cell, part)
+
+
+def _end(cell: Cell, part: str) -> None:
+    words = cell.training_words() if part == TRAINING else cell.evaluation_words(part)
+    cell.log(part).with_suffix(".json").parent.mkdir(parents=True, exist_ok=True)
+    cell.log(part).with_suffix(".json").write_text(json.dumps({**TOLD, "words": words, "ended": True}))
 
 
 def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
@@ -463,20 +471,20 @@ def test_a_page_is_not_emptied_and_a_cut_log_is_told(tmp_path: Path) -> None:
     shutil.copytree(NOTES / "study", tmp_path / "out")
     assert main(["--out", str(tmp_path / "nothing"), "--page", str(page)]) == 2
     assert page.read_text() == (NOTES / "study.md").read_text()
-    log = Cell(read_grid(GRID), tmp_path / "out", "strict", "frames", 0).evaluation(ROLLOUTS) / "episodes.jsonl.gz"
+    log = Cell(read_grid(GRID), tmp_path / "out", "published", "frames", 0).evaluation(ROLLOUTS) / "episodes.jsonl.gz"
     lines = gzip.decompress(log.read_bytes()).splitlines(keepends=True)
     log.write_bytes(gzip.compress(b"".join(lines[:50])))
-    with pytest.raises(MemobenchError, match=r"frames-0/rollouts holds 50 rollouts of the 144 that its card asks for"):
-        tables(read_grid(GRID), tmp_path / "out", "strict")
+    with pytest.raises(MemobenchError, match=r"frames-0/rollouts holds 50 rollouts of the 120 that its card asks for"):
+        tables(read_grid(GRID), tmp_path / "out", "published")
     with pytest.raises(MemobenchError, match="is --out too"):
         study(tmp_path / "out", keep=tmp_path / "out")
 
 
 def test_logs_are_kept_as_they_are(tmp_path: Path) -> None:
-    cell = Cell(read_grid(GRID), tmp_path / "out", "strict", "frames", 0)
-    kept = Cell(cell.grid, NOTES / "study", "strict", "frames", 0).folder
+    cell = Cell(read_grid(GRID), tmp_path / "out", "published", "frames", 0)
+    kept = Cell(cell.grid, NOTES / "study", "published", "frames", 0).folder
     shutil.copytree(kept, cell.folder)
-    again = tmp_path / "kept" / "cells" / "strict" / "frames-0"
+    again = tmp_path / "kept" / "cells" / "published" / "frames-0"
     assert again / ROLLOUTS in cell.keep(tmp_path / "kept")
     files = sorted(path.relative_to(again) for path in again.glob("**/*") if path.is_file())
     assert Path(ROLLOUTS, "episodes.jsonl.gz") in files
@@ -496,7 +504,128 @@ def test_evidence_without_a_chance_is_in_no_table(grid: Grid, tmp_path: Path) ->
     cell = Cell(grid, tmp_path, "strict", "frames, no time", 0)
     for part in (ROLLOUTS, "evidence"):
         write_episodes(cell.evaluation(part), [{**_rollout(k, part == "evidence"), "chance": None} for k in range(10)])
-        write_report(cell.evaluation(part))
-        cell.log(part).with_suffix(".json").write_text(json.dumps({"ended": True, "wall_s": 1.0, "cpu_s": 1.0}))
+        _end(cell, part)
     assert figures_of_rows(grid, tmp_path, "strict")["frames, no time"]["follows"] == []
     assert "frames, no time" in tables(grid, tmp_path, "strict")
+
+
+# -- nothing of another recipe, policy or scene counts -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "what"),
+    [
+        ("steps=4", "steps=8", "training.json .*'steps=4'"),
+        ("[policy.memory=none]", "[policy.memory=bank]", "training.json .*'policy.memory=none'"),
+        ("episodes=2", "episodes=3", "rollouts.json .*'episodes=2'"),
+    ],
+)
+def test_what_ended_by_another_grid_is_neither_done_nor_counted(
+    grid: Grid, tmp_path: Path, old: str, new: str, what: str
+) -> None:
+    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
+    _evaluate(cell, ROLLOUTS)
+    _end(cell, TRAINING)
+    assert cell.finished()
+    (tmp_path / "grid.yaml").write_text(SMALL.replace(old, new))
+    changed = read_grid(tmp_path / "grid.yaml")
+    with pytest.raises(MemobenchError, match=what):
+        replace(cell, grid=changed).finished()
+    with pytest.raises(MemobenchError, match=what):
+        tables(changed, tmp_path, "strict")
+
+
+def test_demonstrations_of_another_grid_are_not_learned(grid: Grid, tmp_path: Path) -> None:
+    data = Demonstrations(grid, "strict", tmp_path)
+    data.folder.mkdir(parents=True)
+    words = ["memobench", "generate", "--suite", "strict", "--out", "/elsewhere/demonstrations/strict"]
+    data.folder.with_suffix(".json").write_text(json.dumps({**TOLD, "words": words, "ended": True}))
+    assert data.finished(), "in whichever folder they were made"
+    data.keep(tmp_path / "kept")
+    assert replace(data, out=tmp_path / "kept").finished()
+    some = SMALL.replace("[suite=strict]}", f"[suite=strict], tasks: [{FIND}]}}")
+    (tmp_path / "grid.yaml").write_text(some)
+    with pytest.raises(MemobenchError, match=r"strict\.json is of another command"):
+        Demonstrations(read_grid(tmp_path / "grid.yaml"), "strict", tmp_path).finished()
+
+
+def test_a_crash_makes_no_demonstrations(grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Status 1 says that a seed was not solved; a traceback ends with it, too."""
+    data, makes = Demonstrations(grid, "strict", tmp_path), False
+
+    def fake(words: list[str], output: IO[str], environment: object) -> tuple[int, Cost]:
+        if makes:
+            (data.folder / "meta").mkdir(parents=True)
+            (data.folder / "meta" / "info.json").touch()
+        return 1, Cost(1.0, 1.0)
+
+    monkeypatch.setattr(stages, "_run", fake)
+    with pytest.raises(MemobenchError, match="ended with status 1"):
+        data.run()
+    assert not data.finished()
+    makes = True
+    data.run()
+    assert data.finished()
+
+
+def test_rollouts_of_a_policy_that_is_gone_are_told(grid: Grid, tmp_path: Path) -> None:
+    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
+    _evaluate(cell, ROLLOUTS)
+    with pytest.raises(MemobenchError, match="rollouts is of a policy that is not in"):
+        cell.finished()
+
+
+def test_a_cell_is_of_one_policy_and_a_policy_of_one_cell(grid: Grid, tmp_path: Path) -> None:
+    def told(out: Path, rollouts: str, evidence: str) -> str:
+        _evaluate(Cell(grid, out, "strict", "no memory", 0), ROLLOUTS, policy="first")
+        cell = Cell(grid, out, "strict", "frames, no time", 0)
+        _evaluate(cell, ROLLOUTS, policy=rollouts)
+        _evaluate(cell, "evidence", policy=evidence)
+        return tables(grid, out, "strict")
+
+    assert told(tmp_path / "right", "second", "second")
+    with pytest.raises(MemobenchError, match="evidence are of two policies"):
+        told(tmp_path / "mixed", "second", "older")
+    with pytest.raises(MemobenchError, match="are of one policy"):
+        told(tmp_path / "copied", "first", "first")
+
+
+def test_rows_are_compared_on_the_same_scenes(grid: Grid, tmp_path: Path) -> None:
+    _evaluate(Cell(grid, tmp_path, "strict", "no memory", 0), ROLLOUTS)
+    _evaluate(Cell(grid, tmp_path, "strict", "frames, no time", 0), ROLLOUTS, scene_hash="another")
+    with pytest.raises(MemobenchError, match="scene_hash is another for 'frames, no time'"):
+        tables(grid, tmp_path, "strict")
+
+
+def test_a_row_that_solves_everything_has_its_interval(grid: Grid, tmp_path: Path) -> None:
+    for seed in (0, 1):
+        _evaluate(Cell(grid, tmp_path, "strict", "no memory", seed), ROLLOUTS, rollouts=12, solved=12)
+    assert "**100.0**" in tables(grid, tmp_path, "strict")
+
+
+def test_words_are_tried_before_anything_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "grid.yaml").write_text(SMALL.replace("policy.memory=none", "policy.memry=none"))
+    monkeypatch.setattr(stages, "_run", lambda *given: pytest.fail("something was run"))
+    with pytest.raises(MemobenchError, match="memory"):
+        study(tmp_path / "out", tmp_path / "grid.yaml", plan=True)
+
+
+def test_cells_that_run_at_once_share_the_cores(grid: Grid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = set[str]()
+
+    def fake(words: list[str], output: IO[str], environment: dict[str, str]) -> tuple[int, Cost]:
+        told.add(environment[BESIDE])
+        return 0, Cost(1.0, 1.0)
+
+    monkeypatch.setattr(stages, "_run", fake)
+    Cell(grid, tmp_path, "strict", "no memory", 0, beside=2).run()
+    assert told == {"2"}
+
+
+@pytest.mark.parametrize("content", ['{"ended": true}', '{"words": [], "ended": "no", "wall_s": 1, "cpu_s": 1}'])
+def test_a_damaged_file_of_a_command_is_told(grid: Grid, tmp_path: Path, content: str) -> None:
+    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
+    _evaluate(cell, ROLLOUTS)
+    cell.log(ROLLOUTS).with_suffix(".json").write_text(content)
+    with pytest.raises(MemobenchError, match=r"rollouts\.json.*remove it"):
+        tables(grid, tmp_path, "strict")
