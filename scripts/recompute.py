@@ -34,7 +34,7 @@ PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmark" / "results.md")
 CLAIMS = NOTES / "figures.md"
 NOT_KEPT = "log not kept"
 ROLLOUTS = "rollouts"
-FOLLOWS, CHANCE = "follows", "chance"
+FOLLOWS, CHANCE, SCENES = "follows", "chance", "scenes"
 """Columns of an evaluation by evidence."""
 INTERVAL = re.compile(r"[\d.]+\s\[[\d.]+–[\d.]+\]")
 
@@ -89,9 +89,10 @@ def of_log(folder: Path) -> Figures:
 
 
 def of_evidence(found: Evidence) -> Figures:
-    """Return how often choices followed the evidence, and how often they could have without the past."""
+    """Return how often choices followed the evidence, how often they could have without the past, in how many scenes."""
     rate = found.rates[FOLLOWS]
-    return {FOLLOWS: with_interval(rate.value, rate.low, rate.high), CHANCE: f"{percent(found.chance):.1f}"}
+    told = with_interval(rate.value, rate.low, rate.high)
+    return {FOLLOWS: told, CHANCE: f"{percent(found.chance):.1f}", SCENES: str(found.scenes)}
 
 
 def of_card(page: Path) -> Figures:
@@ -158,7 +159,7 @@ def rows_of(page: Path) -> Iterator[tuple[list[str], Figures, str]]:
     A row of results is one with an interval, or of a table of SR or of memory types.
     """
     for head, rows in tables(page):
-        known = [name for name in head if name in (*METRICS, *MEMORY_TYPES, ROLLOUTS, FOLLOWS, CHANCE)]
+        known = [name for name in head if name in (*METRICS, *MEMORY_TYPES, ROLLOUTS, FOLLOWS, CHANCE, SCENES)]
         for row in rows:
             if {"SR", "temporal"} & set(known) or any(map(INTERVAL.search, row)):
                 told = {name: row[head.index(name)] for name in known}
