@@ -232,18 +232,29 @@ def _endings(rows: Rows) -> str:
 
 
 def _conditions(rows: Rows) -> str:
-    """Return SR in each control that has no column beside the rows."""
+    """Return SR in each control that has no column beside the rows, and its change from the same scenes without it."""
     first = {row: cells[0] for row, cells in rows.items() if cells[0].seed == 0}
     parts = dict.fromkeys(part for cell in first.values() for part in cell.grid.rows[cell.row].controls)
     wanted = [part for part in parts if part != EVIDENCE]
     there = {row: [part for part in wanted if evaluated(cell, part)] for row, cell in first.items()}
     lines = [
         [row, _average([report(first[row], ROLLOUTS)], "SR")]
-        + [_average([report(first[row], part)], "SR") if part in own else EMPTY for part in wanted]
+        + [_condition(first[row], part, own) if part in own else EMPTY for part in wanted]
         for row, own in there.items()
         if own
     ]
     return markdown(("", "as it is", *wanted), lines) if lines else ""
+
+
+def _condition(cell: Cell, part: str, parts: Sequence[str]) -> str:
+    """Return SR in a control, and its change from the first other part with the same episodes, points and interval."""
+    told = _average([report(cell, part)], "SR")
+    asked = {(one["task"], one["seed"]) for one in _rollouts(cell.evaluation(part))}
+    for other in (ROLLOUTS, *parts[: parts.index(part)]):
+        if {(one["task"], one["seed"]) for one in _rollouts(cell.evaluation(other))} == asked:
+            change = contrast(_runs([cell], part), _runs([cell], other), part, other)
+            return f"{told} ({100 * change.value:+.1f}, {100 * change.low:+.1f} to {100 * change.high:+.1f})"
+    return told
 
 
 def curves(rows: Rows) -> dict[str, list[tuple[int, list[dict[str, float | None]]]]]:
