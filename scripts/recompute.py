@@ -89,7 +89,7 @@ def of_log(folder: Path) -> Figures:
 
 
 def of_evidence(found: Evidence) -> Figures:
-    """Return how often choices followed the evidence, how often they could have without the past, in how many scenes."""
+    """Return how often choices followed the evidence, and could have without the past, and in how many scenes."""
     rate = found.rates[FOLLOWS]
     told = with_interval(rate.value, rate.low, rate.high)
     return {FOLLOWS: told, CHANCE: f"{percent(found.chance):.1f}", SCENES: str(found.scenes)}
