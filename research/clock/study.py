@@ -143,8 +143,8 @@ def markdown(results: Sequence[Result]) -> str:
         shares = [one["chance"], *(one["right"][kind][idle] for idle in idles for kind in KINDS)]
         counts = [f"{one['demonstrations']}", f"{one['decisions']}"]
         rows.append([f"{one['family']}: `{one['task']}`", *counts, *(f"{100 * share:.0f}" for share in shares)])
-    lines = [table(["task", "demonstrations", "decisions", "chance", *heads], rows)]
-    return "\n".join([*lines, "", *_verdict(results)])
+    told = table(["task", "demonstrations", "decisions", "chance", *heads], rows)
+    return "\n".join([told, "", *_verdict(results)])
 
 
 def _verdict(results: Sequence[Result]) -> Iterator[str]:

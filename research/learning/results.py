@@ -79,7 +79,7 @@ def contrast(runs: Runs, reference: Runs, name: str = "arm", of_reference: str =
     Raises:
         MemobenchError: they have not rolled out the same episodes of the same scenes.
     """
-    episodes, rng = _episodes(reference), np.random.default_rng(0)
+    episodes, rng = episodes_of(reference), np.random.default_rng(0)
     weights, tasks = _weights(reference[0], episodes)
     base = _table(reference, episodes, of_reference)
     _check_scenes(runs, reference, name, of_reference)
@@ -123,7 +123,8 @@ def _key(record: Record) -> Key:
     return str(record["task"]), int(record["seed"])
 
 
-def _episodes(runs: Runs) -> list[Key]:
+def episodes_of(runs: Runs) -> list[Key]:
+    """Return task and seed of what the first training seed rolled out, in order."""
     return sorted(_key(record) for record in runs[0])
 
 
@@ -162,7 +163,7 @@ def _weights(records: Sequence[Record], episodes: Sequence[Key]) -> tuple[Array,
 
 def average_success(rollouts: Runs) -> Estimate:
     """Return an arm's success, averaged as the report averages, with its 95 % interval over seeds and episodes."""
-    episodes = _episodes(rollouts)
+    episodes = episodes_of(rollouts)
     weights, tasks = _weights(rollouts[0], episodes)
     table = _table(rollouts, episodes, "training seeds")
     value = float((table @ weights).mean())

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, NotRequired, TypedDict
 
+from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.jobs.threads import sharing
@@ -151,6 +152,20 @@ def train_once(words: Sequence[str], log: Path, policy: Path, *, beside: int = 1
     return run_once(words, log, beside=beside, going_on=["lerobot", "train", f"config_path={begun}", "resume=true"])
 
 
+def check_training(words: Sequence[str]) -> None:
+    """Refuse what ``lerobot train …`` would, before it is run; its dataset need not be there yet.
+
+    Raises:
+        MemobenchError: an unknown setting or value, named with the nearest known one.
+    """
+    from lerobot_memobench.run.arguments import read_arguments
+    from lerobot_memobench.run.training import take_training_options
+
+    told = [word for word in words[2:] if not word.startswith("dataset=")]
+    *_, rest = take_training_options(split_arguments(told))
+    read_arguments("train", rest)
+
+
 def _run(words: Sequence[str], output: IO[str], environment: Mapping[str, str]) -> tuple[int, Cost]:
     """Run a command to its end; return its exit status and what it and its own processes took."""
     started = time.monotonic()
@@ -168,11 +183,6 @@ def _run(words: Sequence[str], output: IO[str], environment: Mapping[str, str]) 
     process.returncode = os.waitstatus_to_exitcode(status)
     wall = time.monotonic() - started
     return process.returncode, Cost(round(wall, 1), round(used.ru_utime + used.ru_stime, 1))
-
-
-def dataset_info(folder: Path) -> Path:
-    """Return the file that a dataset has once it is whole: an exit status of 1 may also be a crash's."""
-    return folder / "meta" / "info.json"
 
 
 Costs = dict[str, list[Cost | None]]
@@ -222,7 +232,7 @@ class Stages:
         words += ["--perturb", "--out", str(self.data)]
         words += [] if self._perception.pictures else ["--no-images"]
         how = ["--workers", str(self.workers)]
-        return run_once(words, self.out / "data.log", how=how, accept=(0, 1), proof=dataset_info(self.data))
+        return run_once(words, self.out / "data.log", how=how, accept=(0, 1), proof=self.data / INFO_FILE)
 
     def check_settings(self) -> None:
         """Refuse what training would, before anything is made; LeRobot's import is left out where nothing was added.
@@ -230,14 +240,8 @@ class Stages:
         Raises:
             MemobenchError: an unknown setting or value, named with the nearest known one.
         """
-        from lerobot_memobench.run.arguments import read_arguments
-        from lerobot_memobench.run.training import take_training_options
-
         for arm in self.experiment.arms if self.experiment.settings else ():
-            # All but the dataset, which is not there yet.
-            told = [word for word in self.training_words(arm, 0)[2:] if not word.startswith("dataset=")]
-            *_, words = take_training_options(split_arguments(told))
-            read_arguments("train", words)
+            check_training(self.training_words(arm, 0))
 
     def training_words(self, arm: str, seed: int) -> list[str]:
         """Return the command that trains an arm's policy with one seed."""

@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.report import keep_log
 from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.run.arguments import split_arguments
-from research.learning.stages import Cost, dataset_info, ended, kept_of, run_once, train_once
+from research.learning.stages import Cost, check_training, ended, kept_of, run_once, train_once
 from research.memory_study.grid import POLICY, ROLLOUTS, SEALED, TRAINING, Grid, after, folder_name, word_of
 
 
@@ -52,7 +53,7 @@ class Demonstrations:
     def run(self) -> None:
         """Generate them."""
         how = ["--workers", str(self.workers)]
-        run_once(self._words, self._log, how=how, accept=(0, 1), proof=dataset_info(self.folder))
+        run_once(self._words, self._log, how=how, accept=(0, 1), proof=self.folder / INFO_FILE)
 
     def finished(self) -> bool:
         """Whether they are all there.
@@ -65,9 +66,7 @@ class Demonstrations:
     def keep(self, out: Path) -> None:
         """Keep in another study's folder by which words they were made."""
         if self.finished():
-            kept = replace(self, out=out)._log.with_suffix(".json")
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            write_file(kept, self._log.with_suffix(".json").read_text())
+            _copy(self._log.with_suffix(".json"), replace(self, out=out)._log.with_suffix(".json"))
 
     def failure(self) -> str | None:
         """Nothing: a scene that the expert does not solve is told by its own log."""
@@ -169,11 +168,10 @@ class Cell:
             keep_log(self.evaluation(part), kept.evaluation(part))
         for part in (TRAINING, *parts) if parts else ():
             if self.done(part):
-                write_file(kept.log(part).with_suffix(".json"), self.log(part).with_suffix(".json").read_text())
-        rate, of_kept = (_rate_file(folder, self.suite, self.row) for folder in (self.out, out))
+                _copy(self.log(part).with_suffix(".json"), kept.log(part).with_suffix(".json"))
+        rate = _rate_file(self.out, self.suite, self.row)
         if parts and rate.exists():
-            of_kept.parent.mkdir(parents=True, exist_ok=True)
-            write_file(of_kept, rate.read_text())
+            _copy(rate, _rate_file(out, self.suite, self.row))
         return [kept.evaluation(part) for part in parts]
 
     def failure(self) -> str | None:
@@ -188,14 +186,12 @@ class Cell:
         """
         from lerobot_memobench.run.arguments import read_arguments
         from lerobot_memobench.run.plan import take_run_options
-        from lerobot_memobench.run.training import take_training_options
 
-        words = [word for word in self.training_words()[2:] if not word.startswith("dataset=")]
-        *_, rest = take_training_options(split_arguments(words))
-        read_arguments("train", rest)
+        words = self.training_words()
+        check_training(words)
         for part in self.parts:
             told = [word for word in self.evaluation_words(part)[2:] if not word.startswith(("env=", "policy="))]
-            given = ["env=memobench", f"policy={word_of(self.training_words(), 'policy')}", *told]
+            given = ["env=memobench", f"policy={word_of(words, 'policy')}", *told]
             read_arguments("eval", take_run_options(split_arguments(given))[1])
 
     def training_words(self) -> list[str]:
@@ -252,6 +248,11 @@ def ended_as(log: Path, words: Sequence[str]) -> bool:
             "--grid, or remove what the command has made"
         )
     return told["ended"]
+
+
+def _copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_file(target, source.read_text())
 
 
 def _in_any_folder(words: Sequence[str]) -> list[str]:

@@ -16,7 +16,7 @@ from lerobot_memobench.evaluation.report import control_data
 from lerobot_memobench.evaluation.statistics import Estimate
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
-from research.learning.results import adjusted, average_success, contrast, contrasts_table, markdown
+from research.learning.results import adjusted, average_success, contrast, contrasts_table, episodes_of, markdown
 from research.memory_study.cells import Cell
 from research.memory_study.grid import AFTER, ROLLOUTS, SEALED, TRAINING, Grid, after, word_of
 
@@ -78,21 +78,26 @@ def titles(grid: Grid) -> list[str]:
 
 
 def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
-    """Return the rows of a suite of which a training seed is evaluated, by their titles."""
-    cells = {
-        title: [cell for seed in range(told.seeds) if evaluated(cell := Cell(grid, out, suite, row, seed), ROLLOUTS)]
-        for title, (row, told) in zip(titles(grid), grid.rows.items(), strict=True)
-    }
-    return {row: own for row, own in cells.items() if own}
+    """Return the rows of a suite of which a training seed is evaluated, by their titles.
+
+    Raises:
+        MemobenchError: a training, or an evaluation, is of other words than the grid's.
+    """
+    found: dict[str, list[Cell]] = {}
+    for title, (row, told) in zip(titles(grid), grid.rows.items(), strict=True):
+        for cell in (Cell(grid, out, suite, row, seed) for seed in range(told.seeds)):
+            cell.done(TRAINING)  # once, for all its evaluations
+            if evaluated(cell, ROLLOUTS):
+                found.setdefault(title, []).append(cell)
+    return found
 
 
 def evaluated(cell: Cell, part: str) -> bool:
     """Return whether a cell's evaluation, or a control, is done.
 
     Raises:
-        MemobenchError: it, or the training, is of other words than the grid's.
+        MemobenchError: it is of other words than the grid's.
     """
-    cell.done(TRAINING)
     return part in cell.parts and cell.done(part)
 
 
@@ -249,10 +254,10 @@ def _conditions(rows: Rows) -> str:
 def _condition(cell: Cell, part: str, parts: Sequence[str]) -> str:
     """Return SR in a control, and its change from the first other part with the same episodes, points and interval."""
     told = _average([report(cell, part)], "SR")
-    asked = {(one["task"], one["seed"]) for one in _rollouts(cell.evaluation(part))}
+    runs = _runs([cell], part)
     for other in (ROLLOUTS, *parts[: parts.index(part)]):
-        if {(one["task"], one["seed"]) for one in _rollouts(cell.evaluation(other))} == asked:
-            change = contrast(_runs([cell], part), _runs([cell], other), part, other)
+        if episodes_of(without := _runs([cell], other)) == episodes_of(runs):
+            change = contrast(runs, without, part, other)
             return f"{told} ({100 * change.value:+.1f}, {100 * change.low:+.1f} to {100 * change.high:+.1f})"
     return told
 

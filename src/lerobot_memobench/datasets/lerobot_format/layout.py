@@ -49,7 +49,7 @@ MOST_NUMBERS = 50_000_000
 
 def is_dataset(folder: Path) -> bool:
     """Whether ``folder`` holds a finished LeRobotDataset."""
-    return (folder / "meta" / "info.json").is_file()
+    return (folder / INFO_FILE).is_file()
 
 
 def check_destination(out: Path) -> None:
