@@ -67,8 +67,9 @@ def checkpoint(folder: Path, inputs: dict[str, PolicyFeature], seed: int = 0) ->
 def lerobot_eval(policy: Path, out: Path, *more: str, episodes: int = 1, batch: int = 1) -> int:
     """Run LeRobot's own `lerobot-eval`."""
     flags = [f"--policy.path={policy}", "--policy.device=cpu", "--env.type=memobench", f"--env.tasks={TASK}"]
-    flags += ["--env.horizon=3", "--env.render=fast", "--seed=7", f"--eval.n_episodes={episodes}"]
-    return call_lerobot("eval", [*flags, f"--eval.batch_size={batch}", f"--output_dir={out}", *more])
+    flags += ["--env.horizon=3", "--env.render=fast", "--seed=7", "--eval.use_async_envs=false"]
+    flags += [f"--eval.n_episodes={episodes}", f"--eval.batch_size={batch}", f"--output_dir={out}"]
+    return call_lerobot("eval", [*flags, *more])
 
 
 # --- what is seen ---

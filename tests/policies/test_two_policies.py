@@ -91,12 +91,8 @@ KINDS = {
 }
 
 
-QUICK = ("memory text in the prompt",)
-
-
-@pytest.mark.parametrize(
-    "kind", [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
-)
+@pytest.mark.slow  # the test below is one of the kinds
+@pytest.mark.parametrize("kind", KINDS)
 def test_two_trainings_in_turns_learn_what_each_learns_alone(
     root: Path, encoders: tuple[Path, Path], kind: str
 ) -> None:
