@@ -589,8 +589,24 @@ def test_frames_are_pooled_whatever_the_order_of_their_things() -> None:
     assert (pooled[0] - prompt[0]).abs().max() > 1e-4, "so is the phase"
 
 
-def frames_memory(pool: ObjectPool, width: int, frames: int) -> Frames:
-    return Frames(MemorySpec(width, 2, width, width, frames, 0, 8), pool, Frames.Settings())
+def frames_memory(pool: ObjectPool, width: int, frames: int, content: bool = True) -> Frames:
+    return Frames(MemorySpec(width, 2, width, width, frames, 0, 8), pool, Frames.Settings(content=content))
+
+
+@pytest.mark.parametrize("phase", [False, True])
+def test_a_clock_remembers_no_thing_and_the_phase_where_it_is_told(phase: bool) -> None:
+    memory = frames_memory(ObjectPool(range(KINDS), KINDS + 1, 2, 32, phase=phase), 32, 4, content=False)
+
+    def read(slots: torch.Tensor, begin: int) -> torch.Tensor:
+        frames = frame_row(slots, hand().expand(4, -1), (torch.arange(4) >= begin).float())
+        state = memory.init(1)
+        for number, frame in enumerate(frames):
+            state = memory.write(state, frame[None], torch.tensor([8 * number]))
+        return memory.read(state).rows()
+
+    first = read(seen().expand(4, -1), 2)
+    assert torch.equal(first, read(seen(lit=1).expand(4, -1), 2)), "what was seen"
+    assert torch.equal(first, read(seen().expand(4, -1), 1)) == (not phase), "when the execution began"
 
 
 def test_a_frame_that_many_read_is_encoded_once() -> None:

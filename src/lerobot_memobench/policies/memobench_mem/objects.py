@@ -14,7 +14,7 @@ import torch
 from einops import rearrange
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 from torch import Tensor, nn
-from torch.nn.functional import rms_norm
+from torch.nn.functional import pad, rms_norm
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
@@ -148,6 +148,11 @@ class ObjectPool(nn.Module):
             pooled = pooled + self.phase(phase).unsqueeze(1)
         kept: Tensor = self.out(pooled)
         return rms_norm(kept, kept.shape[-1:], eps=1e-6)
+
+    def phases(self, frames: Tensor) -> Tensor:
+        """Return tokens as of frames without objects and hand: all that they tell is the phase."""
+        blank: Tensor = self(pad(frames[..., -1:], (frames.shape[-1] - 1, 0)))
+        return blank
 
 
 class ObjectEncoder(nn.Module, ObservationEncoder):

@@ -20,6 +20,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
+from lerobot_memobench.policies.memobench_mem.objects import ObjectPool
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ class FramesSettings:
     Attributes:
         time_codes: whether a memory token says when its frame was; if not, only the frames' order is told.
         content: whether it says what was seen; if not, memory is a clock: the control of `docs/guides/controls.md`.
+            With ``memory_phase`` it is one that knows when the execution began.
     """
 
     time_codes: bool = True
@@ -120,7 +122,7 @@ class Frames(MemoryMechanism):
             real[number, : len(row)] = True
         device = self.encoder.project.weight.device
         frames, steps, real = frames.to(device), steps.to(device), real.to(device)
-        each = self._encoded(self.pool(frames.flatten(0, 1)).unflatten(0, real.shape), steps)
+        each = self._encoded(self._pooled(frames.flatten(0, 1)).unflatten(0, real.shape), steps)
         return self._tokens(each.flatten(1, 2), real, steps)
 
     def join(self, states: Sequence[Any]) -> list[list[Frame]]:
@@ -131,13 +133,21 @@ class Frames(MemoryMechanism):
         """Encode each frame once, whichever samples read it."""
         padded = F.pad(histories.places, (0, self.spec.frames - histories.places.shape[1]), value=-1)
         real, places = padded >= 0, padded.clamp(min=0)
-        each = self._encoded(self.pool(histories.frames).unsqueeze(1), histories.steps[:, None]).squeeze(1)
+        each = self._encoded(self._pooled(histories.frames).unsqueeze(1), histories.steps[:, None]).squeeze(1)
         found = self._tokens(each, real, histories.steps[places])
         return found._replace(places=places)
 
+    def _pooled(self, frames: Tensor) -> Tensor:
+        """Return tokens (N, P, D) of stored frames (N, P', D'); a clock's hold the phase, or nothing."""
+        tokens: Tensor = self.pool(frames)
+        if self.settings.content:
+            return tokens
+        if isinstance(self.pool, ObjectPool) and self.pool.phase is not None:
+            return self.pool.phases(frames)
+        return torch.zeros_like(tokens)
+
     def _encoded(self, tokens: Tensor, steps: Tensor) -> Tensor:
         """Return memory tokens (B, F, P, d_m) of tokens (B, F, P, D) at control steps (B, F)."""
-        tokens = tokens if self.settings.content else torch.zeros_like(tokens)
         encoded: Tensor = self.encoder(tokens, steps if self.settings.time_codes else torch.zeros_like(steps))
         return encoded
 
