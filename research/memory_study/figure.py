@@ -32,7 +32,8 @@ def draw_all(grid: Grid, out: Path, figures: Path) -> list[Path]:
 def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     """Draw what has been evaluated to ``path``; return it, or None where nothing has.
 
-    A bar is the mean of training seeds, a dot one of them; an orange line is the best rate without the past.
+    A bar is the mean of training seeds, a dot one of them; an orange line is the best without the past: what a
+    search found to be solved, and the exact chance of following.
     """
     plt = pyplot()
     suites = {suite: found for suite in grid.suites if (found := figures_of_rows(grid, out, suite))}
@@ -47,7 +48,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     for axis, (suite, measure) in zip(axes[0], panels, strict=True):
         for place, row in enumerate(rows):
             if row in suites[suite]:
-                _draw_row(axis, place, suites[suite][row][measure], suites[suite][row]["chance"], measure)
+                _draw_row(axis, place, suites[suite][row], measure)
         axis.set_xlim(0, 100)
         axis.set_title(suite, fontsize=10)
         axis.set_xlabel(MEASURES[measure])
@@ -105,12 +106,13 @@ def draw_curves(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
     return save(figure, path)
 
 
-def _draw_row(axis: Any, place: int, of_seeds: list[float], chance: float | None, measure: str) -> None:
+def _draw_row(axis: Any, place: int, told: dict[str, Any], measure: str) -> None:
+    of_seeds, without = told[measure], told["without"][measure]
     if not of_seeds:
         return
     average = mean(of_seeds)
     axis.barh(place, average, 0.7, color=COLOURS[list(MEASURES).index(measure)], alpha=0.75)
     axis.plot(of_seeds, [place] * len(of_seeds), "o", color="black", markersize=3)
     axis.text(1, place, f"{average:.0f}", va="center", fontsize=8)
-    if measure == "follows" and chance is not None:
-        axis.plot([chance, chance], [place - 0.42, place + 0.42], color=CHANCE_COLOUR, linewidth=2)
+    if without is not None:
+        axis.plot([without, without], [place - 0.42, place + 0.42], color=CHANCE_COLOUR, linewidth=2)

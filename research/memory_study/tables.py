@@ -15,6 +15,7 @@ from lerobot_memobench.evaluation.records import read_rollouts, read_runs
 from lerobot_memobench.evaluation.report import control_data
 from lerobot_memobench.evaluation.statistics import Estimate
 from lerobot_memobench.io import count_of
+from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.learning.results import adjusted, average_success, contrast, contrasts_table, episodes_of, markdown
 from research.memory_study.cells import Cell
@@ -43,7 +44,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         return ""
     _check_policies(rows)
     parts = [
-        ("What is solved, and whether it follows the evidence", _summary(rows)),
+        ("What is solved, and whether it follows the evidence", _summary(rows, grid.suites[suite].ceilings)),
         ("Rates by memory type and operation", _by_memory_type(rows)),
         ("Success by task", _by_task(rows, grid.suites[suite].ceilings)),
         ("How rollouts ended, all training seeds together", _endings(rows)),
@@ -57,14 +58,16 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
 
 
 def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, Any]]:
-    """Return title of a row -> SR ("solved") and "follows" of each training seed, and the chance of that; per cent."""
-    found = {}
+    """Return title of a row -> SR ("solved") and "follows" of each training seed, and the best of both "without" the
+    past; per cent.
+    """
+    found, ceiling = {}, _ceiling(grid.suites[suite].ceilings)
     for row, cells in evaluated_rows(grid, out, suite).items():
         evidence = _evidence(cells)
         found[row] = {
             "solved": [report(cell, ROLLOUTS)["average"]["SR"] for cell in cells],
             "follows": [told["follows"]["percent"] for told in evidence],
-            "chance": evidence[0]["chance"] if evidence else None,
+            "without": {"solved": ceiling, "follows": evidence[0]["chance"] if evidence else None},
         }
     return found
 
@@ -172,10 +175,22 @@ def _evidence(cells: Sequence[Cell]) -> list[dict[str, Any]]:
 # -- tables -----------------------------------------------------------------------------------------------------------
 
 
-def _summary(rows: Rows) -> str:
+def _summary(rows: Rows, ceilings: Mapping[str, float]) -> str:
     header = ("", "training seeds", "SR", "95 %", "of seeds", *METRICS[1:])
     more = ("follows evidence, first seed", "chance", "scenes")
-    return markdown((*header, *more), [_summary_line(row, cells) for row, cells in rows.items()])
+    lines = [_summary_line(row, cells) for row, cells in rows.items()]
+    if ceilings:
+        empty = [EMPTY] * (len(header + more) - 3)
+        lines.insert(0, ["best found without a memory", EMPTY, _figure(_ceiling(ceilings)), *empty])
+    return markdown((*header, *more), lines)
+
+
+def _ceiling(ceilings: Mapping[str, float]) -> float | None:
+    """Return the mean over memory types of their tasks' ceilings, as SR is averaged."""
+    of_types = [
+        [value for name, value in ceilings.items() if get_task(name).memory_type == kind] for kind in MEMORY_TYPES
+    ]
+    return _mean_of([_mean_of(values) for values in of_types])
 
 
 def _summary_line(row: str, cells: Sequence[Cell]) -> list[str]:

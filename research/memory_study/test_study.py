@@ -392,10 +392,11 @@ def test_tables_and_figures_show_what_is_evaluated(tmp_path: Path) -> None:
     _evaluate(Cell(grid, tmp_path, "strict", "frames, no time", 0), ROLLOUTS, "after 2", "evidence")
     _evaluate(Cell(grid, tmp_path, "strict", "frames, no time", 0), "replan 5", solved=2)
     assert figures_of_rows(grid, tmp_path, "strict") == {
-        "no memory": {"solved": [40.0], "follows": [], "chance": None},
-        "frames, no time": {"solved": [40.0], "follows": [80.0], "chance": 50.0},
+        "no memory": {"solved": [40.0], "follows": [], "without": {"solved": 33.3, "follows": None}},
+        "frames, no time": {"solved": [40.0], "follows": [80.0], "without": {"solved": 33.3, "follows": 50.0}},
     }
     told = tables(grid, tmp_path, "strict").splitlines()
+    assert f"| best found without a memory | – | 33.3 |{8 * ' – |'}" in told
     assert "| no memory | 1 | **40.0** | 10.0–70.0 | 40 | 100.0 | – | 100.0 | – | – | – |" in told
     (line,) = (one for one in told if one.startswith("| frames, no time | 1 | **40.0** |"))
     assert re.search(r"\| 80.0 \(\d+\.\d–100\.0\) \| 50\.0 \| 5 \|$", line)
@@ -451,6 +452,15 @@ def test_the_sealed_test_is_asked_for_and_stays(grid: Grid, tmp_path: Path) -> N
 def test_ceilings_are_of_the_tasks_that_are_rolled_out() -> None:
     for name, suite in read_grid(GRID).suites.items():
         assert sorted(suite.ceilings) == sorted(resolve_tasks(suite.tasks, name))
+
+
+def test_the_average_of_ceilings_is_of_memory_types(grid: Grid, tmp_path: Path) -> None:
+    milk = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+    counted = "check_the_middle_drawer_a_given_number_of_times"
+    suite = replace(grid.suites["strict"], ceilings={BUTTER: 10.0, milk: 20.0, counted: 45.0})
+    changed = replace(grid, suites={"strict": suite})
+    _evaluate(Cell(changed, tmp_path, "strict", "no memory", 0), ROLLOUTS)
+    assert "| best found without a memory | – | 30.0 | –" in tables(changed, tmp_path, "strict")
 
 
 def _rollout(episode: int, evidence: bool, solved: int = 4) -> dict[str, Any]:
