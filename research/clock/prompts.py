@@ -17,7 +17,6 @@ from lerobot_memobench.tasks.catalogue import get_task
 from research.clock.study import FOLDS, check_enough
 from research.learning.results import markdown
 
-
 SHUFFLES = 10
 """As often everything is guessed, each time by other folds: one shuffle of 50 prompts says 61 to 73 %."""
 
