@@ -255,8 +255,8 @@ def _conditions(rows: Rows) -> str:
     """Return SR in each control that has no column beside the rows, and its change from the same scenes without it."""
     first = {row: cells[0] for row, cells in rows.items() if cells[0].seed == 0}
     parts = dict.fromkeys(part for cell in first.values() for part in cell.grid.rows[cell.row].controls)
-    wanted = [part for part in parts if part != EVIDENCE]
-    there = {row: [part for part in wanted if evaluated(cell, part)] for row, cell in first.items()}
+    there = {row: [part for part in parts if part != EVIDENCE and evaluated(cell, part)] for row, cell in first.items()}
+    wanted = [part for part in parts if any(part in own for own in there.values())]
     lines = [
         [row, _average([report(first[row], ROLLOUTS)], "SR")]
         + [_condition(first[row], part, own) if part in own else EMPTY for part in wanted]
