@@ -18,7 +18,7 @@ from research.clock.study import FOLDS, check_enough
 from research.learning.results import markdown
 
 SHUFFLES = 10
-"""As often everything is guessed, each time by other folds: one shuffle of 50 prompts says 61 to 73 %."""
+"""As often everything is guessed, each time by other folds: one shuffle of 49 prompts says 61 to 73 %."""
 
 
 @dataclass(frozen=True)
