@@ -25,6 +25,7 @@ REFERENCES = ("no memory", "clock only", "frames")
 """Rows from which the others' differences are told."""
 EVIDENCE = "evidence"
 """The control that stands beside the rows; the others have a table of their own."""
+FOUND_WITHOUT = "best found without a memory"
 EMPTY = "–"
 
 Rows = Mapping[str, Sequence[Cell]]
@@ -181,7 +182,7 @@ def _summary(rows: Rows, ceilings: Mapping[str, float]) -> str:
     lines = [_summary_line(row, cells) for row, cells in rows.items()]
     if ceilings:
         empty = [EMPTY] * (len(header + more) - 3)
-        lines.insert(0, ["best found without a memory", EMPTY, _figure(_ceiling(ceilings)), *empty])
+        lines.insert(0, [FOUND_WITHOUT, EMPTY, _figure(_ceiling(ceilings)), *empty])
     return markdown((*header, *more), lines)
 
 
@@ -238,7 +239,7 @@ def _by_task(rows: Rows, ceilings: Mapping[str, float]) -> str:
         [f"`{name}`", *map(_figure, (ceilings.get(name), *values))]
         for name, *values in zip(names, *solved.values(), strict=True)
     ]
-    return markdown(("", "best found without a memory", *rows), lines)
+    return markdown(("", FOUND_WITHOUT, *rows), lines)
 
 
 def _endings(rows: Rows) -> str:

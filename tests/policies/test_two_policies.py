@@ -91,7 +91,7 @@ KINDS = {
 }
 
 
-@pytest.mark.slow  # the test below is one of the kinds
+@pytest.mark.slow  # other encoders on one dataset are a default test, below
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_trainings_in_turns_learn_what_each_learns_alone(
     root: Path, encoders: tuple[Path, Path], kind: str

@@ -139,12 +139,10 @@ class Frames(MemoryMechanism):
 
     def _pooled(self, frames: Tensor) -> Tensor:
         """Return tokens (N, P, D) of stored frames (N, P', D'); a clock's hold the phase, or nothing."""
-        tokens: Tensor = self.pool(frames)
-        if self.settings.content:
-            return tokens
-        if isinstance(self.pool, ObjectPool) and self.pool.phase is not None:
+        if not self.settings.content and isinstance(self.pool, ObjectPool) and self.pool.phase is not None:
             return self.pool.phases(frames)
-        return torch.zeros_like(tokens)
+        tokens: Tensor = self.pool(frames)
+        return tokens if self.settings.content else torch.zeros_like(tokens)
 
     def _encoded(self, tokens: Tensor, steps: Tensor) -> Tensor:
         """Return memory tokens (B, F, P, d_m) of tokens (B, F, P, D) at control steps (B, F)."""
