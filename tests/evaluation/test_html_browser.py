@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,7 @@ def filter_list(browser: Any, report: Path, view: str, filters: dict[str, str], 
     browser.wait(f"document.querySelector('#count').innerText.startsWith('{count}')")
 
 
-def shown_frame(browser: Any, video: str = "video") -> int:
+def shown_frame(browser: Any, video: str) -> int:
     """The number of the frame on the screen, read off its grey."""
     from PIL import Image
 
@@ -132,8 +133,16 @@ def shown_frame(browser: Any, video: str = "video") -> int:
     return round((grey - 16) / 4)
 
 
+def assert_shown(browser: Any, frame: int, video: str = "video") -> None:
+    """Wait for a frame on the screen: without a graphics card it is drawn some time after the video has sought it."""
+    deadline = time.monotonic() + chromium.PATIENCE
+    while (shown := shown_frame(browser, video)) != frame and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert shown == frame
+
+
 def settle(browser: Any) -> None:
-    """Wait until a seek has arrived on the screen: two frames of the browser after all videos say so."""
+    """Wait until every video has sought its frame, and for two frames of the browser."""
     browser.wait("[...document.querySelectorAll('video')].every((video) => !video.seeking)")
     browser.js("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
@@ -202,7 +211,7 @@ def test_a_click_on_the_timeline_seeks_the_video(browser: Any, report: Path) -> 
         settle(browser)
         assert playhead(browser) == frame
         assert browser.js("document.querySelector('video').currentTime") == pytest.approx((frame + 0.5) / FPS)
-        assert shown_frame(browser) == frame
+        assert_shown(browser, frame)
 
 
 def test_the_playhead_follows_a_drag(browser: Any, report: Path) -> None:
@@ -236,7 +245,7 @@ def test_marks_show_first_and_ordered_steps(browser: Any, report: Path) -> None:
     browser.click('.mark[data-frame="4"]')
     settle(browser)
     assert playhead(browser) == 4
-    assert shown_frame(browser) == 4
+    assert_shown(browser, 4)
 
 
 def test_the_subgoal_changes_at_each_ordered_step(browser: Any, report: Path) -> None:
@@ -275,7 +284,7 @@ def test_prompt_and_failure_are_on_the_timeline(browser: Any, report: Path) -> N
     assert browser.texts("p.now") == ["watch the prompt"]
     browser.click(".timeline .axis", across=15 / 35)
     settle(browser)
-    assert shown_frame(browser) == 15
+    assert_shown(browser, 15)
     assert browser.texts("p.now")[0].endswith(get_task(BUTTER).checkpoints[0].language[1])
     show(browser, report, f"view=episodes&ep={BUTTER}.1")
     assert "never held: reference drift" in browser.js(
@@ -316,10 +325,10 @@ def test_what_a_chunk_read_is_under_the_timeline_with_its_frames(browser: Any, r
     assert playhead(browser) == 21
     browser.wait("document.querySelector('#tip video')?.readyState >= 2")
     settle(browser)
-    assert shown_frame(browser, "#tip .picture") == 8
+    assert_shown(browser, 8, "#tip .picture")
     browser.key("End")
     settle(browser)
-    assert shown_frame(browser, "#tip .picture") == 16
+    assert_shown(browser, 16, "#tip .picture")
     browser.click(".cell:nth-child(2)")
     assert playhead(browser) == 8
     assert browser.texts("#tip, .lane.read .words")[0].startswith("Memory read: no chunk")
@@ -470,7 +479,8 @@ def test_one_control_moves_both_videos(browser: Any, report: Path) -> None:
             "e.dispatchEvent(new Event('input', {bubbles: true})); })()"
         )
         settle(browser)
-        assert (shown_frame(browser, LEFT), shown_frame(browser, RIGHT)) == both
+        for video, frame in zip((LEFT, RIGHT), both, strict=True):
+            assert_shown(browser, frame, video)
         assert [int(n) for n in browser.js(PLAYHEADS)] == list(both)
 
 
@@ -484,7 +494,8 @@ def test_both_timelines_have_one_scale_and_seek_both(browser: Any, report: Path)
     assert ends == ["100%", "62.5%"]
     browser.click(".pair > section:nth-child(2) .axis", across=place(12))
     settle(browser)
-    assert (shown_frame(browser, LEFT), shown_frame(browser, RIGHT)) == (12, 12)
+    assert_shown(browser, 12, LEFT)
+    assert_shown(browser, 12, RIGHT)
     browser.click(".both input", across=0.2)
     at = int(browser.js("document.querySelector('.both input').value"))
     browser.key("ArrowRight")
