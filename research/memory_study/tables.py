@@ -53,6 +53,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         ("Success and satisfied checkpoints by updates", _by_updates(rows)),
         *((f"Minus *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
         ("The sealed test", _sealed(rows)),
+        *((f"The sealed test, minus *{name}*", _differences(rows, name, SEALED)) for name in REFERENCES),
         ("What a cell takes, beside other work", _costs(rows)),
     ]
     return "\n\n".join([f"## {suite}", *(f"### {title}\n\n{table}" for title, table in parts if table)])
@@ -312,14 +313,15 @@ def _sealed(rows: Rows) -> str:
     return markdown(("", "training seeds", "SR", "95 %", *METRICS[1:]), lines) if lines else ""
 
 
-def _differences(rows: Rows, reference: str) -> str:
-    """Return a table of each row against a reference, by the training seeds that both have."""
-    base = {cell.seed: cell for cell in rows.get(reference, ())}
+def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
+    """Return a table of each row against a reference, by the training seeds that both have evaluated so."""
+    base = {cell.seed: cell for cell in rows.get(reference, ()) if evaluated(cell, part)}
     found = {}
     for row, own in rows.items():
-        shared = [cell for cell in own if cell.seed in base]
+        shared = [cell for cell in own if cell.seed in base and evaluated(cell, part)]
         if row != reference and shared:
-            found[row] = contrast(_runs(shared), _runs([base[cell.seed] for cell in shared]), row, reference)
+            others = [base[cell.seed] for cell in shared]
+            found[row] = contrast(_runs(shared, part), _runs(others, part), row, reference)
     return contrasts_table(adjusted(found), reference) if found else ""
 
 

@@ -447,6 +447,12 @@ def test_the_sealed_test_is_asked_for_and_stays(grid: Grid, tmp_path: Path) -> N
     _evaluate(cell, ROLLOUTS, SEALED)
     assert cell.parts == [ROLLOUTS, SEALED], "what was tested is told, whoever reads"
     assert "### The sealed test" in tables(grid, tmp_path, "strict")
+    other = Cell(grid, tmp_path, "strict", "frames, no time", 0, sealed=True)
+    _evaluate(other, ROLLOUTS)
+    assert "sealed test, minus" not in tables(grid, tmp_path, "strict"), "it has not been tested"
+    _evaluate(other, SEALED, solved=8)
+    _, _, told = tables(grid, tmp_path, "strict").partition("### The sealed test, minus *no memory*")
+    assert "frames, no time minus no memory | 10 | +40.0" in told
 
 
 def test_ceilings_are_of_the_tasks_that_are_rolled_out() -> None:
