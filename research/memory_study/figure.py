@@ -47,8 +47,7 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     panels = [(suite, measure) for suite in suites for measure in MEASURES]
     for axis, (suite, measure) in zip(axes[0], panels, strict=True):
         for place, row in enumerate(rows):
-            if row in suites[suite]:
-                _draw_row(axis, place, suites[suite][row], measure)
+            _draw_row(axis, place, suites[suite].get(row), measure)
         axis.set_xlim(0, 100)
         axis.set_title(suite, fontsize=10)
         axis.set_xlabel(MEASURES[measure])
@@ -106,10 +105,11 @@ def draw_curves(grid: Grid, out: Path, suite: str, path: Path) -> Path | None:
     return save(figure, path)
 
 
-def _draw_row(axis: Any, place: int, told: dict[str, Any], measure: str) -> None:
-    of_seeds, without = told[measure], told["without"][measure]
-    if not of_seeds:
+def _draw_row(axis: Any, place: int, told: dict[str, Any] | None, measure: str) -> None:
+    if told is None or not told[measure]:
+        axis.text(1, place, "not run", va="center", fontsize=7, color="grey")
         return
+    of_seeds, without = told[measure], told["without"][measure]
     average = mean(of_seeds)
     axis.barh(place, average, 0.7, color=COLOURS[list(MEASURES).index(measure)], alpha=0.75)
     axis.plot(of_seeds, [place] * len(of_seeds), "o", color="black", markersize=3)
