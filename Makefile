@@ -11,7 +11,7 @@ help: ## list these commands
 setup: ## install uv, .venv and system libraries (quick when there is nothing to do)
 	@scripts/setup
 
-demo: ## evaluate the scripted expert on four tasks; videos and report in outputs/demo
+demo: ## expert on four tasks, two policies on one; videos and report in outputs/demo (4 minutes)
 	@scripts/setup
 	@.venv/bin/memobench demo $(ARGS)
 

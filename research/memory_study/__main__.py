@@ -18,7 +18,7 @@ from lerobot_memobench.io import count_of, write_file
 from lerobot_memobench.jobs.executors import Needs, options_text, read_options, run_jobs
 from lerobot_memobench.jobs.processes import Advance, Job
 from research.command import run
-from research.memory_study.cells import Cell, Demonstrations, choose_rates, tuning
+from research.memory_study.cells import CELLS, Cell, Demonstrations, choose_rates, tuning
 from research.memory_study.figure import draw_all
 from research.memory_study.grid import Grid, chosen, read_grid
 from research.memory_study.tables import named_rollouts, tables
@@ -66,7 +66,11 @@ def study(
     if keep is not None:
         if keep.resolve() == out.resolve():
             raise MemobenchError(f"--keep {keep} is --out too; name another folder, which gets what is small")
+        if keep.exists() and not (keep / CELLS).is_dir() and not (keep.is_dir() and not any(keep.iterdir())):
+            raise MemobenchError(f"--keep {keep} is no folder of a study; name one that is, or a new one")
         kept = [folder for cell in cells for folder in cell.keep(keep)]
+        if not kept:
+            raise MemobenchError(f"--out {out} holds no evaluated cell of those asked for, so nothing is kept")
         for of_suite in data:
             of_suite.keep(keep)
         say(f"{count_of(len(kept), 'log')} are kept in {keep}")

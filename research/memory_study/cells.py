@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +19,9 @@ from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.run.arguments import split_arguments
 from research.learning.stages import Cost, check_training, ended, kept_of, run_once, train_once
 from research.memory_study.grid import POLICY, ROLLOUTS, SEALED, TRAINING, Grid, after, folder_name, word_of
+
+CELLS = "cells"
+"""The folder of all cells in a study's."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ class Cell:
     @property
     def folder(self) -> Path:
         """Where everything of the cell is."""
-        part = "cells" if self.tuned is None else f"tuning/{self.tuned:g}"
+        part = CELLS if self.tuned is None else f"tuning/{self.tuned:g}"
         return self.out / part / self.suite / f"{folder_name(self.row)}-{self.seed}"
 
     @property
@@ -239,7 +242,7 @@ def ended_as(log: Path, words: Sequence[str]) -> bool:
     told = kept_of(log)
     if told is None:
         return False
-    was, wanted = (_in_any_folder(one) for one in (told["words"], words))
+    was, wanted = (in_any_folder(one) for one in (told["words"], words))
     if was != wanted:
         differ = [word for word in (*was, *wanted) if (word in was) != (word in wanted)] or ["their order"]
         raise MemobenchError(
@@ -255,7 +258,8 @@ def _copy(source: Path, target: Path) -> None:
     write_file(target, source.read_text())
 
 
-def _in_any_folder(words: Sequence[str]) -> list[str]:
+def in_any_folder(words: Iterable[str]) -> list[str]:
+    """Return the words of a command without what is no difference: in which folder a study is, and episode numbers."""
     told = [word for word in words if not word.startswith("dataset.episodes=")]
     return [re.sub(r"(?s)^([\w.]+=)?.*/(?=(cells|tuning|demonstrations)/)", r"\1", word) for word in told]
 

@@ -18,7 +18,7 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.learning.results import adjusted, average_success, contrast, contrasts_table, episodes_of, markdown
-from research.memory_study.cells import Cell
+from research.memory_study.cells import Cell, in_any_folder
 from research.memory_study.grid import AFTER, ROLLOUTS, SEALED, TRAINING, Grid, after, word_of
 
 REFERENCES = ("no memory", "clock only", "frames")
@@ -91,8 +91,13 @@ def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
     found: dict[str, list[Cell]] = {}
     for title, (row, told) in zip(titles(grid), grid.rows.items(), strict=True):
         for cell in (Cell(grid, out, suite, row, seed) for seed in range(told.seeds)):
-            cell.done(TRAINING)  # once, for all its evaluations
+            trained = cell.done(TRAINING)  # once, for all its evaluations
             if evaluated(cell, ROLLOUTS):
+                if not trained:
+                    raise MemobenchError(
+                        f"{cell.evaluation(ROLLOUTS)} is of a training that {cell.log(TRAINING).with_suffix('.json')} "
+                        f"does not tell to have ended; restore that file, or remove {cell.folder}"
+                    )
                 found.setdefault(title, []).append(cell)
     return found
 
@@ -101,8 +106,11 @@ def evaluated(cell: Cell, part: str) -> bool:
     """Return whether a cell's evaluation, or a control, is done.
 
     Raises:
-        MemobenchError: it is of other words than the grid's.
+        MemobenchError: it is of other words than the grid's, or a log is there without them.
     """
+    told, folder = cell.log(part).with_suffix(".json"), cell.evaluation(part)
+    if folder.is_dir() and not told.exists():
+        raise MemobenchError(f"{folder} is there, and {told}, which says by which command, is gone; remove the folder")
     return part in cell.parts and cell.done(part)
 
 
@@ -126,13 +134,25 @@ def _check_policies(rows: Rows) -> None:
 
 
 def report(cell: Cell, part: str) -> dict[str, Any]:
-    """Return the figures of an evaluation, counted from its log."""
-    return _figures(cell.evaluation(part))
+    """Return the figures of an evaluation, counted from its log.
+
+    Raises:
+        MemobenchError: its card tells another command than the cell's, or more rollouts than there are.
+    """
+    return _figures(cell.evaluation(part), tuple(in_any_folder(cell.evaluation_words(part))))
 
 
 @cache
-def _figures(folder: Path) -> dict[str, Any]:
+def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
     (run,) = read_runs([folder])
+    for start in run.card.get("runs") or [{}]:
+        typed = in_any_folder(word for word in start.get("command", ()) if word != "resume=true")
+        if set(typed) != set(words):
+            differ = sorted({*typed} ^ {*words})[0] if typed else "the command"
+            raise MemobenchError(
+                f"{folder} is of another evaluation than its cell's, by its card: {differ[:80]!r} stands in one of "
+                "them alone; remove the folder and evaluate the cell again"
+            )
     asked, there = len(run.protocol["tasks"]) * run.protocol["episodes"], len(run.records)
     if there != asked:
         raise MemobenchError(

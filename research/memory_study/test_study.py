@@ -21,13 +21,14 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import read_rollouts
+from lerobot_memobench.evaluation.records import CARD_FILE, protocol_of_log, read_rollouts
 from lerobot_memobench.jobs.threads import BESIDE
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.tasks.catalogue import resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
 from research.memory_study import cells, figure
+from research.memory_study import tables as tables_module
 from research.memory_study.__main__ import GRID, STUDY, main, planned, study, tables_of
 from research.memory_study.cells import Cell, Demonstrations, choose_rates, chosen_rate, tuning
 from research.memory_study.figure import draw_all
@@ -370,7 +371,18 @@ def _evaluate(cell: Cell, *parts: str, rollouts: int = 10, solved: int = 4, **mo
         right = solved // 2 if part.startswith("after") else solved
         episodes = [_rollout(episode, part == "evidence", right) | more for episode in range(rollouts)]
         write_episodes(cell.evaluation(part), episodes)
+        _write_card(cell, part, episodes)
         _end(cell, part)
+    _end(cell, TRAINING)
+
+
+def _write_card(cell: Cell, part: str, episodes: list[dict[str, Any]]) -> None:
+    """Write of a card what tables read."""
+    card = {
+        "protocol": protocol_of_log(episodes),
+        "runs": [{"command": [*cell.evaluation_words(part), "resume=true"]}],
+    }
+    (cell.evaluation(part) / CARD_FILE).write_text(json.dumps(card))
 
 
 def _end(cell: Cell, part: str) -> None:
@@ -521,8 +533,11 @@ def test_the_page_is_of_the_kept_logs() -> None:
 def test_evidence_without_a_chance_is_in_no_table(grid: Grid, tmp_path: Path) -> None:
     cell = Cell(grid, tmp_path, "strict", "frames, no time", 0)
     for part in (ROLLOUTS, "evidence"):
-        write_episodes(cell.evaluation(part), [{**_rollout(k, part == "evidence"), "chance": None} for k in range(10)])
+        episodes = [{**_rollout(k, part == "evidence"), "chance": None} for k in range(10)]
+        write_episodes(cell.evaluation(part), episodes)
+        _write_card(cell, part, episodes)
         _end(cell, part)
+    _end(cell, TRAINING)
     assert figures_of_rows(grid, tmp_path, "strict")["frames, no time"]["follows"] == []
     assert "frames, no time" in tables(grid, tmp_path, "strict")
 
@@ -543,7 +558,6 @@ def test_what_ended_by_another_grid_is_neither_done_nor_counted(
 ) -> None:
     cell = Cell(grid, tmp_path, "strict", "no memory", 0)
     _evaluate(cell, ROLLOUTS)
-    _end(cell, TRAINING)
     assert cell.finished()
     (tmp_path / "grid.yaml").write_text(SMALL.replace(old, new))
     changed = read_grid(tmp_path / "grid.yaml")
@@ -589,6 +603,9 @@ def test_a_crash_makes_no_demonstrations(grid: Grid, tmp_path: Path, monkeypatch
 def test_rollouts_of_a_policy_that_is_gone_are_told(grid: Grid, tmp_path: Path) -> None:
     cell = Cell(grid, tmp_path, "strict", "no memory", 0)
     _evaluate(cell, ROLLOUTS)
+    cell.log(TRAINING).with_suffix(".json").unlink()
+    with pytest.raises(MemobenchError, match=r"rollouts is of a training that .*training\.json does not tell"):
+        tables(grid, tmp_path, "strict")
     with pytest.raises(MemobenchError, match="rollouts is of a policy that is not in"):
         cell.finished()
 
@@ -606,6 +623,49 @@ def test_a_cell_is_of_one_policy_and_a_policy_of_one_cell(grid: Grid, tmp_path: 
         told(tmp_path / "mixed", "second", "older")
     with pytest.raises(MemobenchError, match="are of one policy"):
         told(tmp_path / "copied", "first", "first")
+
+
+@pytest.mark.parametrize("exchanged", ["another condition", "another row", "no card"])
+def test_a_log_that_was_exchanged_is_refused(grid: Grid, tmp_path: Path, exchanged: str) -> None:
+    cell, other = (Cell(grid, tmp_path, "strict", row, 0) for row in ("frames, no time", "no memory"))
+    _evaluate(cell, ROLLOUTS, "evidence")
+    _evaluate(other, ROLLOUTS)
+    assert tables(grid, tmp_path, "strict")
+    tables_module._figures.cache_clear()
+    source = cell.evaluation("evidence") if exchanged == "another condition" else other.evaluation(ROLLOUTS)
+    if exchanged == "no card":
+        (cell.evaluation(ROLLOUTS) / CARD_FILE).unlink()
+    else:
+        shutil.copytree(source, cell.evaluation(ROLLOUTS), dirs_exist_ok=True)
+    with pytest.raises(MemobenchError, match=r"rollouts is of another evaluation than its cell's"):
+        tables(grid, tmp_path, "strict")
+
+
+def test_a_log_that_nothing_tells_about_is_not_left_out_in_silence(grid: Grid, tmp_path: Path) -> None:
+    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
+    _evaluate(cell, ROLLOUTS)
+    cell.log(ROLLOUTS).with_suffix(".json").unlink()
+    with pytest.raises(MemobenchError, match=r"rollouts is there, and .*rollouts\.json.* is gone"):
+        tables(grid, tmp_path, "strict")
+
+
+def test_a_folder_that_is_no_study_is_not_written_into(
+    grid: Grid, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    told = ["--out", str(out), "--grid", str(tmp_path / "grid.yaml")]
+    _evaluate(Cell(grid, out, "strict", "no memory", 0), ROLLOUTS)
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("")
+    for wrong in (mine, mine / "thesis.tex"):
+        assert main([*told, "--keep", str(wrong)]) == 2
+        assert "is no folder of a study" in capsys.readouterr().err
+    assert [file.name for file in mine.iterdir()] == ["thesis.tex"]
+    assert main([*told, "--only", "seed=1", "--keep", str(tmp_path / "new")]) == 2
+    assert "nothing is kept" in capsys.readouterr().err
+    for _ in range(2):
+        assert main([*told, "--keep", str(tmp_path / "new")]) == 0
 
 
 def test_rows_are_compared_on_the_same_scenes(grid: Grid, tmp_path: Path) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 
+import httpx
 import pytest
+from huggingface_hub.errors import LocalEntryNotFoundError, OfflineModeIsEnabled
 from rich.console import Console, RenderableType
 
-from lerobot_memobench.cli.console import counting
+from lerobot_memobench.cli.console import counting, one_sentence
 from lerobot_memobench.cli.tasks import task_table
 from lerobot_memobench.evaluation.metrics import summarise
 from lerobot_memobench.evaluation.report import table
@@ -75,3 +77,19 @@ def test_a_terminal_shows_a_bar_and_names_only_troubles() -> None:
     assert "2/2" in printed
     assert "a task, seed 2: it slipped" in printed
     assert "seed 1" not in printed
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        httpx.ConnectError("no network", request=httpx.Request("HEAD", "https://hub/outputs/bowl_polcy/config.json")),
+        OfflineModeIsEnabled("Cannot reach https://hub/outputs/bowl_polcy/config.json: offline mode is enabled."),
+    ],
+)
+def test_a_misspelt_folder_is_seen_in_what_the_hub_was_asked_for(error: Exception) -> None:
+    outer = LocalEntryNotFoundError("an error happened while trying to locate the file")
+    outer.__cause__ = error
+    told = one_sentence(outer)
+    assert told is not None
+    assert told.startswith("what was asked for is not on this machine")
+    assert "(https://hub/outputs/bowl_polcy/config.json: an error happened" in told

@@ -330,6 +330,7 @@ def test_render_is_annotated() -> None:
         ({"horizon": 0}, "env.horizon is 0"),
         ({"render_every": 0}, "env.render_every is 0"),
         ({"videos": -2}, "env.videos is -2"),
+        ({"replan_steps": 0}, "env.replan_steps is 0"),
         ({"fps": 30}, "control rate is 20"),
     ],
 )

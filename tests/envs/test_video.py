@@ -210,7 +210,7 @@ def drawn_anew(images: dict[str, np.ndarray], episode: SimpleNamespace) -> np.nd
             font = load_font(size=12)
             draw.text((x + 10, 44), checkpoint.operation, fill=colour, font=font, anchor="mm")
         x += 26
-    now = "watch the prompt" if prompt else "done" if episode.success else episode.subgoal()
+    now = "watch the prompt" if prompt else "done" if episode.success else f"next: {episode.subgoal()}"
     text, font = fitted(draw, now, width - x - 14)
     draw.text((x + 6, 44), text, fill=PURPLE if prompt else TEXT, font=font, anchor="lm")
     return np.vstack([np.asarray(band), pictures])

@@ -444,7 +444,9 @@ def test_logged_classes_win_and_missing_ones_are_derived() -> None:
     assert failure_of({**base, "failure": "reference_drift"}) == "reference_drift"
     assert failure_of({**base, "failure": None}) == "storage_failure"
     assert failure_of(base) == "storage_failure"
-    assert failure_of({**base, "success": True, "failure": "storage_failure"}) is None
+    assert failure_of({**base, "success": True, "failure": None}) is None
+    with pytest.raises(MemobenchError, match="is a success and has the failure class 'storage_failure'"):
+        failure_of({**base, "success": True, "failure": "storage_failure"})
 
 
 def test_an_unknown_class_names_the_nearest() -> None:

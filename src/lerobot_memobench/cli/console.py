@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from enum import StrEnum
 from functools import partial
@@ -183,15 +184,16 @@ def one_sentence(error: BaseException) -> str | None:
             f"{BACKBONE}=null begins with random ones, a checkpoint brings its own all the same"
         )
     hub = next((found for found in errors if _is_hub_error(found)), None)
+    told = "" if hub is None else f"{_address(errors)}{_line(hub)[:200]}"
     if hub is not None and any(_came_through(found, "lerobot.datasets.") for found in errors):
         return (
-            f"the dataset is not on this machine and could not be fetched from the hub ({_line(hub)[:200]}); name a "
+            f"the dataset is not on this machine and could not be fetched from the hub ({told}); name a "
             "folder that is here, dataset=<folder>, or make one: `memobench generate --tasks object --episodes 5 --out "
             "outputs/demonstrations`, then dataset=outputs/demonstrations"
         )
     if hub is not None:
         return (
-            f"what was asked for is not on this machine and could not be fetched from the hub ({_line(hub)[:200]}); "
+            f"what was asked for is not on this machine and could not be fetched from the hub ({told}); "
             "name a folder that is here: dataset=<folder> or policy=<folder>"
         )
     return None
@@ -210,6 +212,16 @@ def _is_hub_error(error: BaseException) -> bool:
     return isinstance(
         error, hub.HfHubHTTPError | hub.LocalEntryNotFoundError | hub.OfflineModeIsEnabled | httpx.TransportError
     )
+
+
+def _address(errors: Sequence[BaseException]) -> str:
+    """Return what the hub was asked for and a colon, "" where no error tells it: a misspelt folder is seen there."""
+    for error in errors:
+        with suppress(AttributeError, RuntimeError):  # others than httpx's, and those before anything was asked
+            return f"{error.request.url}: "  # type: ignore[attr-defined]
+        if offline := re.search(r"Cannot reach (\S+): ", str(error)):
+            return f"{offline[1]}: "
+    return ""
 
 
 def _line(error: BaseException) -> str:

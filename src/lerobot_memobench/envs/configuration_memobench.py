@@ -138,6 +138,8 @@ class MemobenchEnvConfig(EnvConfig):
             check_choice(f"env.{name}", value, known)
         check_counts("env.", horizon=self.horizon, render_every=self.render_every)
         check_pacing("env.", self.pause_steps, self.speed)
+        if self.replan_steps is not None:
+            check_counts("env.", replan_steps=self.replan_steps)
         if self.videos is not None and self.videos < EVERY:
             raise MemobenchError(f"env.videos is {self.videos}; expected a number of episodes from 0 on, or -1 for all")
         if self.task is not None and self.tasks != "all":

@@ -71,7 +71,7 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     prompt = episode.phase == PROMPT
     operations = tuple(checkpoint.operation for checkpoint in episode.task.checkpoints)
     done = 0 if prompt else episode.progress.index
-    now = "watch the prompt" if prompt else "done" if episode.success else episode.subgoal()
+    now = "watch the prompt" if prompt else "done" if episode.success else f"next: {episode.subgoal()}"
     frame[:BAND] = _band(width, episode.task.language, operations, done, now, prompt)
     pieces = ("prompt ", *str(episode.step_index)) if prompt else ("step ", *str(episode.exec_steps))
     # Only as wide as the clock is, so that it covers nothing.

@@ -280,10 +280,18 @@ def failure_of(record: Record) -> str | None:
 
     A log without the class gets it from its checkpoints. Drift cannot be told from them, so it is then never
     named.
+
+    Raises:
+        MemobenchError: the class is unknown, or stands beside a success.
     """
-    if record["success"]:
-        return None
     logged = record.get("failure")
+    if record["success"]:
+        if logged is not None:
+            raise MemobenchError(
+                f"a rollout of {record['task']!r} is a success and has the failure class {logged!r}; expected one of "
+                "both: the log was changed or damaged, evaluate again"
+            )
+        return None
     if logged is None:
         checkpoints = record["checkpoints"]
         return classify([c["operation"] for c in checkpoints], [c["first_step"] for c in checkpoints], False)
