@@ -73,7 +73,7 @@ def study(
             raise MemobenchError(f"--out {out} holds no evaluated cell of those asked for, so nothing is kept")
         for of_suite in data:
             of_suite.keep(keep)
-        say(f"{count_of(len(kept), 'log')} are kept in {keep}")
+        say(f"kept in {keep}: {count_of(len(kept), 'log')}")
     if page is not None:
         text = tables_of(read, out)
         if not text:

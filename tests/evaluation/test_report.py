@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes, write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
@@ -166,6 +166,15 @@ def test_a_compressed_evaluation_is_read_like_any(tmp_path: Path, capsys: pytest
     assert main(["compare", str(open_), str(archive)]) == 0
     assert "2 episodes in both" in capsys.readouterr().out
     assert sorted(archive.iterdir()) == before
+
+
+def test_a_folder_above_a_log_or_the_log_itself_is_told_where_it_is(tmp_path: Path) -> None:
+    write_episodes(tmp_path / "frames-0" / "rollouts", [])
+    folder = tmp_path / "frames-0" / "rollouts"
+    with pytest.raises(MemobenchError, match=f"holds no episode log; .*; there is one in {folder}$"):
+        read_episodes(tmp_path)
+    with pytest.raises(MemobenchError, match=f"is not a folder; .*, such as {folder}$"):
+        read_episodes(folder / "episodes.jsonl")
 
 
 @pytest.mark.parametrize(

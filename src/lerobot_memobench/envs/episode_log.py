@@ -297,6 +297,13 @@ def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:
     return notes
 
 
+def _log_below(directory: Path) -> str:
+    """Return a hint at the first log in a folder's folders, or theirs; "" where there is none."""
+    logs = (file for depth in ("*", "*/*") for file in sorted(directory.glob(f"{depth}/{MERGED_FILE}*")))
+    first = next(logs, None)
+    return "" if first is None else f"; there is one in {first.parent}"
+
+
 def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
     """Return all lines logged under ``directory``, sorted by task, episode and referent; also of episodes not run.
 
@@ -310,12 +317,13 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
     """
     directory = Path(directory)
     if not directory.is_dir():
-        raise MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written")
+        hint = f", such as {directory.parent}" if directory.is_file() and _log_files(directory.parent) else ""
+        raise MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written{hint}")
     files = _log_files(directory)
     if not files:
         raise MemobenchError(
             f"{directory} holds no episode log; expected {MERGED_FILE} or {EPISODES_FOLDER}/*.jsonl, as an "
-            "evaluation writes them"
+            f"evaluation writes them{_log_below(directory)}"
         )
     found: list[str] = []
     policies: dict[str | None, tuple[Path, dict[str, Any]]] = {}
