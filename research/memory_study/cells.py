@@ -226,6 +226,11 @@ class Cell:
         policy = f"policy={kept.get(part, self.policy)}"
         return [*command, policy, *_last_of_each(told), f"output_dir={self.evaluation(part)}"]
 
+    def carded_words(self, part: str) -> list[str]:
+        """Return the command that an evaluation's card tells; of the sealed test, what that runs."""
+        words = self.evaluation_words(part)
+        return ["lerobot", "eval", "env=memobench", *words[2:], f"split={SEALED}"] if part == SEALED else words
+
     def costs(self) -> dict[str, Cost]:
         """Return what each part has taken so far."""
         found = {part: kept_of(self.log(part)) for part in (TRAINING, *self.parts)}

@@ -139,7 +139,7 @@ def report(cell: Cell, part: str) -> dict[str, Any]:
     Raises:
         MemobenchError: its card tells another command than the cell's, or more rollouts than there are.
     """
-    return _figures(cell.evaluation(part), tuple(in_any_folder(cell.evaluation_words(part))))
+    return _figures(cell.evaluation(part), tuple(in_any_folder(cell.carded_words(part))))
 
 
 @cache

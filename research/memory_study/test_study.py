@@ -380,7 +380,7 @@ def _write_card(cell: Cell, part: str, episodes: list[dict[str, Any]]) -> None:
     """Write of a card what tables read."""
     card = {
         "protocol": protocol_of_log(episodes),
-        "runs": [{"command": [*cell.evaluation_words(part), "resume=true"]}],
+        "runs": [{"command": [*cell.carded_words(part), "resume=true"]}],
     }
     (cell.evaluation(part) / CARD_FILE).write_text(json.dumps(card))
 
