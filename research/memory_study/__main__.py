@@ -66,7 +66,7 @@ def study(
     if keep is not None:
         if keep.resolve() == out.resolve():
             raise MemobenchError(f"--keep {keep} is --out too; name another folder, which gets what is small")
-        if keep.exists() and not (keep / CELLS).is_dir() and not (keep.is_dir() and not any(keep.iterdir())):
+        if keep.exists() and not (keep / CELLS).is_dir() and (not keep.is_dir() or any(keep.iterdir())):
             raise MemobenchError(f"--keep {keep} is no folder of a study; name one that is, or a new one")
         kept = [folder for cell in cells for folder in cell.keep(keep)]
         if not kept:

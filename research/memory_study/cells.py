@@ -247,12 +247,11 @@ def ended_as(log: Path, words: Sequence[str]) -> bool:
     told = kept_of(log)
     if told is None:
         return False
-    was, wanted = (in_any_folder(one) for one in (told["words"], words))
-    if was != wanted:
-        differ = [word for word in (*was, *wanted) if (word in was) != (word in wanted)] or ["their order"]
+    differ = difference(told["words"], words)
+    if differ is not None:
         raise MemobenchError(
             f"{log.with_suffix('.json')} is of another command than the study's file asks for: "
-            f"{differ[0][:80]!r} stands in one of them alone; name another --out or "
+            f"{differ[:80]!r} stands in one of them alone; name another --out or "
             "--grid, or remove what the command has made"
         )
     return told["ended"]
@@ -263,8 +262,15 @@ def _copy(source: Path, target: Path) -> None:
     write_file(target, source.read_text())
 
 
-def in_any_folder(words: Iterable[str]) -> list[str]:
-    """Return the words of a command without what is no difference: in which folder a study is, and episode numbers."""
+def difference(was: Iterable[str], wanted: Iterable[str]) -> str | None:
+    """Return the first word that stands in one of two commands alone, None where they are alike in any folder."""
+    one, other = _in_any_folder(was), _in_any_folder(wanted)
+    if one == other:
+        return None
+    return next((word for word in (*one, *other) if (word in one) != (word in other)), "their order")
+
+
+def _in_any_folder(words: Iterable[str]) -> list[str]:
     told = [word for word in words if not word.startswith("dataset.episodes=")]
     return [re.sub(r"(?s)^([\w.]+=)?.*/(?=(cells|tuning|demonstrations)/)", r"\1", word) for word in told]
 

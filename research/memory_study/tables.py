@@ -18,7 +18,7 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.learning.results import adjusted, average_success, contrast, contrasts_table, episodes_of, markdown
-from research.memory_study.cells import Cell, in_any_folder
+from research.memory_study.cells import Cell, difference
 from research.memory_study.grid import AFTER, ROLLOUTS, SEALED, TRAINING, Grid, after, word_of
 
 REFERENCES = ("no memory", "clock only", "frames")
@@ -139,16 +139,15 @@ def report(cell: Cell, part: str) -> dict[str, Any]:
     Raises:
         MemobenchError: its card tells another command than the cell's, or more rollouts than there are.
     """
-    return _figures(cell.evaluation(part), tuple(in_any_folder(cell.carded_words(part))))
+    return _figures(cell.evaluation(part), tuple(cell.carded_words(part)))
 
 
 @cache
 def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
     (run,) = read_runs([folder])
     for start in run.card.get("runs") or [{}]:
-        typed = in_any_folder(word for word in start.get("command", ()) if word != "resume=true")
-        if set(typed) != set(words):
-            differ = sorted({*typed} ^ {*words})[0] if typed else "the command"
+        differ = difference((word for word in start.get("command", ()) if word != "resume=true"), words)
+        if differ is not None:
             raise MemobenchError(
                 f"{folder} is of another evaluation than its cell's, by its card: {differ[:80]!r} stands in one of "
                 "them alone; remove the folder and evaluate the cell again"
