@@ -11,6 +11,7 @@ import re
 import shutil
 import struct
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,12 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class, make_policy_config
+from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
+from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.conformance.subject import load_subject
 from lerobot_memobench.envs.command_line import read_rename_map
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
@@ -51,6 +55,7 @@ TASK = "turn_on_the_stove_and_turn_it_off"
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 CAMERAS = ("image", "wrist_image")
 SHOWN = env_to_policy_features(MemobenchEnvConfig())
+PI0_FAST = PI0FastConfig.action_tokenizer_name
 TINY: dict[str, dict[str, Any]] = {
     "act": {
         "pretrained_backbone_weights": None,
@@ -278,6 +283,91 @@ def test_weights_of_a_repository_are_asked_for_where_lerobot_goes_on_without(mon
     with pytest.raises(MemobenchError, match=r"nobody/pi holds no weights .* pi05 would go on with random ones"):
         check_weights("nobody/pi", config("pi05"))
     check_weights("nobody/act", config())  # LeRobot refuses it by itself
+
+
+def test_a_configuration_of_other_shapes_is_refused_before_memory_is_reserved(tmp_path: Path) -> None:
+    """These widths would take terabytes."""
+    checkpoint = saved(tmp_path / "act", config())
+    policy = PreTrainedConfig.from_pretrained(checkpoint)
+    policy.dim_feedforward = 10**10  # type: ignore[attr-defined]
+    ours = tmp_path / "ours"
+    shutil.copytree(shipped_policies()["memobench_small"], ours)
+    held = json.loads((ours / "config.json").read_text())
+    (ours / "config.json").write_text(json.dumps(held | {"max_action_dim": 10**10}))
+    for refused in (lambda: check_weights(checkpoint, policy), lambda: MemobenchMemPolicy.from_pretrained(ours)):
+        with pytest.raises(MemobenchError, match=r"[1-9]\d* have another shape"):
+            refused()
+
+
+# --- processors ---
+
+PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
+
+
+@dataclasses.dataclass
+class Stranger(ProcessorStep):
+    """A step of a package that is no plugin."""
+
+    def __call__(self, transition: Any) -> Any:
+        raise AssertionError("it was built and called")
+
+    def transform_features(self, features: Any) -> Any:
+        raise AssertionError
+
+
+def poisoned(checkpoint: Path, file: str, **step: Any) -> None:
+    held = json.loads((checkpoint / file).read_text())
+    held["steps"].insert(0, step)
+    (checkpoint / file).write_text(json.dumps(held))
+
+
+@pytest.mark.parametrize("kind", ["act", "memobench_mem"])
+@pytest.mark.parametrize("file", PIPELINES)
+def test_a_checkpoint_runs_no_code(
+    kind: str, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither by a command that loads it, nor by a policy of ours that is loaded by hand."""
+    checkpoint, mark = tmp_path / "it", tmp_path / "mark"
+    if kind == "act":
+        saved(checkpoint, config())
+    else:
+        shutil.copytree(shipped_policies()["memobench_small"], checkpoint)
+    poisoned(checkpoint, file, **{"class": "subprocess.check_call", "config": {"args": ["touch", str(mark)]}})
+    monkeypatch.chdir(tmp_path)
+    held = (f"policy={checkpoint}", "device=cpu", "output_dir=out")
+    for words in (["eval", "env=memobench", f"tasks={TASK}", *held], ["train", "dataset=a/b", "steps=1", *held]):
+        assert main(words) == 2
+        assert "subprocess.check_call" in capsys.readouterr().err
+    with pytest.raises(MemobenchError, match="check_call"):
+        load_subject([f"policy={checkpoint}"], tmp_path)
+    if kind == "memobench_mem":
+        with pytest.raises(MemobenchError, match="check_call"):
+            MemobenchMemPolicy.from_pretrained(checkpoint)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("step", "named"),
+    [
+        ({"registry_name": "no_such_step"}, "no package registers"),
+        ({"registry_name": "strangers"}, "test_compatibility registers"),
+        ({"registry_name": "rename_observations_processor", "class": "os.system"}, "os.system"),
+        ({"registry_name": "rename_observations_processor", "config": {"a": [{"_target_": "os.system"}]}}, "_target_"),
+        ({"registry_name": "action_tokenizer_processor", "config": {"action_tokenizer_name": "a/b"}}, "a/b"),
+        ({"registry_name": "action_tokenizer_processor", "config": {"action_tokenizer_name": PI0_FAST}}, None),
+        ({"registry_name": "pi05_prepare_state_tokenizer_processor_step"}, None),
+        ({"registry_name": "memobench_gather_memory"}, None),
+    ],
+)
+def test_steps_are_registered_by_installed_packages(step: dict[str, Any], named: str | None, tmp_path: Path) -> None:
+    ProcessorStepRegistry.register("strangers")(Stranger)
+    checkpoint = saved(tmp_path / "it", config())
+    poisoned(checkpoint, PIPELINES[0], **step)
+    try:
+        with nullcontext() if named is None else pytest.raises(MemobenchError, match=named):
+            check_checkpoint(str(checkpoint))
+    finally:
+        ProcessorStepRegistry.unregister("strangers")
 
 
 # --- forms of earlier versions ---

@@ -25,7 +25,7 @@ STEP = {
 }
 FILES = {
     "config.json": {"type": "act", "chunk_size": 50},
-    "policy_preprocessor.json": {"name": "before", "steps": [{"registry_name": "rename"}, STEP]},
+    "policy_preprocessor.json": {"name": "before", "steps": [{"registry_name": "rename_observations_processor"}, STEP]},
     "policy_postprocessor.json": {"name": "after", "steps": [STEP]},
     "train_config.json": {"dataset": {"repo_id": "me/it", "root": None, "episodes": None}, "steps": 5},
 }

@@ -20,6 +20,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import check_clock, object
 from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, obs_type_of, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import SHORT_FORMS, read_arguments, split_arguments
 from lerobot_memobench.run.plan import policy_config
@@ -172,6 +173,8 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None)
     if not set(CLOCK) <= set(features):
         raise MemobenchError(f"{dataset.root} has no {CLOCK[0]}; name a dataset of `memobench generate`, or none")
     path = config.pretrained_path
+    if path is not None:
+        check_weights(path, config)
     torch.manual_seed(0)
     policy = policies.make_policy(config, ds_meta=dataset.meta)
     if path is None:

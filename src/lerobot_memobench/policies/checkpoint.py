@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -137,7 +138,8 @@ def check_checkpoint(path: str) -> None:
     if not folder.is_dir():
         if looks_local(path):
             raise MemobenchError(f"the checkpoint folder {path} does not exist")
-        return  # a repository: LeRobot fetches it
+        check_processors(path)
+        return  # a repository: LeRobot fetches the rest
     checkpoint_type(path)
     if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
         raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
@@ -146,6 +148,26 @@ def check_checkpoint(path: str) -> None:
         for step in read_json(folder / name, Processor).get("steps", []):
             if str(step.get("registry_name", "")).endswith("normalizer_processor"):
                 _check_statistics(folder, name, step)
+    check_processors(path)
+
+
+def check_processors(path: str | Path, revision: str | None = None) -> None:
+    """Refuse processors that name other code than registered steps (`processor_steps`); nothing is built.
+
+    Args:
+        path: a checkpoint folder, or a repository, whose processor files are fetched now.
+
+    Raises:
+        MemobenchError: a step is refused.
+    """
+    from lerobot_memobench.policies.processor_steps import check_step
+
+    held = _file_of(path, CONFIG_FILE, revision)
+    kind = None if held is None else read_json(held).get("type")
+    for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
+        file = _file_of(path, name, revision)
+        for step in [] if file is None else read_json(file, Processor).get("steps", []):
+            check_step(file, step, kind)
 
 
 def _check_form(folder: Path) -> None:
@@ -160,11 +182,12 @@ def _check_form(folder: Path) -> None:
         )
 
 
-def check_weights(path: str, policy: PreTrainedConfig) -> None:
-    """Refuse weights that are not all there: LeRobot goes on with random numbers in their place, and warns at most.
+def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
+    """Refuse weights that are not all there, or not of the shapes that the configuration asks for.
 
-    They are compared with the policy built without memory for its weights. One that cannot be built so (its parts come
-    from the hub) and the project's own, which load exactly, are left to themselves.
+    LeRobot reserves whatever the configuration asks for, and goes on with random numbers where weights are missing.
+    The weights are compared with the policy built without memory for its weights. One that cannot be built so (its
+    parts come from the hub) is left to LeRobot.
 
     Args:
         path: a checkpoint folder, or a repository, whose weights are fetched now. policy: its configuration.
@@ -172,9 +195,9 @@ def check_weights(path: str, policy: PreTrainedConfig) -> None:
     Raises:
         MemobenchError: weights are missing, or have other shapes.
     """
-    if policy.use_peft or type(policy).__module__.partition(".")[0] == __name__.partition(".")[0]:
+    if policy.use_peft:
         return
-    file = _file_of(path, WEIGHTS_FILE)
+    file = _file_of(path, WEIGHTS_FILE, revision)
     if file is None:
         if policy.type in GO_ON_WITHOUT:
             raise MemobenchError(
@@ -195,12 +218,17 @@ def check_weights(path: str, policy: PreTrainedConfig) -> None:
     for name in built.state_dict():
         names.setdefault(id(wanted[name]), []).append(name)
     missing = [same[0] for same in names.values() if not any(name in tensors for name in same)]
+    if type(policy).__module__.startswith(f"{__package__}."):
+        # Ours loads exactly, also weights of earlier names and without the heads of an alignment; it may not reserve
+        # more for them than the file holds.
+        reserved = sum(math.prod(wanted[name].shape) for name in missing)
+        missing = missing if reserved > sum(map(math.prod, found.values())) else []
     wrong = [name for name in built.state_dict() if name in tensors and tensors[name] != tuple(wanted[name].shape)]
     if missing or wrong:
         raise MemobenchError(
             f"the weights of the checkpoint {path} are not those of its policy ({policy.type}): {len(missing)} of "
             f"{len(names)} are missing and {len(wrong)} have another shape, the first being {(missing + wrong)[0]}; "
-            "LeRobot would go on with random numbers there: copy it whole or train it again"
+            "copy it whole or train it again"
         )
 
 
@@ -296,7 +324,8 @@ def _built_empty(policy: PreTrainedConfig) -> Any | None:
 
     config = copy.deepcopy(policy)
     config.device = "meta"
-    for loads in ("pretrained_backbone_weights", "load_vlm_weights"):  # what the checkpoint's replace
+    # What the checkpoint's weights replace, and a detector, which is none of them.
+    for loads in ("pretrained_backbone_weights", "load_vlm_weights", "base_weights", "detector"):
         if hasattr(config, loads):
             setattr(config, loads, None)
     try:
@@ -311,7 +340,7 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
     import torch
 
     renamed = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if renamed is None:
+    if renamed is None or type(policy).__module__.startswith(f"{__package__}."):
         return shapes
     found = renamed({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, policy.config)
     return {name if name.startswith("model.") else f"model.{name}": tuple(value.shape) for name, value in found.items()}

@@ -41,6 +41,8 @@ from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_FILE
 from lerobot_memobench.policies.checkpoint import (
     as_trained,
     check_as_begun,
+    check_processors,
+    check_weights,
     checkpoint_folder,
     checkpoint_type,
     differing,
@@ -154,6 +156,10 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
     arguments = with_own_memory(arguments)
     policy = policy_config(arguments)
     check_memory_settings(arguments, policy)
+    path = arguments.get("policy.path")
+    if path is not None and policy is not None:
+        with quiet():
+            check_weights(path, as_trained(path, policy))
     check_observations(policy, env_config(arguments))
     steps = whole_number(arguments.get("steps"))
     if steps is not None and steps < 2000 and arguments.get("resume") != "true":
@@ -332,6 +338,7 @@ def check_same_training(arguments: LerobotArguments) -> None:
     checkpoint = _gone_on_with(arguments)
     if checkpoint is None:
         return
+    check_processors(checkpoint)
     _check_same_dataset(arguments, checkpoint)
     given = overrides("policy", arguments.flags)
     if not given:

@@ -21,6 +21,7 @@ from lerobot_memobench.policies.checkpoint import (
     PREPROCESSOR_FILE,
     WEIGHTS_FILE,
     Processor,
+    check_processors,
     checkpoint_file,
     read_json,
     statistics_shapes,
@@ -41,8 +42,9 @@ def read_config(source: str | Path, config: PreTrainedConfig | None, revision: s
     """Return the configuration that a checkpoint is loaded with: ``config``, or its own.
 
     Raises:
-        MemobenchError: it is another policy's, or was trained with another visual encoder.
+        MemobenchError: it is another policy's, was trained with another visual encoder, or its processors name code.
     """
+    check_processors(source, revision)
     found = PreTrainedConfig.from_pretrained(source, revision=revision) if config is None else config
     if not isinstance(found, MemobenchMemConfig):
         raise MemobenchError(

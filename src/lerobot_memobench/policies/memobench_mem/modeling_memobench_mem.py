@@ -25,7 +25,7 @@ from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_resumed
+from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_resumed, check_weights
 from lerobot_memobench.policies.compatibility import PICTURE_STEP, cure, require_fresh
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
@@ -621,6 +621,7 @@ class MemobenchMemPolicy(PI05Policy):
                 check_resumed(saved, config)
         trained = as_trained(source, config, revision)
         assert isinstance(trained, MemobenchMemConfig)
+        check_weights(source, trained, revision)
         policy = cls(config, dataset_meta=dataset_meta, load_base=False, draw=remembers_otherwise(config, trained))
         load_weights(policy, path, source, trained)
         policy.to(config.device)
