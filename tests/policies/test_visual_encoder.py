@@ -104,7 +104,7 @@ def test_the_package_encoder_is_the_default_of_small_pixels(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"size": "tiny", "visual_encoder": "package"}, r"size=small --policy\.perception=pixels.*leave it out"),
+        ({"size": "tiny", "visual_encoder": "package"}, "size=small perception=pixels.*leave it out"),
         (
             {"size": "small", "visual_encoder": "package", "image_resolution": (96, 96)},
             f"{SIDE} x {SIDE}.*visual_encoder=random",

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import torch
 import yaml
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
@@ -30,6 +31,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch.utils.data import default_collate
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.datasets import execution_frames
 from lerobot_memobench.datasets.feature_cache.frames import read_frame_table
 from lerobot_memobench.datasets.validate import validate
@@ -186,6 +188,36 @@ def test_histories_do_not_reach_back_into_the_prompt(root: Path) -> None:
     for state in first["observation.state"]:
         assert state.tolist() == whole[START]["observation.state"].tolist()
     assert train[START + 2]["observation.state_is_pad"].tolist() == [False, False, False]
+
+
+@pytest.mark.parametrize("settings", [{}, {"episodes": [1, 2]}, {"eval_split": 0.4}], ids=str)
+@pytest.mark.parametrize("prompt_frames", [True, False])
+def test_samples_out_of_memory_are_lerobots_without_its_pictures(
+    settings: dict[str, Any], prompt_frames: bool, tmp_path: Path
+) -> None:
+    """Equal to the bit, of the same types, history and padding included; no video is opened."""
+    root = write_streams(tmp_path / "streams", frames=9)
+    policy = DiffusionConfig(device="cpu", push_to_hub=False, n_obs_steps=3)
+    config = TrainPipelineConfig(DatasetConfig("memobench/streams", root=str(root), **settings), policy=policy)
+    with trained_on(prompt_frames, "environment_state_agent_pos"):
+        parts = [part for part in lerobot_train.make_train_eval_datasets(config) if part is not None]
+    assert len(parts) == 1 + ("eval_split" in settings)
+    assert "language_persistent" in parts[0].meta.features
+    for part in parts:
+        whole = getattr(part, "dataset", part)
+        pictures = set(whole.meta.camera_keys)
+        assert len(pictures) == 2
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", None)
+            quick = [part[row] for row in range(len(part))]
+        whole.reader.in_memory = None
+        for row, found in enumerate(quick):
+            expected = {name: value for name, value in part[row].items() if name not in pictures}
+            assert set(found) == set(expected)
+            for name, value in expected.items():
+                same = torch.equal(value, found[name]) if isinstance(value, torch.Tensor) else value == found[name]
+                assert same, name
+                assert getattr(value, "dtype", type(value)) == getattr(found[name], "dtype", type(found[name])), name
 
 
 def test_the_held_out_part_has_no_prompt_either(tmp_path: Path) -> None:

@@ -11,21 +11,34 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import FLOW_MATCHING, MemobenchMemConfig
 
 CHUNK = 6
 
 
 def small_config(**fields: Any) -> MemobenchMemConfig:
-    fields = {"chunk_size": CHUNK, "n_action_steps": CHUNK, "num_inference_steps": 2, "memory_frames": 8} | fields
-    return MemobenchMemConfig(device="cpu", push_to_hub=False, **fields)
+    """Return a configuration of few actions, and where they are read, of few denoising steps and remembered frames."""
+    if "none" in (fields.get("memory"), fields.get("memory_fusion")):
+        fields.pop("memory_stride", None)
+    read = MemobenchMemConfig(device="cpu", **fields)
+    usual: dict[str, Any] = {"chunk_size": CHUNK, "n_action_steps": CHUNK}
+    if read.objective == FLOW_MATCHING:
+        usual["num_inference_steps"] = 2
+    if read.memory in ("frames", "subgoal"):
+        usual["memory_frames"] = 8
+    return MemobenchMemConfig(device="cpu", push_to_hub=False, **usual | fields)
+
+
+def opened(root: Path, config: MemobenchMemConfig) -> LeRobotDataset:
+    """Return a dataset as lerobot-train opens it for a policy."""
+    meta = LeRobotDatasetMetadata("memobench/synthetic", root=root)
+    return LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
 
 
 def made_for_training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
     """Policy, preprocessor, postprocessor and dataset, as lerobot-train makes them."""
     config = small_config(**fields)
-    meta = LeRobotDatasetMetadata("memobench/synthetic", root=root)
-    dataset = LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
+    dataset = opened(root, config)
     torch.manual_seed(0)
     policy = make_policy(config, ds_meta=dataset.meta)
     before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)

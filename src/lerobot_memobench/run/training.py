@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import json
 import logging
 import shlex
 import time
@@ -153,7 +154,7 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
     check_numbers(arguments)
     check_dataset(arguments)
     check_same_training(arguments)
-    arguments = with_own_memory(arguments)
+    arguments = without_unread(with_own_memory(arguments))
     policy = policy_config(arguments)
     check_memory_settings(arguments, policy)
     path = arguments.get("policy.path")
@@ -206,6 +207,23 @@ def with_own_memory(arguments: LerobotArguments) -> LerobotArguments:
     }
     for name, value in own.items():
         arguments = arguments.default(f"policy.{name}", value)
+    return arguments
+
+
+def without_unread(arguments: LerobotArguments) -> LerobotArguments:
+    """Return arguments that reset the settings of a checkpoint which nothing reads under the settings asked for.
+
+    What the line itself sets is left to be refused.
+    """
+    if arguments.get("policy.path") is None:
+        return arguments
+    from draccus.utils import ParsingError
+
+    try:
+        policy_config(arguments)
+    except ParsingError as error:
+        for name, value in getattr(error.__cause__, "defaults", {}).items():
+            arguments = arguments.default(f"policy.{name}", json.dumps(value))
     return arguments
 
 
@@ -500,6 +518,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
     @functools.wraps(make)
     def run(config: Any) -> Any:
         from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
+        from lerobot_memobench.datasets.samples import keep_in_memory
         from lerobot_memobench.policies.memobench_mem.sampler import check_transforms
 
         if prompt_frames is not False:
@@ -527,9 +546,22 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
             held_out.reader.trained_with = train.meta
         if held_out is not None and not tested and leave_out_prompts(held_out):
             held_out = ExecutionFrames(held_out)
+        if _reads_no_pictures(config):
+            for dataset in filter(None, (train, held_out)):
+                keep_in_memory(getattr(dataset, "dataset", dataset))
         return train, held_out
 
     return run
+
+
+def _reads_no_pictures(config: Any) -> bool:
+    """Return whether a policy of somebody's is known to read no pictures, of a dataset that lies on the disk."""
+    from lerobot.configs import FeatureType
+
+    inputs = getattr(config.policy, "input_features", None) or {}
+    pictures = any(feature.type is FeatureType.VISUAL for feature in inputs.values())
+    chosen = bool(inputs) and not chooses_inputs(config.policy)  # memobench_mem has samples of its own
+    return chosen and not pictures and not config.dataset.streaming
 
 
 def _check_streaming(config: Any) -> None:

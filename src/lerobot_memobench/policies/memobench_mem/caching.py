@@ -154,8 +154,9 @@ def cameras_of(root: Path) -> list[str]:
 
 
 def _text_encoder(config: MemobenchMemConfig) -> WordTextEncoder | SiglipTextEncoder:
-    assert config.text_encoder is not None  # set by the configuration
-    return make_text_encoder(config.text_encoder, config.dimensions.text_dim, str(config.device))
+    name = "words" if config.align == "none" else config.text_encoder  # without an alignment nothing reads the vectors
+    assert name is not None  # set by the configuration
+    return make_text_encoder(name, config.dimensions.text_dim, str(config.device))
 
 
 def _logged(message: str) -> Progress:

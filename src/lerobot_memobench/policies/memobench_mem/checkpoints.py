@@ -23,6 +23,7 @@ from lerobot_memobench.policies.checkpoint import (
     Processor,
     check_processors,
     checkpoint_file,
+    differing,
     read_json,
     statistics_shapes,
     undamaged,
@@ -80,6 +81,12 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
     if trained.memory == "frames":  # all that there was; a package's memory may have layers of the old names
         weights = _today(weights)
     config, model = cast(MemobenchMemConfig, policy.config), cast(MemoryPI05, policy.model)
+    begins = ["base_weights"] if remembers_otherwise(config, trained) else ["base_weights", "open_gate"]
+    for name, asked, held in differing(config, trained, begins):
+        raise MemobenchError(
+            f"--policy.{name}={asked} would do nothing: it decides how weights begin, and those of '{source}' "
+            f"({name}={held}) go on; leave {name} out, or train from scratch."
+        )
     # A run may change the objective of the one it goes on from; its heads then start anew.
     new = {name for name in policy.state_dict() if name.startswith("alignment.")}
     if remembers_otherwise(config, trained):

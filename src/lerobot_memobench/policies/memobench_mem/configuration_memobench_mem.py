@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,6 +27,7 @@ from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
 from lerobot_memobench.policies.memobench_mem.memory import (
     NONE,
+    OURS,
     find_mechanism,
     mechanism_names,
     read_settings,
@@ -177,18 +178,6 @@ OF_ACTING = _names(
 """Fields that are free where a checkpoint acts. A ``detector`` is no part of it, and its own ``visual_encoder`` has a
 rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` of the environment's, which
 `policies.compatibility` compares with the checkpoint's, and ``freeze_vision_encoder`` has one value here."""
-OF_TRAINING = _names(
-    """
-    detection_noise base_weights open_gate align align_weight subgoal_level shuffle_subgoals
-    shuffle_seed text_encoder feature_cache_dir ema_decay frames_per_episode task_weights
-    train_expert_only warmup_fraction min_lr_ratio gradient_checkpointing time_sampling_beta_alpha
-    time_sampling_beta_beta time_sampling_scale time_sampling_offset optimizer_lr optimizer_betas optimizer_eps
-    optimizer_weight_decay optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
-    push_to_hub repo_id private tags license
-    """
-)
-"""Fields that say how a policy is trained and where it goes: a checkpoint that acts reads none of them, and another
-value is refused there, or its card would tell of a training that never was."""
 SINCE_BEGUN = _names(
     """
     align subgoal_level shuffle_subgoals shuffle_seed text_encoder base_weights train_expert_only
@@ -196,13 +185,86 @@ SINCE_BEGUN = _names(
     optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
     """
 )
-"""Those of `OF_TRAINING` that a training keeps where it is gone on with: they decide the model's parts and what these
+"""Fields that a training keeps where it is gone on with: they decide the model's parts and what these
 learn, or stand in the optimizer's saved state, which LeRobot makes from them once."""
 PI05_ALONE = _names(
     "use_visual_memory use_proprioceptive_memory memory_temporal_attention_every rtc_training_max_delay"
 )
-"""Fields of pi0.5's own in LeRobot's main: its visual memory, and training for real-time chunking. Refused here, and
-not saved, so that a checkpoint goes from one LeRobot to the other."""
+"""Fields of pi0.5's own in LeRobot's main: its visual memory, and training for real-time chunking. They are not saved,
+so that a checkpoint goes from one LeRobot to the other."""
+
+
+def _remembers(config: MemobenchMemConfig, how: Callable[[Any], bool] = lambda _: True) -> bool:
+    return config.memory != NONE and how(find_mechanism(config.memory))
+
+
+READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
+    "perception=objects": (
+        lambda it: it.uses_objects,
+        "detector detection_noise object_classes full_chunk_when_stalled",
+    ),
+    "perception=pixels": (lambda it: not it.uses_objects, "image_resolution empty_cameras"),
+    "a policy that sees pictures": (lambda it: it.uses_pictures, "memory_camera"),
+    "size=small perception=pixels": (lambda it: it.size == "small" and not it.uses_objects, "visual_encoder"),
+    "a training that encodes pictures ahead": (
+        lambda it: it.encodes_ahead or it.needs_every_frame,
+        "feature_cache_dir",
+    ),
+    "a memory": (_remembers, "memory_settings memory_fusion memory_stride tokens_per_frame"),
+    "memory=frames or subgoal": (
+        lambda it: _remembers(it, lambda one: issubclass(one, find_mechanism("frames"))),
+        "memory_frames",
+    ),
+    "a memory of objects other than motion": (
+        lambda it: it.uses_objects and _remembers(it, lambda one: not one.asks_motion),
+        "memory_phase",
+    ),
+    "a memory with memory_fusion=modulation": (
+        lambda it: it.memory != NONE and it.memory_fusion == MODULATION,
+        "open_gate",
+    ),
+    "a memory that learns from texts": (lambda it: it.privileged_memory, "subgoals"),
+    "an alignment": (lambda it: it.align != NONE, "align_weight shuffle_subgoals text_encoder"),
+    "an alignment or a memory that learns from texts": (
+        lambda it: it.align != NONE or it.privileged_memory,
+        "subgoal_level",
+    ),
+    "shuffle_subgoals=true": (lambda it: it.shuffle_subgoals, "shuffle_seed"),
+    "objective=flow_matching": (
+        lambda it: it.objective == FLOW_MATCHING,
+        "num_inference_steps rtc_config time_sampling_beta_alpha time_sampling_beta_beta time_sampling_scale "
+        "time_sampling_offset",
+    ),
+    "use_relative_actions=true": (lambda it: it.use_relative_actions, "relative_exclude_joints"),
+    "policy=pi05": (
+        lambda _: False,
+        "paligemma_variant action_expert_variant n_obs_steps compile_model compile_mode freeze_vision_encoder "
+        "scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr " + " ".join(PI05_ALONE),
+    ),
+}
+"""What alone reads some fields, for messages -> whether a configuration has it, and the fields: each must have its
+default where nothing reads it."""
+RANGES = {
+    **dict.fromkeys(_names("memory_frames memory_stride n_action_steps tokens_per_frame"), (1, math.inf)),
+    **dict.fromkeys(_names("frames_per_episode num_inference_steps"), (1, math.inf)),
+    **dict.fromkeys(_names("min_lr_ratio warmup_fraction"), (0, 1)),
+    **dict.fromkeys(_names("detection_noise align_weight"), (0, math.inf)),
+    "ema_decay": (0, math.nextafter(1, 0)),
+}
+"""Smallest and largest value of fields."""
+
+
+class UnreadError(MemobenchError):
+    """Fields that nothing reads have other values than their defaults.
+
+    Attributes:
+        defaults: those fields -> their defaults.
+    """
+
+    def __init__(self, sentence: str, defaults: Mapping[str, Any]) -> None:
+        super().__init__(sentence)
+        self.defaults = defaults
+
 
 FROM_SIZE: Any = None
 """Default of a field that the size or the perception decides; after construction it is set."""
@@ -216,7 +278,6 @@ class MemobenchMemConfig(PI05Config):
     reads_prompt: ClassVar[bool] = True
     execution_only: ClassVar[bool] = True
     fixed_by_training: ClassVar[tuple[str, ...]] = FIXED
-    of_training_alone: ClassVar[tuple[str, ...]] = OF_TRAINING
     kept_since_begun: ClassVar[tuple[str, ...]] = (*FIXED, *SINCE_BEGUN)
 
     size: str = "tiny"
@@ -352,57 +413,82 @@ class MemobenchMemConfig(PI05Config):
         self._choose("align", tuple(ALIGN_WEIGHTS))
         self._choose("perception", PERCEPTIONS)
         self._choose("subgoal_level", SUBGOAL_LEVELS)
-        self._check_encoders()
+        if self.visual_encoder is None and self.size == "small" and not self.uses_objects:
+            self.visual_encoder = PACKAGE
         self._complete_memory()
+        defaults = self._defaults()
+        for name, value in defaults.items():
+            if getattr(self, name) in (None, {}):
+                setattr(self, name, value)
+        self._choose("objective", OBJECTIVES)
+        # A checkpoint without oracle memory holds the length of prompts without it, which would cut the text off.
+        if self.tokenizer_max_length == self.dimensions.tokenizer_max_length:
+            self.tokenizer_max_length = defaults["tokenizer_max_length"]
+        self._check_read(defaults)
+        if self.objective == REGRESSION:
+            self.num_inference_steps = 1
+        # A checkpoint with align=none holds a weight of 0, with which another objective would change nothing.
+        self.align_weight = self.align_weight or ALIGN_WEIGHTS[self.align]
+        self._check_numbers()  # before LeRobot's main, whose pi0.5 has a memory_stride too
+        super().__post_init__()
+        self._check_perception()
+        self._check_alignment()
+
+    def _defaults(self) -> dict[str, Any]:
+        """Return the defaults that the size, the perception and the memory decide."""
         dims = self.dimensions
-        actions, planned = dims.defaults["n_action_steps"], self.chunk_size or dims.defaults["chunk_size"]
-        defaults = {
+        side, mode = SIDE if self.uses_visual_encoder else dims.vision.image, NormalizationMode(dims.normalization)
+        planned = self.chunk_size or dims.defaults["chunk_size"]
+        room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
+        return {
             **dims.defaults,
-            "n_action_steps": min(actions, planned),
+            "n_action_steps": min(dims.defaults["n_action_steps"], planned),
             "optimizer_lr": dims.learning_rate,
             "tokens_per_frame": TOKENS_PER_FRAME[self.perception],
             "memory_stride": MEMORY_STRIDE if self.decodes_no_video else 1,
             "frames_per_episode": FRAMES_PER_EPISODE if self.decodes_no_video else 1,
             "task_weights": {} if self.decodes_no_video else None,
             "tokenizer_name": dims.tokenizer,
+            "tokenizer_max_length": dims.tokenizer_max_length + room,
             "text_encoder": dims.text_encoder,
+            "normalization_mapping": {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode},
+            "image_resolution": (side, side),
         }
-        for name, value in defaults.items():
-            if getattr(self, name) is None:
-                setattr(self, name, value)
-        self._choose("objective", OBJECTIVES)
-        if not self.normalization_mapping:
-            mode = NormalizationMode(dims.normalization)
-            self.normalization_mapping = {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode}
-        if self.image_resolution is None:
-            side = SIDE if self.uses_visual_encoder else dims.vision.image
-            self.image_resolution = (side, side)
-        # A checkpoint without oracle memory holds the length of prompts without it, which would cut the text off.
-        if self.tokenizer_max_length in (None, dims.tokenizer_max_length):
-            room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
-            self.tokenizer_max_length = dims.tokenizer_max_length + room
-        # A checkpoint with align=none holds a weight of 0, with which another objective would change nothing.
-        if not self.align_weight:
-            self.align_weight = ALIGN_WEIGHTS[self.align]
-        if self.objective == REGRESSION:
-            self.num_inference_steps = 1
-        if not self.freeze_vision_encoder:
-            raise MemobenchError(
-                "--policy.freeze_vision_encoder=false would train the image tower, whose tokens of remembered frames "
-                "are computed once, before training; leave it out."
+
+    def _check_read(self, defaults: Mapping[str, Any]) -> None:
+        """Refuse a field that nothing reads, unless it has its default.
+
+        Args:
+            defaults: those of `_defaults`.
+        """
+        unset = {
+            one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)
+        }
+        # As a recipe or a checkpoint of another memory, objective or alignment may hold them.
+        usual = {"memory_fusion": (NONE, MODULATION), "num_inference_steps": (1,), "align_weight": (0.0,)}
+        found: dict[str, str] = {}
+        for reader, (present, names) in READERS.items():
+            for name in () if present(self) else [one for one in names.split() if one in unset]:
+                known = [unset[name], defaults.get(name), *usual.get(name, ())]
+                value = getattr(self, name)
+                if value not in known and (not isinstance(value, list) or tuple(value) not in known):
+                    found[name] = reader
+        for name, reader in found.items():
+            raise UnreadError(
+                f"--policy.{name}={getattr(self, name)} would do nothing: only {reader} reads it; leave it out, or set "
+                f"it to its default, {json.dumps(unset[name])}.",
+                {one: unset[one] for one in found},
             )
-        self._check_pi05_alone()
-        self._check_numbers()  # before LeRobot's main, whose pi0.5 has a memory_stride too
-        super().__post_init__()
-        self._check_perception()
-        self._check_objectives()
+        if self.memory == NONE:
+            self.memory_fusion = NONE
 
     def _complete_memory(self) -> None:
         """Set and check what makes the memory."""
         if self.memory in (None, "frames"):  # the default, as a recipe or checkpoint may name it
             self.memory = NONE if self.memory_fusion == NONE else "frames"
         if self.memory == NONE:
-            self.memory_fusion, self.memory_settings = NONE, {}
+            if self.memory_settings in [asdict(read_settings(one, {})) for one in OURS if self.memory_settings]:
+                self.memory_settings = {}  # the defaults of the memory of a checkpoint, whose training goes on without
             return
         mechanism = find_mechanism(self.memory)
         fusion = OWN if mechanism.fusion is not None else MODULATION
@@ -414,11 +500,6 @@ class MemobenchMemConfig(PI05Config):
             raise MemobenchError(
                 f"--policy.memory={self.memory} cannot be read by memory_fusion={self.memory_fusion}; pass "
                 f"--policy.memory_fusion={fitting}; policy.memory=none is the baseline without a memory."
-            )
-        if self.memory_frames != MEMORY_FRAMES and not issubclass(mechanism, find_mechanism("frames")):
-            raise MemobenchError(
-                f"--policy.memory_frames={self.memory_frames} is for memory=frames or subgoal, and does nothing with "
-                f"memory={self.memory}; leave it out, and see policy.memory_settings."
             )
         other = settings_of_another(self.memory, self.memory_settings)
         if other is not None:  # a checkpoint's, whose training this memory goes on from
@@ -440,65 +521,21 @@ class MemobenchMemConfig(PI05Config):
                 f"Pass --policy.{field}=<one of {', '.join(known)}>."
             )
 
-    def _check_pi05_alone(self) -> None:
-        pi05s = [one for one in fields(self) if one.name in PI05_ALONE]
-        changed = [one.name for one in pi05s if getattr(self, one.name) != one.default]
-        if changed:
-            raise MemobenchError(
-                f"--policy.{changed[0]} is pi0.5's own, and memobench_mem has a memory of its own; leave it out, or "
-                "train policy=pi05."
-            )
-
-    def _check_encoders(self) -> None:
-        """Refuse a detector or a visual encoder where there is no use for it; set the default encoder."""
-        encodes = self.size == "small" and not self.uses_objects
-        if self.visual_encoder is not None and not encodes:
-            raise MemobenchError(
-                f"--policy.visual_encoder={self.visual_encoder} is for --policy.size=small --policy.perception=pixels, "
-                f"and not for size={self.size} perception={self.perception}; leave it out."
-            )
-        if self.detector is not None and (not self.uses_objects or self.detector == RANDOM):
-            raise MemobenchError(
-                f"--policy.detector={self.detector} cannot be used with perception={self.perception}: with "
-                f"--policy.perception=objects name {PACKAGE} or a file of `python -m research.detector train`; or "
-                "leave it out: then the environment gives the objects."
-            )
-        if encodes:
-            self.visual_encoder = self.visual_encoder or PACKAGE
-
     def _check_numbers(self) -> None:
-        counts = ("memory_frames", "memory_stride", "n_action_steps", "tokens_per_frame", "frames_per_episode")
-        for name in counts:
-            if getattr(self, name) < 1:
-                raise MemobenchError(f"--policy.{name}={getattr(self, name)} must be at least 1.")
-        if not 0.0 <= self.min_lr_ratio <= 1.0:
-            raise MemobenchError(
-                f"--policy.min_lr_ratio={self.min_lr_ratio} must be in [0, 1]; 1 keeps the rate constant."
-            )
+        for name, (least, most) in RANGES.items():
+            if not least <= getattr(self, name) <= most:  # nor NaN
+                raise MemobenchError(
+                    f"--policy.{name}={getattr(self, name)} is out of range; expected at least {least}"
+                    + ("." if most == math.inf else f" and {'at most' if isinstance(most, int) else 'below'} 1.")
+                )
         if any(weight < 0 for weight in (self.task_weights or {}).values()):
             raise MemobenchError(f"--policy.task_weights={self.task_weights} must not hold negative weights.")
-        if not 0.0 <= self.ema_decay < 1.0:
-            raise MemobenchError(f"--policy.ema_decay={self.ema_decay} must be in [0, 1); 0 turns it off.")
-        if self.align_weight is not None and self.align_weight < 0:
-            raise MemobenchError(f"--policy.align_weight={self.align_weight} must not be negative.")
 
     def _check_perception(self) -> None:
-        if self.detection_noise < 0 or (self.detection_noise and not self.uses_objects):
+        if self.detector == RANDOM:
             raise MemobenchError(
-                f"--policy.detection_noise={self.detection_noise} must not be negative, and is noise of objects: leave "
-                "it out, or use --policy.perception=objects."
-            )
-        if self.memory_phase and (
-            not self.uses_objects or self.memory == NONE or find_mechanism(self.memory).asks_motion
-        ):
-            raise MemobenchError(
-                f"--policy.memory_phase=true tells the phase of remembered objects, which perception={self.perception} "
-                f"memory={self.memory} does not remember; leave it out."
-            )
-        if self.full_chunk_when_stalled and not self.uses_objects:
-            raise MemobenchError(
-                "--policy.full_chunk_when_stalled=true is for policies that read objects, which are given the hand's "
-                "pose; leave it out, or use --policy.perception=objects."
+                f"--policy.detector={self.detector} is no detector; name {PACKAGE} or a file of "
+                "`python -m research.detector train`; or leave it out: then the environment gives the objects."
             )
         if not self.uses_objects and self.tokens_per_frame != MEMORY_GRID**2:
             raise MemobenchError(
@@ -519,18 +556,15 @@ class MemobenchMemConfig(PI05Config):
                 f"size {self.size}, so that its patches pool to a 4x4 grid."
             )
 
-    def _check_objectives(self) -> None:
-        if self.objective == REGRESSION and self.rtc_config is not None:
-            raise MemobenchError(
-                "--policy.rtc_config guides the denoising of a chunk, which --policy.objective=regression lacks; "
-                "leave it out, or use --policy.objective=flow_matching."
-            )
-        if self.align != "none" and self.memory == NONE:
+    def _check_alignment(self) -> None:
+        if self.align == NONE:
+            return
+        if self.memory == NONE:
             raise MemobenchError(
                 f"--policy.align={self.align} has no memory to align with --policy.memory=none; name a memory "
                 f"({', '.join(mechanism_names())}), or use --policy.align=none."
             )
-        if self.align != "none" and find_mechanism(self.memory).reads_text:
+        if find_mechanism(self.memory).reads_text:
             raise MemobenchError(
                 f"--policy.align={self.align} ties what is remembered to the subgoal's text, and memory={self.memory} "
                 "learns from that text already, which is all that a chunk reads of it; use --policy.align=none."
@@ -541,18 +575,14 @@ class MemobenchMemConfig(PI05Config):
                 f"memory={self.memory} has no tokens of single frames; use semantic or contrastive, or "
                 "--policy.memory=frames."
             )
-        if self.shuffle_subgoals and self.align == "none":
-            raise MemobenchError(
-                "--policy.shuffle_subgoals=true changes nothing with --policy.align=none, which reads no subgoals; "
-                "name an alignment too."
-            )
-        if self.open_gate and self.memory_fusion != MODULATION:
-            raise MemobenchError(
-                f"--policy.open_gate=true changes nothing with memory_fusion={self.memory_fusion}, which has no gate; "
-                f"leave it out, or pass --policy.memory_fusion={MODULATION}."
-            )
 
     # -- properties that follow ------------------------------------------------------------------------------------
+
+    @property
+    def of_training_alone(self) -> tuple[str, ...]:
+        """All other fields: they say how a policy is trained and where it goes. A checkpoint that acts reads none of
+        them, and another value is refused there, or its card would tell of a training that never was."""
+        return tuple(one.name for one in fields(self) if one.name not in (*FIXED, *OF_ACTING))
 
     @property
     def dimensions(self) -> Dimensions:

@@ -132,12 +132,6 @@ class MemobenchMemPolicy(PI05Policy):
         """
         # As PI05Policy.__init__, which names its model class.
         PreTrainedPolicy.__init__(self, config)
-        if config.compile_model:
-            raise MemobenchError(
-                "--policy.compile_model=true would compile pi0.5's forward pass, and set torch's precision of products "
-                "for the whole process, while this policy hands its memory to the pass from outside; leave it out "
-                "(--use_torch_compile too)."
-            )
         if dataset_meta is not None:
             require_texts(Path(dataset_meta.root), config)
             if config.privileged_memory:
@@ -338,7 +332,7 @@ class MemobenchMemPolicy(PI05Policy):
         rows = range(len(batch[OBS_STATE])) if rows is None else rows
         query, chosen = Query(), list(rows)
         if memory.asks_present and not writes:
-            query = query._replace(tokens=memory.pool(self.perception.remember(batch, chosen).to(device)))
+            query = query._replace(tokens=memory.pooled(self.perception.remember(batch, chosen).to(device)))
         if memory.privileged:
             labels = batch[SUBGOAL][chosen].to(device) if SUBGOAL in batch else None
             query = query._replace(choices=batch[CHOICES][chosen].to(device), subgoal=labels)

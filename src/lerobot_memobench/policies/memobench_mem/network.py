@@ -278,7 +278,8 @@ class InstructionCondition(nn.Module):
 
     def forward(self) -> Tensor:
         """Return what is added to the condition (B, width)."""
-        added: Tensor = self.mlp(self.mean)
+        assert self.mean is not None  # it was read
+        added: Tensor = self.mlp(self.mean.to(next(self.mlp.parameters()).dtype))
         return added
 
 

@@ -24,6 +24,7 @@ from torch import Tensor
 from lerobot_memobench.datasets.execution_frames import first_frames
 from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, RecordedFrames
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
+from lerobot_memobench.datasets.samples import sample
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.lerobot_hooks import DRAW_FRAMES, MAKE_PROCESSORS, READ_SAMPLE, hooked_for
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import PROMPTED, MemobenchMemConfig
@@ -296,7 +297,7 @@ def _use_execution_statistics(stats: dict[str, dict[str, Any]], frames: Recorded
 def _reads(get_item: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap LeRobot's reader: samples of a dataset on which no policy reads pictures are made out of main memory.
 
-    LeRobot's decodes the videos of every sample, wanted or not, and takes a millisecond per row for the rest.
+    They hold what this policy reads and no more (`datasets.samples` keeps all but the pictures).
     """
 
     @functools.wraps(get_item)
@@ -333,11 +334,8 @@ def item(frames: RecordedFrames, meta: Any, deltas: dict[str, list[int]], number
     episode, _ = frames.locate(number)
     first, end = frames.episodes[episode : episode + 2].tolist()
     columns = {name: column for name, column in frames.columns.items() if not name.startswith(ENCODED)}
-    found: dict[str, Any] = {name: column[number] for name, column in columns.items()}
-    for name in deltas.keys() & columns.keys():
-        wanted = number + torch.tensor(deltas[name])
-        found[f"{name}_is_pad"] = (wanted < first) | (wanted >= end)
-        found[name] = columns[name][wanted.clamp(first, end - 1)]
+    deltas = {name: deltas[name] for name in deltas.keys() & columns.keys()}
+    found: dict[str, Any] = dict(sample(columns, number, first, end, deltas))
     found["task"] = meta.tasks.index[int(found["task_index"])]
     return found
 

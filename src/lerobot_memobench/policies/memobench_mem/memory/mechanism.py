@@ -194,7 +194,7 @@ class MemoryMechanism(nn.Module, ABC):
         """Return the state after each row's next frame; ``state`` itself is not changed.
 
         Args:
-            tokens: (R, P, D) of the frame, behind the pool. step: (R,) control step since the episode began.
+            tokens: (R, P, D) of the frame, as `pooled` returns them. step: (R,) control step since the episode began.
             query: choices of the rows.
         """
 
@@ -204,7 +204,16 @@ class MemoryMechanism(nn.Module, ABC):
 
     def observe(self, state: State, frames: Tensor, step: Tensor, query: Query | None = None) -> State:
         """Return the state after each row's next stored frame (R, P', D')."""
-        return self.write(state, self.pool(frames), step, query)
+        return self.write(state, self.pooled(frames), step, query)
+
+    def pooled(self, frames: Tensor) -> Tensor:
+        """Return the tokens (N, P, D) of stored frames (N, P', D'), at least as precise as the mechanism's weights.
+
+        Frames of pictures are stored in bfloat16; weights are float32 in a training, and mostly in a rollout.
+        """
+        tokens: Tensor = self.pool(frames)
+        own = next((one for name, one in self.named_parameters() if not name.startswith("pool.")), tokens)
+        return tokens.to(torch.promote_types(tokens.dtype, own.dtype))
 
     def join(self, states: Sequence[State]) -> State:
         """Return one state of the rows of several."""
@@ -301,7 +310,7 @@ class MemoryMechanism(nn.Module, ABC):
             (after so many frames, these), which go with the rows ``row_of`` (B,).
         """
         needed, where = places.clamp(min=0).unique(return_inverse=True)
-        pooled, steps = self.pool(histories.frames[needed]), histories.steps[needed]
+        pooled, steps = self.pooled(histories.frames[needed]), histories.steps[needed]
         left, found = counts.tolist(), []
         for time in range(left[0] + 1):
             still = sum(count > time for count in left)
