@@ -182,14 +182,21 @@ class Study:
         return {"arm": arm, "seed": seed, **found, **took}
 
 
+def _aligned(words: tuple[str, ...]) -> bool:
+    return any(word.startswith("align=") for word in words)
+
+
 def experiment_of(split: Split, settings: StudySettings) -> Experiment:
     """Return what is trained and rolled out: every arm on the episodes that are not held out."""
     return Experiment(
         split.tasks,
         episodes=0,
         steps=settings.steps,
-        settings=(f"policy.subgoal_level={settings.level}", f"dataset.episodes={split.trained}", "save_freq=1000"),
-        arms=ALIGNMENTS,
+        settings=(f"dataset.episodes={split.trained}", "save_freq=1000"),
+        arms={
+            arm: (*words, *([f"policy.subgoal_level={settings.level}"] if _aligned(words) else []))
+            for arm, words in ALIGNMENTS.items()
+        },
         seeds=settings.seeds,
         rollouts=settings.rollouts,
         first_seed=settings.first_seed,

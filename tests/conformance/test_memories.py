@@ -13,19 +13,24 @@ from lerobot_memobench.conformance.streams import TASK, task_of_texts
 from lerobot_memobench.conformance.subject import Subject, load_subject
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import OURS, mechanism_names
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.tasks.catalogue import get_task
 
 
 def test_a_memory_of_another_package_is_built_and_goes_through_an_episode(traces: None) -> None:
-    config = MemobenchMemConfig(device="cpu", size="tiny", perception="objects", memory="traces")
+    """Frames of pictures are stored in bfloat16, and its weights are float32."""
+    config = MemobenchMemConfig(device="cpu", size="tiny", memory="traces")
     assert config.memory_settings == {"traces": 4}
     memory = MemoryPI05(config).memory
     assert memory is not None
     state = memory.init(2)
     for step in range(5):
-        tokens = torch.randn(2, memory.spec.tokens, memory.spec.dim)
-        state = memory.write(state, tokens, torch.tensor([step, step]))
+        frames = torch.randn(2, memory.spec.tokens, memory.spec.dim, dtype=torch.bfloat16)
+        state = memory.observe(state, frames, torch.tensor([step, step]))
+    places = torch.arange(5).expand(2, 5)
+    histories = Histories(frames[:1].expand(5, -1, -1), torch.arange(5), places)
+    assert memory.replay(histories).rows().dtype == torch.float32
     assert memory.read(state).rows().shape == (2, 4 * memory.spec.tokens, memory.spec.width)
 
 

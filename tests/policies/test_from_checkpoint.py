@@ -164,7 +164,7 @@ def test_another_memory_begins_anew_and_says_so(
     told: list[str] = []
     monkeypatch.setattr(checkpoints.logger, "warning", lambda text, *of: told.append(text % of))
     meta = LeRobotDataset("memobench/synthetic", root=dataset_root).meta
-    config = PreTrainedConfig.from_pretrained(start, cli_overrides=[f"--memory_fusion={fusion}"])
+    config = PreTrainedConfig.from_pretrained(start, cli_overrides=[f"--memory_fusion={fusion}", "--memory_frames=32"])
     policy = MemobenchMemPolicy.from_pretrained(start, config=config, dataset_meta=meta)
     assert "was trained with memory=frames, and this is memory=" in told[0]
     assert policy.average is not None

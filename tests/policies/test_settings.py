@@ -59,6 +59,7 @@ OTHERS: dict[str, Any] = {
     "base_weights": "no such folder",
     "normalization_mapping": dict.fromkeys(("STATE", "ACTION", "VISUAL"), NormalizationMode.IDENTITY),
     "image_resolution": (144, 144),
+    "tokenizer_max_length": 3,
     "tokenizer_name": "no such tokenizer",
     "dtype": "bfloat16",
     "rtc_config": RTCConfig(),

@@ -6,16 +6,13 @@ for. Here numbers lie in tensors, and pictures are left out; the rest of a sampl
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import torch
 from torch import Tensor
-
-from lerobot_memobench.lerobot_hooks import READ_SAMPLE, hooked_for
 
 
 def sample(
@@ -36,20 +33,8 @@ def sample(
 
 
 def keep_in_memory(dataset: Any) -> None:
-    """Give the samples of an opened dataset out of main memory, without pictures, as long as it lives."""
-    dataset.reader.in_memory = _Rows(dataset.reader)
-    hooked_for(dataset.reader, READ_SAMPLE, _reads)
-
-
-def _reads(get_item: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap LeRobot's reader."""
-
-    @functools.wraps(get_item)
-    def read(self: Any, idx: int) -> Any:
-        rows: _Rows | None = getattr(self, "in_memory", None)
-        return get_item(self, idx) if rows is None else rows.sample(idx)
-
-    return read
+    """Give the samples of an opened dataset out of main memory, without pictures."""
+    dataset.reader.get_item = _Rows(dataset.reader).sample
 
 
 class _Rows:

@@ -547,6 +547,8 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         if held_out is not None and not tested and leave_out_prompts(held_out):
             held_out = ExecutionFrames(held_out)
         if _reads_no_pictures(config):
+            logger.info("samples lie in main memory, where loader processes would be slower: num_workers=0")
+            config.num_workers = 0
             for dataset in filter(None, (train, held_out)):
                 keep_in_memory(getattr(dataset, "dataset", dataset))
         return train, held_out

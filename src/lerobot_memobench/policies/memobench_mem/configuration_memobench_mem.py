@@ -464,8 +464,13 @@ class MemobenchMemConfig(PI05Config):
         unset = {
             one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)
         }
-        # As a recipe or a checkpoint of another memory, objective or alignment may hold them.
-        usual = {"memory_fusion": (NONE, MODULATION), "num_inference_steps": (1,), "align_weight": (0.0,)}
+        # As a recipe or a checkpoint of another memory, objective, alignment or perception may hold them.
+        usual = {
+            "memory_fusion": (NONE, MODULATION),
+            "memory_camera": (f"{OBS_IMAGES}.{next(iter(CAMERAS))}",),
+            "num_inference_steps": (1,),
+            "align_weight": (0.0,),
+        }
         found: dict[str, str] = {}
         for reader, (present, names) in READERS.items():
             for name in () if present(self) else [one for one in names.split() if one in unset]:
