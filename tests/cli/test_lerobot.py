@@ -544,7 +544,7 @@ def test_an_unknown_referent(evaluation: Called, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["policy.memory=none", "policy.memory_settings={content: false}"], "policy.memory=none has none"),
+        (["policy.memory=none", "policy.memory_settings={content: false}"], "only a memory reads it"),
         (["policy.memory=recurrent", "policy.memory_settings={length: 4, time_codes: true}"], "names 'length'"),
     ],
 )

@@ -1,8 +1,4 @@
-"""Check the processor steps that a checkpoint names, before LeRobot builds them.
-
-LeRobot imports and calls whatever a step's ``class`` names. A checkpoint may come from a stranger, so it may name
-registered steps of installed packages only.
-"""
+"""Check the processor steps that a checkpoint names, before LeRobot builds them: it imports and calls any ``class``."""
 
 from __future__ import annotations
 
@@ -19,62 +15,54 @@ PLUGIN = "lerobot_policy_"
 NAMES_CODE = ("class", "registry_name", "_target_")
 """Keys by which a nested mapping would ask for an object to be built."""
 REMOTE_CODE = {
-    "action_tokenizer_processor": {
-        "action_tokenizer_name": "lerobot/fast-action-tokenizer",
-        "paligemma_tokenizer_name": "google/paligemma-3b-pt-224",
-    },
-    "groot_n1_7_vlm_encode_v1": {"model_name": "nvidia/Cosmos-Reason2-2B"},
+    "action_tokenizer_name": "lerobot/fast-action-tokenizer",
+    "paligemma_tokenizer_name": "google/paligemma-3b-pt-224",
+    "model_name": "nvidia/Cosmos-Reason2-2B",
 }
-"""Steps of LeRobot that run Python code of a repository -> their settings that name it, and LeRobot's own values."""
+"""Settings of LeRobot's steps that name a repository whose Python code is run -> LeRobot's own values."""
 
 
 def check_step(file: Path, step: Mapping[str, Any], kind: str | None) -> None:
     """Refuse a saved step unless LeRobot, this package or an installed policy plugin registers it.
 
     Args:
-        file: the processor's file. step: its entry there. kind: the checkpoint's type of policy, whose module is
-            imported where no step of that name is registered yet.
+        file: the processor's file. step: its entry there. kind: the checkpoint's type of policy.
 
     Raises:
         MemobenchError: the step is refused.
     """
+    for reason in _reasons(step, kind):
+        raise MemobenchError(
+            f"{file} {reason}; expected steps with plain settings that LeRobot, this package or an installed {PLUGIN}* "
+            "package registers: install the policy's package, or use a checkpoint that you trust"
+        )
+
+
+def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
+    """Yield the reasons to refuse a step."""
     name, config = step.get("registry_name"), step.get("config") or {}
     if not isinstance(name, str) or "class" in step:
-        raise MemobenchError(
-            f"{file} names the class {step.get('class')!r}, which LeRobot would import and call; expected a step's "
-            "registry_name: use a checkpoint of a source that you trust, saved by lerobot-train"
-        )
+        yield f"names the class {step.get('class')!r}, which LeRobot would import and call"
+        return
     found = _registered(name, kind)
     if found is None or not _trusted(found.__module__.partition(".")[0]):
-        holder = "no package" if found is None else found.__module__
-        raise MemobenchError(
-            f"{file} names the step {name!r}, which {holder} registers; expected a step of LeRobot, of this package or "
-            f"of an installed {PLUGIN}* package: install the package that this policy comes with"
-        )
-    key = next(_naming(config), None)
-    if key is not None:
-        raise MemobenchError(
-            f"{file} holds {key!r} in the settings of the step {name!r}, which would name code; expected plain values: "
-            "use a checkpoint of a source that you trust"
-        )
+        yield f"names the step {name!r}, which {'no package' if found is None else found.__module__} registers"
+    yield from (f"holds {key!r} in the settings of the step {name!r}, which would name code" for key in _naming(config))
     if config.get("trust_remote_code") is not False:
-        for setting, known in REMOTE_CODE.get(name, {}).items():
+        for setting, known in REMOTE_CODE.items():
             if config.get(setting, known) != known:
-                raise MemobenchError(
-                    f"{file} sets {setting}={config[setting]!r} in the step {name!r}, which runs the code of that "
-                    f"repository; expected {known}: write it there, or use another checkpoint"
-                )
+                yield f"sets {setting}={config[setting]!r} in the step {name!r}, which runs code of that repository"
 
 
 def _registered(name: str, kind: str | None) -> type | None:
-    """Return the class of a registered step; None where there is none."""
+    """Return the class of a step that the policy's module, or another one, registers; None where there is none."""
     from lerobot.policies.factory import get_policy_class
     from lerobot.processor import ProcessorStepRegistry
 
-    for imports in (lambda: None, lambda: get_policy_class(str(kind))):
-        with suppress(Exception):  # an unknown name, or a policy whose packages are not installed
-            imports()
-            return ProcessorStepRegistry.get(name)
+    with suppress(Exception):  # a policy whose packages are not installed
+        get_policy_class(str(kind))
+    with suppress(KeyError):
+        return ProcessorStepRegistry.get(name)
     return None
 
 
@@ -82,15 +70,13 @@ def _trusted(package: str) -> bool:
     from lerobot.configs import PreTrainedConfig
 
     policies = {one.__module__.partition(".")[0] for one in PreTrainedConfig.get_known_choices().values()}
-    return package in PACKAGES or package.startswith(PLUGIN) or package in policies
+    return package in {*PACKAGES, *policies} or package.startswith(PLUGIN)
 
 
 def _naming(value: Any) -> Iterator[str]:
     """Yield the keys, at any depth, that would name code."""
     if isinstance(value, Mapping):
         yield from (key for key in NAMES_CODE if key in value)
-        value = value.values()
-    elif not isinstance(value, list):
-        return
-    for one in value:
+        value = list(value.values())
+    for one in value if isinstance(value, list) else []:
         yield from _naming(one)

@@ -228,21 +228,12 @@ def without_unread(arguments: LerobotArguments) -> LerobotArguments:
 
 
 def check_memory_settings(arguments: LerobotArguments, policy: Any) -> None:
-    """Refuse settings on the line that are not those of the policy's memory.
-
-    Raises:
-        MemobenchError: they are another memory's, or there is none.
-    """
+    """Refuse settings on the line that are another memory's; errors as of `read_settings`."""
     given = yaml.safe_load(arguments.get("policy.memory_settings") or "{}")
-    if not given or getattr(policy, "type", None) != "memobench_mem":
-        return
-    from lerobot_memobench.policies.memobench_mem.memory import NONE, read_settings
+    if given and getattr(policy, "memory", "none") != "none":
+        from lerobot_memobench.policies.memobench_mem.memory import read_settings
 
-    if policy.memory == NONE:
-        raise MemobenchError(
-            f"policy.memory_settings={given} says how a memory remembers, and policy.memory=none has none; leave it out"
-        )
-    read_settings(policy.memory, given)
+        read_settings(policy.memory, given)
 
 
 def check_dataset(arguments: LerobotArguments) -> None:
