@@ -507,6 +507,17 @@ def test_another_memory_than_a_checkpoints_has_its_own_defaults(training: Called
         assert found.memory_settings == own.memory_settings | ({"length": 4} if "bank" in found.memory else {})
 
 
+def test_settings_of_a_checkpoint_that_nothing_reads_any_more_are_reset(
+    training: Called, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", "policy=memobench_small", "steps=1", "device=cpu", "align=none"]
+    for more in ([], ["policy.memory=none"]):
+        assert main([*words, *more]) == 0
+        assert training.value("policy.align_weight") == "null"
+    assert main([*words, "policy.align_weight=0.3"]) == 2
+    assert "align_weight=0.3 would do nothing" in capsys.readouterr().err
+
+
 # --- mistakes: one sentence, status 2, LeRobot never called, nothing written ---
 
 
