@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import check_weights
 
 TURN_STEPS = (8, 48)
 """A turn of the expert, or of the learner, takes at least the first, and less than the second, number of steps."""
@@ -48,7 +47,6 @@ def load_learner(checkpoint: str) -> Loaded:
             f"the policy {checkpoint} reads in its instruction what has been done (policy.oracle_memory=true), which "
             "demonstrations do not have; name one without"
         )
-    check_weights(checkpoint, config)
     torch.set_num_threads(1)  # a worker is one of as many as there are cores
     policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
     override = {"device_processor": {"device": "cpu"}}
