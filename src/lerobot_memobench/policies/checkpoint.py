@@ -166,8 +166,9 @@ def check_processors(path: str | Path, revision: str | None = None) -> None:
     kind = None if held is None else read_json(held).get("type")
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         file = _file_of(path, name, revision)
-        for step in [] if file is None else read_json(file, Processor).get("steps", []):
-            check_step(file, step, kind)
+        if file is not None:
+            for step in read_json(file, Processor).get("steps", []):
+                check_step(file, step, kind)
 
 
 def _check_form(folder: Path) -> None:
