@@ -42,7 +42,9 @@ BASES: dict[str, dict[str, Any]] = {
 }
 OTHERS: dict[str, Any] = {
     "size": {"small": "tiny", "tiny": "small"},
-    "perception": "pixels",
+    "perception": {"pixels": "objects", "objects": "pixels"},
+    "ema_decay": 0.0,
+    "shuffle_seed": 1,
     "object_classes": ["knob"],
     "align": "semantic",
     "text_encoder": "labels",
@@ -79,6 +81,8 @@ LEROBOTS = {
     "input_features": "make_policy",
     "action_feature_names": "make_policy",
     "use_amp": "eval_main",
+    "rtc_config": "rollout/inference/rtc.py",
+    "relative_exclude_joints": "RelativeActionsProcessorStep, of datasets that name their actions",
 }
 """Fields that LeRobot reads or writes itself -> where."""
 
@@ -86,7 +90,7 @@ LEROBOTS = {
 def other(name: str, value: Any) -> Any:
     """Return another value of a field."""
     found = OTHERS.get(name)
-    if name in ("size", "objective"):
+    if name in ("size", "objective", "perception"):
         return found[value]
     if found is not None:
         return found
@@ -160,7 +164,7 @@ def effects(root: Path, fields: Mapping[str, Any]) -> str:
         (name, {"size": "small", "perception": "objects"})
         for name in ("visual_encoder", "image_resolution", "empty_cameras")
     ]
-    + [(name, {"size": "tiny"}) for name in READERS["perception=objects"][1].split()]
+    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *READERS["perception=objects"][1].split())]
     + [(name, {"memory": "none"}) for name in (*READERS["a memory"][1].split(), "memory_frames", "open_gate")]
     + [(name, {"size": "small", "perception": "objects"}) for name in READERS["objective=flow_matching"][1].split()]
     + [(name, {}) for name in READERS["policy=pi05"][1].split() if name not in PI05_ALONE]

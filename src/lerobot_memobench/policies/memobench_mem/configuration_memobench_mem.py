@@ -204,6 +204,7 @@ READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
         "detector detection_noise object_classes full_chunk_when_stalled",
     ),
     "perception=pixels": (lambda it: not it.uses_objects, "image_resolution empty_cameras"),
+    "a policy whose state is a token": (lambda it: it.state_token, "max_state_dim"),
     "a policy that sees pictures": (lambda it: it.uses_pictures, "memory_camera"),
     "size=small perception=pixels": (lambda it: it.size == "small" and not it.uses_objects, "visual_encoder"),
     "a training that encodes pictures ahead": (
@@ -466,6 +467,7 @@ class MemobenchMemConfig(PI05Config):
         }
         # As a recipe or a checkpoint of another memory, objective, alignment or perception may hold them.
         usual = {
+            "max_state_dim": () if self.robot_state_feature is None else self.robot_state_feature.shape,
             "memory_fusion": (NONE, MODULATION),
             "memory_camera": (f"{OBS_IMAGES}.{next(iter(CAMERAS))}",),
             "num_inference_steps": (1,),
