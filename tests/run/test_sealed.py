@@ -27,6 +27,7 @@ from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import logs
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
+BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 LINE = ["env=memobench", f"tasks={STOVE}", "policy=memobench_random", "env.videos=0"]
 SEALED = [*LINE, "split=sealed"]
 
@@ -80,9 +81,26 @@ def test_seeds_are_run_under_their_own_name(words: list[str], said: str) -> None
     assert not user_ledger().exists()
 
 
-def test_nothing_is_taught_on_sealed_seeds(tmp_path: Path) -> None:
-    with pytest.raises(MemobenchError, match="seeds 100050 to 100059 reach into the sealed test's"):
-        generate([get_task(STOVE)], 10, tmp_path / "data", seed_base=100_050)
+@pytest.mark.parametrize(
+    ("asked", "split"),
+    [
+        ({"episodes": 10, "seed_base": 100_050}, "sealed"),
+        ({"episodes": 9, "seed_base": 100_000, "prompted_episodes": 1}, "sealed"),
+        ({"episodes": 1, "seed_base": 99_999, "prompted_episodes": 9}, "sealed"),
+        ({"episodes": 5, "seed_base": 7}, "paper"),
+        ({"episodes": 8, "seed_base": 0}, "paper"),
+        ({"episodes": 10_050}, "validation"),
+        ({"episodes": 1, "prompted_episodes": 10_050}, "validation"),
+        ({"episodes": 1, "seed_base": 29_999}, "validation"),
+    ],
+)
+def test_no_demonstration_has_a_scene_on_which_policies_are_measured(
+    tmp_path: Path, asked: dict[str, int], split: str
+) -> None:
+    """The largest number of episodes of any task counts, here of one without and of one with a prompt."""
+    with pytest.raises(MemobenchError, match=f"reach into the split '{split}'"):
+        generate([get_task(STOVE), get_task(BUTTER)], out=tmp_path / "data", **asked)
+    assert not (tmp_path / "data").exists()
 
 
 def test_each_start_is_counted_and_told_and_going_on_is_none() -> None:

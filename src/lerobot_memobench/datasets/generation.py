@@ -46,7 +46,7 @@ from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, tel
 from lerobot_memobench.jobs.executors import Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.protocol import DEMONSTRATION_SEED, IMAGE_SIZE, SEALED, SPLITS
+from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
 from lerobot_memobench.tasks.task import Task, referent_text
 
 WEIGHTS = "model.safetensors"
@@ -101,7 +101,7 @@ def generate(
         referent, images, image_size, demonstration_prompt, perturb, policy: see `recording.RecordingSettings`.
 
     Raises:
-        MemobenchError: nothing to do, ``out`` holds something else or a damaged dataset, another run is writing there,
+        MemobenchError: nothing to do, seeds of a guarded split, ``out`` holds something else or a damaged dataset, another run is writing there,
             its disk has no room (what is finished stays), or an episode could not be run at all (which no later run
             would change).
     """
@@ -111,12 +111,8 @@ def generate(
             f"{len(tasks)} tasks, {episodes} episodes ({most} with a prompt), {workers} workers were asked for; each "
             "must be at least 1"
         )
-    sealed = SPLITS[SEALED]
-    if seed_base <= sealed[-1] and seed_base + most > sealed[0]:
-        raise MemobenchError(
-            f"seeds {seed_base} to {seed_base + most - 1} reach into the sealed test's ({sealed[0]} to {sealed[-1]}), "
-            "which no policy is trained on; choose others, such as --seed-base 10000"
-        )
+    most = max(episodes_of(task, episodes, prompted_episodes) for task in tasks)
+    _check_seeds(range(seed_base, seed_base + most))
     check_executor(executor, executor_options)
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
     if hiding is not None and not demonstration_prompt:
@@ -238,6 +234,18 @@ def _carry_out(
 def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
     """Return how many demonstrations of a task `generate` is asked for."""
     return episodes if task.prompt is None or prompted_episodes is None else prompted_episodes
+
+
+def _check_seeds(seeds: range) -> None:
+    """Refuse demonstrations of scenes on which policies are chosen or measured (`protocol.GUARDED`)."""
+    for name in GUARDED:
+        split = SPLITS[name]
+        if seeds[0] <= split[-1] and seeds[-1] >= split[0]:
+            raise MemobenchError(
+                f"seeds {seeds[0]} to {seeds[-1]} reach into the split '{name}' ({split[0]} to {split[-1]}), on which "
+                f"no policy is trained; ask for seeds within {DEMONSTRATION_SEED} to {SPLITS['demonstrations'][-1]}, "
+                f"such as --seed-base {DEMONSTRATION_SEED}; evaluate policy=memobench_expert to measure the expert"
+            )
 
 
 def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.acting import SEALED_LEDGER
+from lerobot_memobench.envs.acting import SEALED_LEDGER, SEALED_RUN
 from lerobot_memobench.evaluation.records import SealedRun, SealedStart
 from lerobot_memobench.io import Malformed, checked, count_of, is_there, parsed, read_json, write_file
 from lerobot_memobench.jobs.processes import taking_turns
@@ -24,7 +24,7 @@ from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.machine import PACKAGES, versions
 from lerobot_memobench.run.plan import EvaluationPlan
 
-RUN_FILE = "sealed.json"
+RUN_FILE = SEALED_RUN
 REPEATED = ("suite", "referent", "replan_steps")
 """Settings of the protocol that a ledger's line repeats."""
 
