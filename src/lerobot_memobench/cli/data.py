@@ -268,7 +268,9 @@ def validate(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     suite: OfSuite = None,
 ) -> int:
-    """Replay every episode in the simulator. The first disagreement of each is reported."""
+    """Replay every episode in the simulator, and read every file to its end. The first disagreement of each is
+    reported, and files that were written again.
+    """
     from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
     from lerobot_memobench.datasets.validate import exit_status
     from lerobot_memobench.datasets.validate import validate as run
@@ -278,11 +280,15 @@ def validate(
     with counting(console(), "episodes") as count:
 
         def advance(done: int, total: int, verdict: Verdict) -> None:
-            count(done, total, verdict.episode, trouble=verdict.disagreement)
+            count(done, total, verdict.subject, trouble=verdict.disagreement)
 
         verdicts = run(folder, workers=workers, progress=advance)
-    wrong = sum(verdict.disagreement is not None for verdict in verdicts)
-    say(f"{len(verdicts) - wrong} of {len(verdicts)} episodes agree")
+    for verdict in verdicts:
+        if verdict.note is not None:
+            say(f"note: {verdict.subject}: {verdict.note}")
+    episodes, files = ([each for each in verdicts if each.of_file == of_file] for of_file in (False, True))
+    agree, damaged = (sum(each.disagreement is None for each in episodes), exit_status(files))
+    say(f"{agree} of {len(episodes)} episodes agree" + damaged * ", and files of the dataset do not (above)")
     return exit_status(verdicts)
 
 

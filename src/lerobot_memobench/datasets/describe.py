@@ -48,6 +48,10 @@ FRAME = 160
 """Height and width of a storyboard's pictures, pixels."""
 MOST_FRAMES = 6
 
+UNCHECKED = (
+    "not checked: values of tables, pictures of videos, statistics, states, hashes, HDF5 files and feature caches; "
+    "`memobench validate {folder}` checks them"
+)
 Say = Callable[[str], None]
 
 
@@ -68,6 +72,7 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
         tables = card_tables(card or card_from_frames(folder, rows))
         board = storyboard(folder, rows) if (folder / "videos").is_dir() else None
         manifest = read_manifest(folder) if hashes.is_file() else _manifest_of(rows)
+    say(UNCHECKED.format(folder=folder))
     if card is None:
         say(EDITED)
         _put_card(folder, rows, say)

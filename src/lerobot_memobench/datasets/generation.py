@@ -101,9 +101,9 @@ def generate(
         referent, images, image_size, demonstration_prompt, perturb, policy: see `recording.RecordingSettings`.
 
     Raises:
-        MemobenchError: nothing to do, seeds of a guarded split, ``out`` holds something else or a damaged dataset, another run is writing there,
-            its disk has no room (what is finished stays), or an episode could not be run at all (which no later run
-            would change).
+        MemobenchError: nothing to do, seeds of a guarded split, ``out`` holds something else or a damaged dataset,
+            another run is writing there, its disk has no room (what is finished stays), or an episode could not be run
+            at all (which no later run would change).
     """
     most = episodes if prompted_episodes is None else prompted_episodes
     if not tasks or min(episodes, most, workers) < 1:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_name, refusing
+from lerobot_memobench.io import check_fetched, file_name, refusing
 from lerobot_memobench.io import read_json as read_json_file
 from lerobot_memobench.protocol import CLOCK
 
@@ -141,6 +141,8 @@ def check_checkpoint(path: str) -> None:
     checkpoint_type(path)
     if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
         raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
+    for weights in folder.glob("*.safetensors"):
+        check_fetched(weights)
     _check_form(folder)
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         for step in read_json(folder / name, Processor).get("steps", []):
@@ -286,7 +288,7 @@ def _shapes(file: Path) -> dict[str, tuple[int, ...]]:
 
 def undamaged(file: Path) -> AbstractContextManager[None]:
     """As `refusing`, for reading the tensors of a checkpoint's file."""
-    return refusing(lambda why: MemobenchError(f"{file} cannot be read ({why}); {ADVICE}"))
+    return refusing(lambda why: MemobenchError(f"{file} cannot be read ({why}); {ADVICE}"), file)
 
 
 def _built_empty(policy: PreTrainedConfig) -> Any | None:

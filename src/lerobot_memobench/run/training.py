@@ -27,13 +27,14 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     PRIVILEGED,
     check_clock,
     naming_damage,
+    read_info,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
 from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, chooses_inputs, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import count_of
+from lerobot_memobench.io import check_fetched, count_of
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
@@ -239,6 +240,8 @@ def check_dataset(arguments: LerobotArguments) -> None:
             f"the folder {root} is not a LeRobot dataset ({INFO_FILE} is missing); make one with "
             "`memobench generate --out <folder>`"
         )
+    read_info(folder)
+    check_fetched(folder)
 
 
 def note_on_start(arguments: LerobotArguments) -> str | None:

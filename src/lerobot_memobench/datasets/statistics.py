@@ -1,0 +1,133 @@
+"""Statistics of a dataset: computed from its frames, compared with ``meta/stats.json``, and completed there.
+
+LeRobot normalises by them. Datasets that were converted from its format v2.1 lack quantiles, others those of pictures.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_memobench.datasets.feature_cache.frames import frame_reader, read_frame_table
+from lerobot_memobench.datasets.feature_cache.reading import read_recorded
+from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats
+from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, STATS_FILE, read_info
+from lerobot_memobench.datasets.video import ImageHistograms, Stats
+from lerobot_memobench.io import read_json, short, telling_of_the_disk, write_file
+from lerobot_memobench.protocol import CLOCK
+
+PICTURES = ("video", "image")
+BLOCK = 64
+"""Pictures that are decoded at a time."""
+NEAR, NEAR_PICTURES = 1e-4, 0.02
+"""By how much of its range a number's statistic may be off, and by how much of all levels a picture's mean and
+deviation: they are of pictures before they were encoded."""
+
+
+def measured(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the features of which LeRobot keeps statistics: numbers and pictures, and not the clock."""
+    return [
+        name
+        for name, feature in features.items()
+        if name not in CLOCK and (feature["dtype"] in PICTURES or np.dtype(_known(feature["dtype"])).kind in "biuf")
+    ]
+
+
+def _known(dtype: str) -> str:
+    return "O" if dtype in ("string", "language") else dtype
+
+
+def compute(folder: Path, names: Iterable[str]) -> dict[str, Stats]:
+    """Return the statistics of a dataset's features: exact ones of numbers; of pictures, of the frames that LeRobot
+    samples of each episode.
+
+    Raises:
+        MemobenchError: a column is missing or damaged.
+    """
+    features, chosen = read_info(folder)["features"], list(names)
+    cameras = [name for name in chosen if features[name]["dtype"] in PICTURES]
+    numbers = [name for name in chosen if name not in cameras]
+    columns = read_recorded(folder, numbers)[0] if numbers else {}
+    found = {name: numeric_stats(column.numpy()) for name, column in columns.items()}
+    return found | {camera: _of_pictures(folder, camera) for camera in cameras}
+
+
+def _of_pictures(folder: Path, camera: str) -> Stats:
+    from lerobot.datasets.compute_stats import aggregate_stats
+
+    read, found = frame_reader(folder, camera), []
+    for episode, length in enumerate(np.diff(read_frame_table(folder).episodes).tolist()):
+        seen = ImageHistograms()
+        for first in range(0, length, BLOCK):
+            pictures = read(episode, list(range(first, min(first + BLOCK, length))))
+            for picture in (pictures * 255).round().byte().permute(0, 2, 3, 1).numpy():
+                seen.add(np.ascontiguousarray(picture))
+        found.append({camera: seen.stats()})
+    stats: Stats = aggregate_stats(found)[camera]
+    return stats
+
+
+def recorded(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return ``meta/stats.json``; empty where there is none.
+
+    Raises:
+        MemobenchError: it cannot be read.
+    """
+    try:
+        found: dict[str, dict[str, Any]] = read_json(folder / STATS_FILE, dict[str, dict[str, Any]], ADVICE, nan=True)
+    except FileNotFoundError:
+        return {}
+    return found
+
+
+def differences(folder: Path) -> Iterator[str]:
+    """Yield in what ``meta/stats.json`` is not what the frames say, a sentence for each feature.
+
+    Quantiles need only lie between the extremes: LeRobot's tools average those of the episodes.
+    """
+    features, told = read_info(folder)["features"], recorded(folder)
+    for name, stats in compute(folder, measured(features)).items():
+        pictures = features[name]["dtype"] in PICTURES
+        low, high = (np.zeros(1), np.ones(1)) if pictures else (stats["min"].ravel(), stats["max"].ravel())
+        slack = NEAR_PICTURES if pictures else NEAR * (1 + high - low)
+        for key, value in stats.items():
+            bounded = key.startswith("q") or (pictures and key != "mean" and key != "std")
+            least, most = (low, high) if bounded else (value.ravel(), value.ravel())
+            there = told.get(name, {}).get(key)
+            if (pictures and key == "count") or _within(there, value.size, least - slack, most + slack):
+                continue
+            yield f"{key} of {name} is {short(there)}, and the frames have {short(value.tolist())}"
+            break
+
+
+def _within(there: Any, size: int, least: Any, most: Any) -> bool:
+    try:
+        found = np.asarray(there, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        return False
+    return found.size == size and bool(((least <= found) & (found <= most)).all())
+
+
+def complete(folder: Path, needed: Mapping[str, Collection[str]], tell: Callable[[str], None]) -> None:
+    """Compute the statistics that a dataset lacks and write them into its ``meta/stats.json``; the others stay.
+
+    Args:
+        needed: feature -> names of its statistics, such as q01. tell: told what is missing, before it is computed.
+
+    Raises:
+        MemobenchError: a column is missing or damaged, or the folder cannot be written.
+    """
+    there = recorded(folder)
+    missing = [name for name, keys in needed.items() if set(keys) - set(there.get(name, {}))]
+    if not missing:
+        return
+    lacks = sorted({key for name in missing for key in needed[name] if key not in there.get(name, {})})
+    tell(f"{folder / STATS_FILE} lacks {', '.join(lacks)} of {', '.join(missing)}: computed from the frames and added")
+    for name, stats in compute(folder, missing).items():
+        there[name] = {key: value.tolist() for key, value in stats.items()} | there.get(name, {})
+    with telling_of_the_disk(folder):
+        write_file(folder / STATS_FILE, json.dumps(there, indent=4))
