@@ -6,7 +6,7 @@ LeRobot normalises by them. Datasets that were converted from its format v2.1 la
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,13 @@ from lerobot_memobench.protocol import CLOCK
 PICTURES = ("video", "image")
 BLOCK = 64
 """Pictures that are decoded at a time."""
+NEEDED = {
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+"""LeRobot's mode of normalisation -> the statistics that it takes."""
 NEAR, NEAR_PICTURES = 1e-4, 0.02
 """By how much of its range a number's statistic may be off, and by how much of all levels a picture's mean and
 deviation: they are of pictures before they were encoded."""
@@ -112,22 +119,45 @@ def _within(there: Any, size: int, least: Any, most: Any) -> bool:
     return found.size == size and bool(((least <= found) & (found <= most)).all())
 
 
-def complete(folder: Path, needed: Mapping[str, Collection[str]], tell: Callable[[str], None]) -> None:
-    """Compute the statistics that a dataset lacks and write them into its ``meta/stats.json``; the others stay.
+def needed_by(policy: Any, features: Mapping[str, Mapping[str, Any]], imagenet: bool) -> dict[str, Collection[str]]:
+    """Return feature -> names of the statistics by which a training normalises it.
 
     Args:
-        needed: feature -> names of its statistics, such as q01. tell: told what is missing, before it is computed.
+        policy: its configuration. features: of the dataset.
+        imagenet: whether LeRobot puts ImageNet's statistics in the place of the pictures', which it must find.
+    """
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    found: dict[str, Collection[str]] = {}
+    for name, feature in dataset_to_policy_features(dict(features)).items():
+        mode = policy.normalization_mapping.get(feature.type.value)
+        keys = NEEDED.get(getattr(mode, "value", mode), ())
+        if features[name]["dtype"] in PICTURES and imagenet:
+            keys = (*keys, "mean", "std")
+        depth = features[name]["dtype"] in PICTURES and 3 not in features[name]["shape"]
+        if keys and name not in CLOCK and not depth:
+            found[name] = keys
+    return found
+
+
+def lacking(folder: Path, needed: Mapping[str, Collection[str]]) -> list[str]:
+    """Return the features of which a dataset lacks one of the statistics that are ``needed``."""
+    there = recorded(folder)
+    return [name for name, keys in needed.items() if set(keys) - set(there.get(name, {}))]
+
+
+def complete(folder: Path, names: Sequence[str], tell: Callable[[str], None]) -> None:
+    """Compute statistics of a dataset's features and write into its ``meta/stats.json`` those that it lacks.
+
+    Args:
+        tell: told of which features, before they are computed.
 
     Raises:
         MemobenchError: a column is missing or damaged, or the folder cannot be written.
     """
+    tell(f"{folder / STATS_FILE} lacks statistics of {', '.join(names)}: they are computed from the frames and added")
     there = recorded(folder)
-    missing = [name for name, keys in needed.items() if set(keys) - set(there.get(name, {}))]
-    if not missing:
-        return
-    lacks = sorted({key for name in missing for key in needed[name] if key not in there.get(name, {})})
-    tell(f"{folder / STATS_FILE} lacks {', '.join(lacks)} of {', '.join(missing)}: computed from the frames and added")
-    for name, stats in compute(folder, missing).items():
+    for name, stats in compute(folder, names).items():
         there[name] = {key: value.tolist() for key, value in stats.items()} | there.get(name, {})
     with telling_of_the_disk(folder):
         write_file(folder / STATS_FILE, json.dumps(there, indent=4))

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -31,6 +31,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
+from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, chooses_inputs, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -66,6 +67,9 @@ from lerobot_memobench.run.arguments import (
 from lerobot_memobench.run.gpu_memory import refuse_too_large
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_configuration
 from lerobot_memobench.run.plan import check_observations, env_config, policy_config
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
 
 logger = logging.getLogger(__name__)
 
@@ -502,7 +506,10 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
             _check_streaming(config)
         check_transforms(config.policy, config.dataset.image_transforms.enable)
         _check_distribution(config)
-        _check_episodes(config.dataset)
+        meta = _metadata(config.dataset)
+        _check_episodes(config.dataset, meta.total_episodes)
+        if config.policy is not None and not config.dataset.streaming:
+            _complete_statistics(config, meta)
         train, held_out = make(config)
         check_clock(train.meta.features, train.root)
         if EPISODE_INFO in train.meta.features and not config.dataset.streaming:
@@ -560,19 +567,36 @@ def _check_distribution(config: Any) -> None:
         )
 
 
-def _check_episodes(dataset: Any) -> None:
+def _metadata(dataset: Any) -> LeRobotDatasetMetadata:
+    """Return the metadata of a dataset, of LeRobot's configuration of it; fetched, where it is on the hub."""
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    return LeRobotDatasetMetadata(
+        dataset.repo_id, root=dataset.root, revision=dataset.revision, repo_type=dataset.repo_type
+    )
+
+
+def _complete_statistics(config: Any, meta: LeRobotDatasetMetadata) -> None:
+    """Add the statistics that a policy normalises by and its dataset lacks, before anything is encoded or trained."""
+    from lerobot.datasets import LeRobotDataset
+
+    given, root = config.dataset, Path(meta.root)
+    missing = lacking(root, needed_by(config.policy, meta.features, given.use_imagenet_stats))
+    if not missing:
+        return
+    if not (root / "data").is_dir():
+        root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
+    complete(root, missing, logger.warning)
+
+
+def _check_episodes(dataset: Any, total: int) -> None:
     """Refuse to train on episodes that a dataset does not have: LeRobot leaves them out, and fails where none is left.
 
     Args:
-        dataset: LeRobot's configuration of it.
+        dataset: LeRobot's configuration of it. total: the episodes that it has.
     """
-    from lerobot.datasets import LeRobotDatasetMetadata
-
     if dataset.episodes is None:
         return
-    total = LeRobotDatasetMetadata(
-        dataset.repo_id, root=dataset.root, revision=dataset.revision, repo_type=dataset.repo_type
-    ).total_episodes
     absent = [episode for episode in dataset.episodes if episode >= total]
     if absent or not dataset.episodes:
         raise MemobenchError(
