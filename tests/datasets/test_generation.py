@@ -27,9 +27,12 @@ import pytest
 from lerobot_memobench.datasets import generation, recording
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs import processes
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
+from tests.support.kills import hashes as tree_hash
+from tests.support.kills import killed_at
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
@@ -66,14 +69,6 @@ def recorded(make_demo, monkeypatch):
     monkeypatch.setattr(recording, "record", record)
     monkeypatch.setattr(recording, "model_file", lambda task, poses: "<mujoco/>")
     return calls
-
-
-def tree_hash(root: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 def run(tasks, out, episodes=2, **more):
@@ -603,3 +598,21 @@ def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path, every):
         assert tree_hash(out) == reference, f"killed at change {call}"
     assert killed > 3
     assert unfinished > 3
+
+
+@pytest.mark.parametrize(
+    ("holder", "name", "call", "after"),
+    [
+        (os, "replace", "ds/meta", False),
+        (os, "replace", "ds/meta", True),
+        (VideoWriter, "add", 41, False),
+        (VideoWriter, "close", 3, True),
+    ],
+    ids=["before the last move", "after the last move", "while pictures are encoded", "when a video is written"],
+)
+def test_killed_in_assembly_and_in_encoding(tasks, recorded, tmp_path, holder, name, call, after):
+    run(tasks, tmp_path / "undisturbed")
+    killed_at(holder, name, call, lambda: run(tasks, tmp_path / "ds"), after=after)
+    assert is_dataset(tmp_path / "ds") == (after and name == "replace")
+    run(tasks, tmp_path / "ds")
+    assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "undisturbed")

@@ -64,13 +64,14 @@ def compute(folder: Path, names: Iterable[str]) -> dict[str, Stats]:
 
 
 def _of_pictures(folder: Path, camera: str) -> Stats:
-    from lerobot.datasets.compute_stats import aggregate_stats
+    from lerobot.datasets.compute_stats import aggregate_stats, sample_indices
 
     read, found = frame_reader(folder, camera), []
     for episode, length in enumerate(np.diff(read_frame_table(folder).episodes).tolist()):
         seen = ImageHistograms()
-        for first in range(0, length, BLOCK):
-            pictures = read(episode, list(range(first, min(first + BLOCK, length))))
+        sampled = sample_indices(length)
+        for first in range(0, len(sampled), BLOCK):
+            pictures = read(episode, sampled[first : first + BLOCK])
             for picture in (pictures * 255).round().byte().permute(0, 2, 3, 1).numpy():
                 seen.add(np.ascontiguousarray(picture))
         found.append({camera: seen.stats()})
@@ -91,13 +92,13 @@ def recorded(folder: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def differences(folder: Path) -> Iterator[str]:
-    """Yield in what ``meta/stats.json`` is not what the frames say, a sentence for each feature.
+def differences(folder: Path, names: Iterable[str]) -> Iterator[str]:
+    """Yield in what ``meta/stats.json`` is not what the frames say, a sentence for each of those features.
 
     Quantiles need only lie between the extremes: LeRobot's tools average those of the episodes.
     """
     features, told = read_info(folder)["features"], recorded(folder)
-    for name, stats in compute(folder, measured(features)).items():
+    for name, stats in compute(folder, names).items():
         pictures = features[name]["dtype"] in PICTURES
         low, high = (np.zeros(1), np.ones(1)) if pictures else (stats["min"].ravel(), stats["max"].ravel())
         slack = NEAR_PICTURES if pictures else NEAR * (1 + high - low)

@@ -42,7 +42,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace, check_idling, list_episodes, read_episode
 from lerobot_memobench.datasets.replay import Pictures, replay
-from lerobot_memobench.datasets.statistics import differences
+from lerobot_memobench.datasets.statistics import differences, measured
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import refusing
 from lerobot_memobench.jobs.processes import process_pool
@@ -213,15 +213,18 @@ def _file_checks(folder: Path) -> Iterator[_FileCheck]:
     if written is None:
         yield _FileCheck(folder, MANIFEST_FILE, partial(str, NO_HASHES))
     yield _FileCheck(folder, INFO_FILE.as_posix(), partial(check_whole, folder))
-    yield _FileCheck(folder, STATS_FILE.as_posix(), partial(_check_statistics, folder))
+    names = measured(read_info(folder)["features"])
+    cameras = [name for name in names if name.startswith(image_key(""))]
+    for chosen in ([name for name in names if name not in cameras], *([camera] for camera in cameras)):
+        yield _FileCheck(folder, STATS_FILE.as_posix(), partial(_check_statistics, folder, chosen))
     yield _FileCheck(folder, MANIFEST_FILE, partial(_check_manifest, folder))
     for cache in sorted((folder / CACHES).glob("*")):
         if cache.is_dir():
             yield _FileCheck(folder, f"{CACHES}/{cache.name}", partial(check_cache, cache))
 
 
-def _check_statistics(folder: Path) -> None:
-    for difference in differences(folder):
+def _check_statistics(folder: Path, names: Sequence[str]) -> None:
+    for difference in differences(folder, names):
         raise MemobenchError(difference)
 
 
