@@ -6,7 +6,7 @@ LeRobot normalises by them. Datasets that were converted from its format v2.1 la
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from lerobot_memobench.datasets.feature_cache.reading import read_recorded
 from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats
 from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, STATS_FILE, read_info
 from lerobot_memobench.datasets.video import ImageHistograms, Stats
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, short, telling_of_the_disk, write_file
 from lerobot_memobench.protocol import CLOCK
 
@@ -37,15 +38,7 @@ deviation: they are of pictures before they were encoded."""
 
 def measured(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return the features of which LeRobot keeps statistics: numbers and pictures, and not the clock."""
-    return [
-        name
-        for name, feature in features.items()
-        if name not in CLOCK and (feature["dtype"] in PICTURES or np.dtype(_known(feature["dtype"])).kind in "biuf")
-    ]
-
-
-def _known(dtype: str) -> str:
-    return "O" if dtype in ("string", "language") else dtype
+    return [name for name, one in features.items() if name not in CLOCK and one["dtype"] not in ("string", "language")]
 
 
 def compute(folder: Path, names: Iterable[str]) -> dict[str, Stats]:
@@ -92,10 +85,13 @@ def recorded(folder: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def differences(folder: Path, names: Iterable[str]) -> Iterator[str]:
-    """Yield in what ``meta/stats.json`` is not what the frames say, a sentence for each of those features.
+def check_statistics(folder: Path, names: Iterable[str]) -> None:
+    """Compare the statistics of features in ``meta/stats.json`` with those of the frames.
 
     Quantiles need only lie between the extremes: LeRobot's tools average those of the episodes.
+
+    Raises:
+        MemobenchError: naming the first that differs.
     """
     features, told = read_info(folder)["features"], recorded(folder)
     for name, stats in compute(folder, names).items():
@@ -106,10 +102,10 @@ def differences(folder: Path, names: Iterable[str]) -> Iterator[str]:
             bounded = key.startswith("q") or (pictures and key != "mean" and key != "std")
             least, most = (low, high) if bounded else (value.ravel(), value.ravel())
             there = told.get(name, {}).get(key)
-            if (pictures and key == "count") or _within(there, value.size, least - slack, most + slack):
-                continue
-            yield f"{key} of {name} is {short(there)}, and the frames have {short(value.tolist())}"
-            break
+            if not (pictures and key == "count") and not _within(there, value.size, least - slack, most + slack):
+                raise MemobenchError(
+                    f"{key} of {name} is {short(there)}, and the frames have {short(value.tolist())}; {ADVICE}"
+                )
 
 
 def _within(there: Any, size: int, least: Any, most: Any) -> bool:

@@ -25,7 +25,6 @@ from lerobot_memobench.datasets.lerobot_format.files import (
     check_file,
     check_manifest,
     dataset_files,
-    hashes_in_manifest,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
@@ -42,7 +41,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace, check_idling, list_episodes, read_episode
 from lerobot_memobench.datasets.replay import Pictures, replay
-from lerobot_memobench.datasets.statistics import differences, measured
+from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import refusing
 from lerobot_memobench.jobs.processes import process_pool
@@ -203,8 +202,8 @@ def _file_checks(folder: Path) -> Iterator[_FileCheck]:
     """Yield a check of each file of a dataset, or of those HDF5 files of one that ``folder`` names."""
     root = next((place for place in (folder, *folder.parents[:2]) if (place / MANIFEST_FILE).is_file()), folder)
     written = None
-    with contextlib.suppress(MemobenchError):  # `_check_manifest` names its damage
-        written = hashes_in_manifest(root)
+    with contextlib.suppress(MemobenchError, FileNotFoundError):  # `check_manifest` names its damage
+        written = read_manifest(root).get("files")
     for name in sorted({*dataset_files(root), *(written or {})}):
         if (root / name).is_relative_to(folder):
             yield _FileCheck(root, name, partial(check_file, root / name, (written or {}).get(name)))
@@ -216,21 +215,12 @@ def _file_checks(folder: Path) -> Iterator[_FileCheck]:
     names = measured(read_info(folder)["features"])
     cameras = [name for name in names if name.startswith(image_key(""))]
     for chosen in ([name for name in names if name not in cameras], *([camera] for camera in cameras)):
-        yield _FileCheck(folder, STATS_FILE.as_posix(), partial(_check_statistics, folder, chosen))
-    yield _FileCheck(folder, MANIFEST_FILE, partial(_check_manifest, folder))
+        yield _FileCheck(folder, STATS_FILE.as_posix(), partial(check_statistics, folder, chosen))
+    if (folder / MANIFEST_FILE).exists():
+        yield _FileCheck(folder, MANIFEST_FILE, partial(check_manifest, folder))
     for cache in sorted((folder / CACHES).glob("*")):
         if cache.is_dir():
             yield _FileCheck(folder, f"{CACHES}/{cache.name}", partial(check_cache, cache))
-
-
-def _check_statistics(folder: Path, names: Sequence[str]) -> None:
-    for difference in differences(folder, names):
-        raise MemobenchError(difference)
-
-
-def _check_manifest(folder: Path) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        check_manifest(read_manifest(folder), list_episodes(folder))
 
 
 def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:

@@ -182,10 +182,10 @@ class PublishedFile:
         import h5py
 
         group = self._data.get(name)
+        if group is None:
+            raise Unusable(f"the group {_missing(self._data, name)}")
         if demo_number(name) is None or not isinstance(group, h5py.Group):
-            raise Unusable(
-                "it is no group demo_<number>" if name in self._data else f"the group {_missing(self._data, name)}"
-            )
+            raise Unusable("it is no group demo_<number>")
         states = array(group, "states", (None, None), np.float64)
         actions = array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
         if not isinstance(group.get("obs"), h5py.Group):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
@@ -14,7 +12,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     read_manifest,
     read_to_end,
 )
-from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace
+from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import check_fetched, file_hash
 
@@ -42,18 +40,6 @@ def written_files(folder: Path) -> dict[str, Written]:
     }
 
 
-def hashes_in_manifest(folder: Path) -> dict[str, Written] | None:
-    """Return what `written_files` was when the dataset in ``folder`` was written; None where the manifest has it not.
-
-    Raises:
-        MemobenchError: the manifest is none of this package's.
-    """
-    try:
-        return read_manifest(folder).get("files")
-    except FileNotFoundError:
-        return None
-
-
 def check_file(path: Path, written: Written | None) -> str | None:
     """Read a file to its end and compare it with what was written; return a note where it was written again.
 
@@ -74,20 +60,18 @@ def check_file(path: Path, written: Written | None) -> str | None:
     return f"encoded or written again since {MANIFEST_FILE} was: its content is checked, its bytes are not"
 
 
-def check_manifest(manifest: Mapping[str, Any], places: list[EpisodePlace]) -> None:
-    """Compare seeds, hashes and lengths of the manifest with the episodes of its dataset.
+def check_manifest(folder: Path) -> None:
+    """Compare seeds, hashes and lengths in the manifest of the dataset in ``folder`` with its episodes.
 
     Raises:
         MemobenchError: naming the first episode and field that differ.
     """
-    rows = {row.get("episode_index"): row for row in manifest["episodes"] if row["failure"] is None}
-    for place in places:
-        if place.record is None or rows.keys() == {None}:  # of another program, or of a version without numbers
-            continue
+    rows = {row.get("episode_index"): row for row in read_manifest(folder)["episodes"] if row["failure"] is None}
+    for place in list_episodes(folder) if None not in rows else ():  # a manifest of an earlier version
         row = rows.pop(place.index, {})
-        held = {key: getattr(place.record, key) for key in COMPARED} | {"frames": place.length}
-        for key, value in held.items():
+        held = {key: getattr(place.record, key) for key in COMPARED} if place.record is not None else {}
+        for key, value in {"frames": place.length, **held}.items():
             if row.get(key) != value and value is not None:
                 raise MemobenchError(f"episode {place.index} has {key}={value!r}, {MANIFEST_FILE} {row.get(key)!r}")
-    if rows.keys() - {None}:
-        raise MemobenchError(f"{MANIFEST_FILE} tells of episode {min(rows)}, and the dataset has none of that number")
+    if rows:
+        raise MemobenchError(f"it names episode {next(iter(rows))}, and the dataset has none of that number")
