@@ -116,7 +116,7 @@ def test_statistics_that_are_lacking_are_computed_and_added(root):
     path, names = root / "meta" / "stats.json", measured(read_info(root)["features"])
     check_statistics(root, names)
     whole = json.loads(path.read_text())
-    assert set(names) == set(whole)
+    assert set(names) < set(whole)
     camera = image_key("image")
     left = {name: {key: one[key] for key in one if key[0] != "q"} for name, one in whole.items() if name != camera}
     path.write_text(json.dumps(left))

@@ -56,7 +56,10 @@ def check_file(path: Path, written: Written | None) -> str | None:
     if written is None or file_hash(path) == written["sha256"]:
         return None
     if path.stat().st_size == written["bytes"]:
-        raise MemobenchError(f"its bytes are not those that {MANIFEST_FILE} has the hash of; {ADVICE}")
+        raise MemobenchError(
+            f"it has as many bytes as {MANIFEST_FILE} says, and others: it was damaged or edited; take the dataset "
+            "from its source again, or generate it"
+        )
     return f"encoded or written again since {MANIFEST_FILE} was: its content is checked, its bytes are not"
 
 
