@@ -340,7 +340,7 @@ def test_a_bad_attribute_ends_its_episode_or_file_alone(stove, tmp_path):
     assert summary.episodes == 1
     assert validate(tmp_path / "ds")[0].disagreement is None
     verdicts = validate(source)
-    assert [verdict.episode for verdict in verdicts if verdict.disagreement is None] == ["many.hdf5, demo_0"]
+    assert [verdict.subject for verdict in verdicts if verdict.disagreement is None] == ["many.hdf5, demo_0"]
 
 
 @pytest.mark.parametrize(

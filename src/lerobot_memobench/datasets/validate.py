@@ -154,7 +154,7 @@ def validate(
     folder = Path(folder).absolute()
     if workers < 1:
         raise MemobenchError(f"{workers} workers were asked for; it must be at least 1")
-    checks = [*_checks(folder, tasks), *_file_checks(folder)]
+    checks: list[_Check | _FileCheck] = [*_checks(folder, tasks), *_file_checks(folder)]
     verdicts: dict[int, Verdict] = {}
 
     def note(number: int, verdict: Verdict) -> None:

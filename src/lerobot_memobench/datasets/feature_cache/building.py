@@ -332,7 +332,8 @@ def _meta_text(meta: CacheMeta) -> str:
 
 def _write_hashes(folder: Path, meta: CacheMeta, *, kept: bool) -> None:
     """Write the hash of every file of a complete cache; those there are ``kept`` where only texts came since."""
-    path, earlier = folder / HASHES_FILE, {}
+    path = folder / HASHES_FILE
+    earlier: dict[str, str] = {}
     with contextlib.suppress(FileNotFoundError):
         earlier = read_json(path, dict[str, str], f"delete {folder}, and it is made again") if kept else {}
     names = {file.name for file in folder.iterdir() if file.name not in (META_FILE, HASHES_FILE)}
