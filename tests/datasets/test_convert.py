@@ -103,7 +103,7 @@ def test_our_own_files_come_back_as_they_were(written, stove, short, tmp_path):
 
 def test_our_own_files_replay(source, tmp_path):
     verdicts = validate(source)
-    assert [(v.episode, v.disagreement) for v in verdicts] == [
+    assert [(v.subject, v.disagreement) for v in verdicts] == [
         (f"{name}_demo.hdf5, demo_{k}", None) for name in (BUTTER, STOVE) for k in range(2)
     ]
     with h5py.File(source / f"{STOVE}_demo.hdf5", "a") as file:
