@@ -97,13 +97,26 @@ def test_a_part_alone_is_repeated_as_a_part(fake_lerobot: Any) -> None:
     assert fake_lerobot.ran == [(DRAWER, k) for k in range(4)]
 
 
-def test_missing_episodes_are_a_disagreement(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+INCOMPLETE = {
+    "bare": lambda episodes: [{key: each[key] for key in ("task", "episode", "referent")} for each in episodes],
+    "without steps": lambda episodes: [episodes[0], *({**each, "steps": None} for each in episodes[1:])],
+    "one alone": lambda episodes: episodes[:1],
+    "one more": lambda episodes: [*episodes, {**episodes[-1], "episode": 9}],
+    "another outcome": lambda episodes: [{**episodes[0], "success": not episodes[0]["success"]}, *episodes[1:]],
+}
+
+
+@pytest.mark.parametrize("change", INCOMPLETE)
+def test_a_card_is_repeated_only_with_the_outcome_of_every_episode(fake_lerobot: Any, change: str, capsys: Any) -> None:
     assert lerobot([*COMMAND, "output_dir=out"]) == 0
     card = json.loads(Path("out/card.json").read_text())
-    card["episodes"].append({**card["episodes"][-1], "episode": 9})
+    card["episodes"] = INCOMPLETE[change](card["episodes"])
     Path("card.json").write_text(json.dumps(card))
-    assert memobench(["rerun", "card.json", "--out", "again"]) == 1
-    assert "episode 9 is on the card and was not run here" in capsys.readouterr().out
+    capsys.readouterr()
+    status = 1 if change in ("another outcome", "without steps") else 2
+    assert memobench(["rerun", "card.json", "--out", "again"]) == status
+    assert "\nrepeated: " not in capsys.readouterr().out
+    assert Path("again").exists() == (status == 1), "an incomplete card runs nothing"
 
 
 def test_other_versions_are_told(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,7 +24,7 @@ from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_command
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     line = list(sys.argv[1:] if argv is None else argv)
-    again = f"lerobot: ended by SIGTERM; begin anew with: {shlex.join(['lerobot', *line])}"
+    again = f"begin anew with: {shlex.join(['lerobot', *line])}"
     return run_command(partial(run, line), "lerobot", again)
 
 

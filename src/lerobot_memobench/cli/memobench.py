@@ -111,7 +111,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     use_threads(LEARNING if words and words[0] in LEARN else ACTING)
     begins = "go on" if words and words[0] in GO_ON else "begin anew"
-    again = f"memobench: ended by SIGTERM; {begins} with: {shlex.join(['memobench', *words])}"
+    again = f"{begins} with: {shlex.join(['memobench', *words])}"
     return run_app(app, words, "memobench", again)
 
 

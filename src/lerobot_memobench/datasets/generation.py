@@ -39,6 +39,7 @@ from lerobot_memobench.datasets.staging import (
     STAGING,
     compare_requests,
     episodes_folder,
+    remove_staging,
     staged,
 )
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -291,7 +292,7 @@ def _finished(out: Path, plan: _Plan) -> GenerationSummary:
         check_whole(out)
     if HDF5 in plan.formats:
         _check_hdf5(out, Counter(row["task_name"] for row in manifest["episodes"] if row["failure"] is None))
-    shutil.rmtree(out / STAGING, ignore_errors=True)
+    remove_staging(out)
     return summarise(manifest["episodes"], plan.tasks, out)
 
 

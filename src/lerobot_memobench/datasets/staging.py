@@ -49,7 +49,7 @@ from lerobot_memobench.io import (
     short,
     write_file,
 )
-from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
 
 STAGING = ".staging"
@@ -428,6 +428,13 @@ def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
         folder.mkdir(exist_ok=True)
         clean_temporaries(folder)
         yield folder.absolute()
+
+
+def remove_staging(out: Path) -> None:
+    """Remove the staging folder of a finished run, unless a run is at work there."""
+    staging = out / STAGING
+    with contextlib.suppress(FileNotFoundError, HeldError), locked(staging, out):
+        shutil.rmtree(staging, ignore_errors=True)
 
 
 def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:

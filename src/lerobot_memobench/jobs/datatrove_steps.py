@@ -10,7 +10,7 @@ from datatrove.pipeline.base import PipelineStep
 from lerobot_memobench.jobs.processes import Job, saying_how_to_go_on
 
 PREEMPTED = (
-    "memobench: ended by SIGTERM; what is finished stays, and the job goes on when Slurm requeues it, or when the "
+    "what is finished stays, and the job goes on when Slurm requeues it, or when the "
     "command that submitted it is given again (an evaluation's with resume=true)"
 )
 
@@ -29,7 +29,7 @@ class JobsStep(PipelineStep):
         """Do what is not finished yet of every ``world_size``-th part of the list."""
         yield from data or ()
         count = len(self.jobs)
-        with saying_how_to_go_on(lambda: PREEMPTED):
+        with saying_how_to_go_on("memobench", lambda: PREEMPTED):
             for job in self.jobs[rank * count // world_size : (rank + 1) * count // world_size]:
                 if not job.finished():
                     with self.track_time("job"):

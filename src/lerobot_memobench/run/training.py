@@ -11,10 +11,11 @@ from __future__ import annotations
 import copy
 import functools
 import logging
+import os
 import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, chooses_inputs, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
-from lerobot_memobench.jobs.processes import saying_how_to_go_on
+from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
 from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_FILE
@@ -106,12 +107,38 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
         return 0
     root = arguments.get("dataset.root")
     with (
-        saying_how_to_go_on(lambda: f"lerobot: {how_to_go_on(arguments, line, begun)}"),
+        saying_how_to_go_on("lerobot", lambda: how_to_go_on(arguments, line, begun)),
+        held_run(arguments),
         trained_on(prompt_frames, obs_type),
         naming_damage(Path(root) if root else None),
         without_configuration(),
     ):
         return call_lerobot("train", arguments.flags)
+
+
+@contextmanager
+def held_run(arguments: LerobotArguments) -> Iterator[None]:
+    """Hold the folder of a training that is named, in its first process, by a lock file beside it.
+
+    LeRobot refuses a folder that is there before its first checkpoint, so there is none to hold until then.
+
+    Raises:
+        MemobenchError: another training holds it.
+    """
+    named = arguments.get("output_dir") or read_config_file(arguments.get(CONFIG_FILE)).get("output_dir")
+    if not isinstance(named, str) or os.environ.get("RANK", "0") != "0":
+        yield
+        return
+    run = Path(named).expanduser().absolute()
+    run.parent.mkdir(parents=True, exist_ok=True)
+    lock = run.with_name(f".{run.name}.lock")
+    lock.touch()
+    with locked(lock, run):
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows keeps a file that is open
+                lock.unlink()
 
 
 def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Arguments]:
@@ -451,12 +478,12 @@ def how_to_go_on(arguments: LerobotArguments, line: Sequence[str], begun: float)
     saved = [link for link in links if link.exists() and (given is not None or link.lstat().st_mtime >= begun)]
     if not saved:
         again = shlex.join(["lerobot", "train", *line])
-        return f"ended by SIGTERM before a checkpoint was saved; begin anew with: {again}"
+        return f"no checkpoint was saved; begin anew with: {again}"
     run = max(saved, key=lambda link: link.lstat().st_mtime).parents[1]
     # LeRobot's configuration has no place for these.
     kept = [word for word in line if word.partition("=")[0] in TRAINING_OPTIONS]
     again = shlex.join(["lerobot", "train", f"output_dir={run}", "resume=true", *kept])
-    return f"ended by SIGTERM; go on with: {again}"
+    return f"go on with: {again}"
 
 
 # --- what is added to LeRobot's training: which frames are trained on, and what a policy's inputs are ---
