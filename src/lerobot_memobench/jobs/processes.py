@@ -161,6 +161,7 @@ def saying_how_to_go_on(program: str, how: Callable[[], str]) -> Iterator[None]:
     except (EOFError, ConnectionError, RuntimeError) as error:
         if not _is_dead_worker(error):
             raise
+        traceback.clear_frames(error.__traceback__)  # CPython 3.12.1 crashes where it collects a pipe's buffer in them
         raise WorkerKilledError(
             "a worker process was killed, usually because memory ran out; choose a smaller batch_size, or fewer workers"
             f"; {how()}"

@@ -31,7 +31,8 @@ from lerobot_memobench.io import write_file
 from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.run.card import CARD_MARKDOWN
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line
-from lerobot_memobench.run.run import VIDEOS, held_folder
+from lerobot_memobench.run.run import VIDEOS
+from lerobot_memobench.run.run import made as made_folder
 from lerobot_memobench.tasks.catalogue import BOWL
 from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
 
@@ -91,7 +92,7 @@ def make_demo(out: Path, evaluate: Callable[[Path], int], compare: Callable[[Pat
     there = [name for name in PRODUCTS if (out / name).exists()]
     if there and CONTACT_SHEET not in there:
         raise MemobenchError(f"{out} holds {there[0]}, and no earlier demo; name a new or an empty folder")
-    with held_folder(out), tempfile.TemporaryDirectory(prefix=".demo-", dir=out) as scratch:
+    with made_folder(out), tempfile.TemporaryDirectory(prefix=".demo-", dir=out) as scratch:
         work = Path(scratch) / "eval"
         status = evaluate(work)
         if status:

@@ -34,7 +34,7 @@ from lerobot_memobench.run.card import (
     with_episodes,
     write_card,
 )
-from lerobot_memobench.run.run import VIDEOS, EvaluationReport, held_folder
+from lerobot_memobench.run.run import VIDEOS, EvaluationReport, made
 
 SHARDS = "shard-*-of-*"
 """Folders of the parts of an evaluation, in its own."""
@@ -46,7 +46,7 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
     Raises:
         MemobenchError: see `merge`; or another run is writing to ``out``.
     """
-    with held_folder(out):
+    with made(out):
         return merge_held(out, folders)
 
 

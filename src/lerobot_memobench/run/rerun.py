@@ -65,14 +65,13 @@ NOTES = ("policy.label", "policy.keys")
 SERVERS = ("policy.host", "policy.servers")
 
 RECORDING = "eval.recording"
-"""Writes a dataset of the rollouts beside them: no outcome depends on it, and a repetition leaves it out."""
-MOST = {"env.horizon": 10 * HORIZON, "eval.n_episodes": MOST_EPISODES, "eval.batch_size": 512}
-MOST |= {"env.max_parallel_tasks": 512, "env.videos": MOST_EPISODES}
-"""Setting -> the largest number that a card may ask for."""
+"""Writes a dataset of the rollouts: no outcome depends on it, and a repetition leaves it out."""
+MOST = {"env.horizon": 10 * HORIZON, "eval.n_episodes": MOST_EPISODES, "env.videos": MOST_EPISODES}
+MOST |= {"eval.batch_size": 512, "env.max_parallel_tasks": 512}
 MOST_STEPS = 100 * HORIZON
-"""Control steps of an episode, pauses included, that a card may ask for."""
+"""What a card may ask for: setting -> its largest number, and control steps of an episode with its pauses."""
 NAMED = {"success", "steps", "checkpoints"}
-"""Fields of an episode without which a card says nothing that a repetition could contradict."""
+"""What a card must name of an episode, since a repetition could contradict nothing else."""
 
 FLAG = re.compile(r"--([\w.]+)=(.*)", re.DOTALL)
 WORD = re.compile(r"[\w.,+' ()-]*")

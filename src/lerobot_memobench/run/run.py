@@ -121,7 +121,7 @@ def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | No
             card = counted(plan, card, tell)
             write_card(plan.log, card)
             left = remainder(plan, ranges)
-            with made(left.output):  # LeRobot makes it for videos of its own only
+            with made(left.output, hold=False):  # LeRobot makes it for videos of its own only
                 status = call_lerobot("eval", left.lerobot_flags)
             return Ended(status, None if status else _finish(plan, card))
     finally:
@@ -247,13 +247,13 @@ def logged(folder: Path, referent: str) -> set[tuple[str, int]]:
 
 @contextmanager
 def held(plan: EvaluationPlan) -> Iterator[None]:
-    """Hold the folders of an evaluation and of its log, see `held_folder`.
+    """Hold the folders of an evaluation and of its log, see `made`.
 
     Drafts of a killed run are removed, and of a run that ends before its first episode the files that it made.
     """
     with ExitStack() as stack:
         for folder in {folder.absolute(): folder for folder in (plan.output, plan.log)}.values():
-            stack.enter_context(held_folder(folder))
+            stack.enter_context(made(folder))
         for folder in (plan.log, plan.log / VIDEOS, plan.log / MEMORY_READS):
             remove_drafts(folder)
         files = [*(plan.log / name for name in (CARD_FILE, CARD_MARKDOWN)), plan.output / RUN_FILE]
@@ -266,8 +266,8 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
 
 
 @contextmanager
-def held_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder that is written to, and make it where it is missing; of a new one nothing empty stays behind.
+def made(folder: Path, hold: bool = True) -> Iterator[None]:
+    """Make a folder, and hold it, for as long as it is written to; of new ones nothing that is empty stays behind.
 
     Raises:
         MemobenchError: another run holds it, or it is a file.
@@ -275,24 +275,12 @@ def held_folder(folder: Path) -> Iterator[None]:
     check_folder(folder)
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder, folder):
+    with locked(folder, folder) if hold else nullcontext():
         try:
             yield
         finally:
             for path in new:
                 _remove_empty(path)
-
-
-@contextmanager
-def made(folder: Path) -> Iterator[None]:
-    """Make a folder for as long as it is written to; of a new one nothing that is empty stays behind."""
-    new = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    finally:
-        if new:
-            _remove_empty(folder)
 
 
 def _remove_empty(folder: Path) -> None:

@@ -24,7 +24,7 @@ from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.card import card_of
 from lerobot_memobench.run.merging import SHARDS, merge_held
 from lerobot_memobench.run.plan import EvaluationPlan, Shard
-from lerobot_memobench.run.run import EvaluationReport, Tell, check_folder, check_new, held_folder, logged, resumed_card
+from lerobot_memobench.run.run import EvaluationReport, Tell, check_folder, check_new, logged, made, resumed_card
 
 LOGS = "logs"
 
@@ -194,7 +194,7 @@ def run_shards(
         finish: what Slurm's last job calls with the evaluation's folder and those of its parts. It is pickled.
     """
     options, out, folders = plan.options, plan.output.absolute(), [job.folder for job in jobs]
-    with held_folder(out):
+    with made(out):
         complete = run_jobs(
             jobs,
             workers=options.workers or len(jobs),

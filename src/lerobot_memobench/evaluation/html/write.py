@@ -102,12 +102,12 @@ def write_html(
     with locked(out, out):
         if not (out / PAGE).exists():
             write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on
-        names, earlier = {name for each in addresses for name in each.values()}, _placed(out)
-        _note_placed(out, earlier | names)
+        placed, earlier = {name for each in addresses for name in each.values()}, _placed(out)
+        _note_placed(out, earlier | placed)
         place_videos(chosen, link)
         write_file(out / PAGE, text)
-        _remove_videos(out, earlier - names)
-        _note_placed(out, names)
+        _remove_videos(out, earlier - placed)
+        _note_placed(out, placed)
     return Written(
         page=out / PAGE,
         rollouts=sum(len(run.records) for run in runs),
