@@ -27,9 +27,9 @@ COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would st
 #: generator of its own; what it drew shows in the films.
 EXPERT = [f"tasks={TASKS}", "episodes=6", "horizon=70", "env.render_every=10"]
 RANDOM = [f"tasks={TASKS}", "policy=memobench_random", "episodes=6", "horizon=40"]
-#: Each scene with each variant, and pauses.
-PACED = ["policy=memobench_random", "evidence=true", "referent=random", "episodes=6", "horizon=40", "pause_steps=10"]
-PACED += ["tasks=put_the_butter_picked_up_in_the_prompt_video_on_the_plate"]
+#: Each scene with each variant, and a pause within 120 steps.
+PACED = ["policy=memobench_random", "evidence=true", "referent=random", "episodes=6", "horizon=130", "pause_steps=10"]
+PACED += ["tasks=put_the_butter_into_the_bowl_from_the_prompt_video", "demonstration_prompt=false"]
 
 IMPORTED = ("lerobot.scripts.lerobot_eval", "lerobot_memobench.envs.memobench_env")
 IMPORTED += ("lerobot_memobench.datasets.generation", "lerobot_memobench.cli.lerobot")
@@ -99,6 +99,7 @@ def test_killed_and_gone_on_with(server: ForkServer, tmp_path: Path, settings: l
     assert start(server, undisturbed, settings, resume=False).wait() == 0
     run_s = time.monotonic() - began
     reference = comparable(undisturbed)
+    assert settings is not PACED or all(each["paused_steps"] and "variants" in each for each in reference)
 
     rng = random.Random(f"{settings}")
     kills, history = 0, []
