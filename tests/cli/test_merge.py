@@ -231,18 +231,27 @@ def test_slurm_gets_a_job_per_part_and_one_that_merges(
     for line in (
         "#SBATCH --partition=gpu",
         "#SBATCH --array=0-3%2",
-        "--dependency=afterok:4711",
+        "--dependency=afterany:4711",  # a failed part does not leave it waiting
+        "#SBATCH --kill-on-invalid-dep=yes",
         "#SBATCH --account=lab",
         "#SBATCH --cpus-per-task=2",
         "#SBATCH --mem-per-cpu=4G",
     ):
         assert line in script, line
     assert "requeue" not in script
-    for part, ranks in (("make", range(4)), ("finish", range(1))):
-        for rank in ranks:
-            monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))
-            with open(tmp_path / "out" / "logs" / part / "executor.pik", "rb") as file:
-                dill.load(file).run()  # noqa: S301 - datatrove wrote it, in this test
+
+    def run(part: str, rank: int = 0) -> None:
+        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))
+        with open(tmp_path / "out" / "logs" / part / "executor.pik", "rb") as file:
+            dill.load(file).run()  # noqa: S301 - datatrove wrote it, in this test
+
+    for rank in (0, 1, 3):
+        run("make", rank)
+    with pytest.raises(SystemExit, match=r"^memobench: 1 of 4 jobs .*shard-3-of-4.* resume=true"):
+        run("finish")
+    assert not Path("out/report.md").exists()
+    run("make", 2)
+    run("finish")
     assert len(read_episodes("out")) == 8
     assert Path("out/report.md").is_file()
 

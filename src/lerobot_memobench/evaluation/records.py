@@ -130,11 +130,15 @@ class SealedRun(TypedDict):
     """How often a policy was started on the sealed seeds (`memobench test-sealed`).
 
     Attributes:
+        started: when. policy: hash of what it loads. scenes: hash of task files, referent, seed and episodes.
         release: of this package.
         run: this start's number, from 1 on, among those of the policy with the release.
         earlier: the starts before it.
     """
 
+    started: NotRequired[str]
+    policy: NotRequired[str]
+    scenes: NotRequired[str]
     release: str
     run: Count
     earlier: list[SealedStart]

@@ -21,6 +21,7 @@ from typing import Protocol
 from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError, unsupported_system
+from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 
@@ -65,6 +66,25 @@ class Advance:
 
 
 ProgressCallback = Callable[[Advance], None]
+
+
+MOST_NAMED = 5
+
+
+def check_finished(jobs: Sequence[Job], logs: Path) -> None:
+    """Refuse to go on with jobs that ended without a result, as a killed one does.
+
+    Raises:
+        MemobenchError: naming them, and how to go on.
+    """
+    failed = [job.folder.name for job in jobs if not job.finished()]
+    if not failed:
+        return
+    names = ", ".join(failed[:MOST_NAMED]) + (f" and {len(failed) - MOST_NAMED} more" if failed[MOST_NAMED:] else "")
+    raise MemobenchError(
+        f"{len(failed)} of {count_of(len(jobs), 'job')} ended without a result ({names}); "
+        f"see {logs}, then run the same command again (an evaluation's with resume=true), which runs these alone"
+    )
 
 
 def run_in_processes(jobs: Sequence[Job], workers: int, tell: Callable[[Job], None]) -> None:

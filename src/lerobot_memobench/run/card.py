@@ -314,7 +314,10 @@ def _sealed_line(sealed: Mapping[str, Any] | None) -> list[str]:
     if sealed is None:
         return []
     before = "; ".join(f"{start['started'][:10]} {start['suite']} {start['referent']}" for start in sealed["earlier"])
-    return [f"| sealed test | run {sealed['run']} with release {sealed['release']}; before it: {before or 'none'} |"]
+    lines = [f"| sealed test | run {sealed['run']} with release {sealed['release']}; before it: {before or 'none'} |"]
+    return lines + [
+        f"| {name} of that run | {sealed[name]} |" for name in ("started", "policy", "scenes") if name in sealed
+    ]
 
 
 def _policy_lines(card: Mapping[str, Any]) -> list[str]:

@@ -112,13 +112,18 @@ def _what_is_run(plan: EvaluationPlan) -> str:
 def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
     """Run LeRobot's evaluation on what is left."""
     status, trained = 1, not isinstance(plan.policy, UntrainedConfig)
+
+    def begin() -> None:
+        nonlocal card
+        card = counted(plan, with_checkpoint(card, plan.policy_path), tell)
+        write_card(plan.log, card)
+
     try:
         with (
             nullcontext() if plan.options.verbose else without_chatter(trained),
             calm_output(),
-            steered(plan.seed, ranges, ReadLog.of(plan)),
+            steered(plan.seed, ranges, ReadLog.of(plan), begin),
         ):
-            card = counted(plan, card, tell)
             write_card(plan.log, card)
             left = remainder(plan, ranges)
             with made(left.output, hold=False):  # LeRobot makes it for videos of its own only
