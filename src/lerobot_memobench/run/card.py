@@ -29,6 +29,7 @@ from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.evaluation.records import CARD_FILE
+from lerobot_memobench.evaluation.tables import markdown_text
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
 from lerobot_memobench.run.arguments import without_flags
@@ -295,6 +296,11 @@ def markdown(card: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _row(name: str, value: object) -> str:
+    """Return a row of a table; what it holds may be a stranger's."""
+    return f"| {markdown_text(name)} | {markdown_text(str(value))} |"
+
+
 def _protocol_lines(card: Mapping[str, Any]) -> list[str]:
     protocol = card["protocol"]
     tasks = protocol.get("tasks", [])
@@ -302,44 +308,45 @@ def _protocol_lines(card: Mapping[str, Any]) -> list[str]:
     others = {key: value for key, value in protocol.items() if key not in (*SETTINGS, *EXTENT)}
     return [
         *("| protocol | |", "|---|---|"),
-        f"| tasks | {len(tasks)}: {', '.join(tasks)} |",
-        f"| episodes of each | {protocol.get('episodes')} |",
-        *(f"| {name.replace('_', ' ')} | {value} |" for name, value in {**settings, **others}.items()),
-        *_sealed_line(card.get("sealed")),
-        f"| episodes in the log | {len(card['episodes'])} |",
+        _row("tasks", f"{len(tasks)}: {', '.join(tasks)}"),
+        _row("episodes of each", protocol.get("episodes")),
+        *(_row(name.replace("_", " "), value) for name, value in {**settings, **others}.items()),
+        *_sealed_lines(card.get("sealed")),
+        _row("episodes in the log", len(card["episodes"])),
     ]
 
 
-def _sealed_line(sealed: Mapping[str, Any] | None) -> list[str]:
+def _sealed_lines(sealed: Mapping[str, Any] | None) -> list[str]:
     if sealed is None:
         return []
     before = "; ".join(f"{start['started'][:10]} {start['suite']} {start['referent']}" for start in sealed["earlier"])
-    lines = [f"| sealed test | run {sealed['run']} with release {sealed['release']}; before it: {before or 'none'} |"]
-    return lines + [
-        f"| {name} of that run | {sealed[name]} |" for name in ("started", "policy", "scenes") if name in sealed
-    ]
+    number = f"run {sealed['run']} with release {sealed['release']}; before it: {before or 'none'}"
+    told = {f"{name} of that run": sealed[name] for name in ("started", "policy", "scenes") if name in sealed}
+    return [_row("sealed test", number), *(_row(name, value) for name, value in told.items())]
 
 
 def _policy_lines(card: Mapping[str, Any]) -> list[str]:
     policy = card["policy"]
-    lines = ["| policy | |", "|---|---|"]
-    lines += [f"| type | {policy.get('type', 'not known')} |", f"| seed | {policy.get('seed')} |"]
+    lines = [
+        "| policy | |",
+        "|---|---|",
+        _row("type", policy.get("type", "not known")),
+        _row("seed", policy.get("seed")),
+    ]
     if card["checkpoint"]:
-        lines += [f"| checkpoint | {card['checkpoint']['path']} |"]
-        lines += [f"| its sha256 | {policy.get('sha256', 'not known')} |"]
+        lines += [_row("checkpoint", card["checkpoint"]["path"]), _row("its sha256", policy.get("sha256", "not known"))]
     if "detector_sha256" in policy:
-        lines += [f"| sha256 of its detector | {policy['detector_sha256']} |"]
-    return lines + [f"| trained on: {key} | {value} |" for key, value in (card["trained_on"] or {}).items()]
+        lines += [_row("sha256 of its detector", policy["detector_sha256"])]
+    return lines + [_row(f"trained on: {key}", value) for key, value in (card["trained_on"] or {}).items()]
 
 
 def _run_lines(number: int, run: Mapping[str, Any]) -> list[str]:
     times = run.get("times", 1)
+    command = " ".join(" ".join(run["command"]).split())
     lines = [f"## Run {number}" + (f" (started {times} times)" if times > 1 else ""), ""]
-    lines += ["```", " ".join(run["command"]), "```", "", "| | |", "|---|---|"]
-    lines += [f"| {name} | {version} |" for name, version in run["versions"].items()]
-    lines += [f"| commit | {run['git_commit']} |", f"| batch size | {run['batch_size']} |"]
-    lines += [f"| {name} | {value} |" for name, value in run["machine"].items()]
-    return lines + [f"| {name} | {value} |" for name, value in run["gl"].items()]
+    lines += [f"    {command}", "", "| | |", "|---|---|"]  # indented: no text ends such a block
+    facts = {"commit": run["git_commit"], "batch size": run["batch_size"]}
+    return lines + [_row(*fact) for fact in ({**run["versions"], **facts, **run["machine"], **run["gl"]}).items()]
 
 
 # --- whether an episode was drawn as it is drawn here ---
