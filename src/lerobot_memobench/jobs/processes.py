@@ -21,7 +21,6 @@ from typing import Protocol
 from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError, unsupported_system
-from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 
@@ -82,7 +81,7 @@ def check_finished(jobs: Sequence[Job], logs: Path) -> None:
         return
     names = ", ".join(failed[:MOST_NAMED]) + (f" and {len(failed) - MOST_NAMED} more" if failed[MOST_NAMED:] else "")
     raise MemobenchError(
-        f"{len(failed)} of {count_of(len(jobs), 'job')} ended without a result ({names}); "
+        f"{len(failed)} of {len(jobs)} jobs ended without a result ({names}); "
         f"see {logs}, then run the same command again (an evaluation's with resume=true), which runs these alone"
     )
 
