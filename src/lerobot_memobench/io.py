@@ -100,6 +100,17 @@ def file_name(text: object, what: str) -> str:
     return text
 
 
+def home_expanded(word: str) -> str:
+    """Return a word of a command line in which a path or a value that begins with ``~/`` leads to the home folder.
+
+    Not every shell expands it behind ``key=``, and none does in quotes.
+    """
+    key, equals, value = word.partition("=")
+    if value.startswith("~/"):
+        return key + equals + os.path.expanduser(value)
+    return os.path.expanduser(word) if word.startswith("~/") else word
+
+
 def file_hash(path: Path) -> str:
     """Return the sha256 (hex) of a file; one that has not changed is read once per process."""
     found = os.stat(path)

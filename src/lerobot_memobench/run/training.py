@@ -96,7 +96,7 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
     check_task_names(given)
     arguments = read_arguments("train", given)
     if given.wants_help:
-        return call_lerobot("train", arguments.flags)
+        return call_lerobot("train", arguments.for_parser)
     arguments = complete_training(arguments)
     refuse_too_large(arguments)
     note, left = note_on_resume(arguments)
@@ -113,7 +113,7 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
         naming_damage(Path(root) if root else None),
         without_configuration(),
     ):
-        return call_lerobot("train", arguments.flags)
+        return call_lerobot("train", arguments.for_parser)
 
 
 @contextmanager
@@ -360,7 +360,7 @@ def check_same_training(arguments: LerobotArguments) -> None:
     if checkpoint is None:
         return
     _check_same_dataset(arguments, checkpoint)
-    given = overrides("policy", arguments.flags)
+    given = overrides("policy", arguments.for_parser)
     if not given:
         return
     from lerobot.configs.policies import PreTrainedConfig
