@@ -100,6 +100,11 @@ def file_name(text: object, what: str) -> str:
     return text
 
 
+def cache_folder() -> Path:
+    """Return the folder for files that this package can make again."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_memobench"
+
+
 def home_expanded(word: str) -> str:
     """Return a word of a command line in which a path or a value that begins with ``~/`` leads to the home folder.
 

@@ -143,9 +143,11 @@ def test_what_is_no_flag_of_ours(flags: Any, said: str) -> None:
 
 
 @pytest.mark.parametrize("label", [":", "=", "a: b: c"])
-def test_a_value_that_is_no_yaml_is_told(label: str) -> None:
+def test_a_text_need_be_no_yaml(label: str) -> None:
+    plan: Any = plan_line(["env=memobench", "policy=memobench_remote", f"policy.label={label}"])
+    assert plan.policy.label == label
     with pytest.raises(MemobenchError, match=r"a value of policy\. cannot be read"):
-        plan_line(["env=memobench", "policy=memobench_remote", f"policy.label={label}"])
+        plan_line(["env=memobench", "policy=diffusion", "policy.down_dims=[1"])
 
 
 def test_a_checkpoint_that_the_card_does_not_identify_is_refused() -> None:

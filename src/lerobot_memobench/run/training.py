@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import logging
 import os
 import shlex
@@ -28,6 +29,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     PRIVILEGED,
     check_clock,
     naming_damage,
+    without_pattern,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
@@ -40,13 +42,16 @@ from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
 from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_FILE
 from lerobot_memobench.policies.checkpoint import (
+    LAST,
     as_trained,
     check_as_begun,
     checkpoint_folder,
     checkpoint_type,
+    checkpoints_of,
     differing,
     local_folder,
     read_json,
+    text_of_link,
 )
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import (
@@ -105,6 +110,7 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
             tell(noted)
     if not left:
         return 0
+    make_room_for_link(arguments)
     root = arguments.get("dataset.root")
     with (
         saying_how_to_go_on("lerobot", lambda: how_to_go_on(arguments, line, begun)),
@@ -324,20 +330,42 @@ def last_checkpoint(run: Path) -> Path:
     Raises:
         MemobenchError: there is none.
     """
-    checkpoints = run / "checkpoints"
-    numbered = sorted(
-        (path for path in checkpoints.glob("*") if path.name.isdecimal()), key=lambda path: int(path.name)
-    )
-    # The link is set once a checkpoint is whole; a copy of the run may lack it, and so does one killed at that moment.
-    for folder in (checkpoints / "last", *reversed(numbered)):
-        told = (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file()
-        if told and (folder.name == "last" or any(folder.glob("training_state/**/" + OPTIMIZER_GROUPS))):
-            return folder / "pretrained_model"
+    found = next(whole_checkpoints(run), None)
+    if found is not None:
+        return found / "pretrained_model"
     what = "holds no whole checkpoint" if run.is_dir() else "does not exist"
     raise MemobenchError(
         f"output_dir={run} {what}, so there is nothing to go on with; a first one is saved after save_freq steps: "
         "leave resume=true out and name a new folder"
     )
+
+
+def whole_checkpoints(run: Path) -> Iterator[Path]:
+    """Yield the checkpoints of a training run that can be gone on with, the last one first."""
+    for folder in checkpoints_of(run):
+        told = (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file()
+        # The link is set once a checkpoint is whole.
+        if told and (folder.name == LAST or any(folder.glob("training_state/**/" + OPTIMIZER_GROUPS))):
+            yield folder
+
+
+def make_room_for_link(arguments: LerobotArguments) -> None:
+    """Remove a file that stands for the link ``last`` of a training that goes on: LeRobot makes the link itself.
+
+    Raises:
+        MemobenchError: it is a folder, or another file.
+    """
+    checkpoint = _gone_on_with(arguments)
+    last = None if checkpoint is None else checkpoint.parents[1] / LAST
+    if last is None or last.is_symlink() or not last.exists():
+        return
+    named = text_of_link(last)
+    if not (named and named.isdecimal()):
+        raise MemobenchError(
+            f"{last} is no link, and LeRobot makes a link of that name when it saves a checkpoint; give it another "
+            "name, such as the number of its step"
+        )
+    last.unlink(missing_ok=True)  # another process of this training may have
 
 
 def _check_same_policy(given: Arguments, checkpoint: Path, folder: str) -> None:
@@ -474,12 +502,12 @@ def how_to_go_on(arguments: LerobotArguments, line: Sequence[str], begun: float)
     """
     given = arguments.get("output_dir")
     runs = [Path(given)] if given is not None else list(Path("outputs/train").glob("*/*"))
-    links = [run / "checkpoints" / "last" for run in runs]
-    saved = [link for link in links if link.exists() and (given is not None or link.lstat().st_mtime >= begun)]
+    saved = [checkpoint for run in runs for checkpoint in itertools.islice(whole_checkpoints(run), 1)]
+    saved = [one for one in saved if given is not None or one.lstat().st_mtime >= begun]
     if not saved:
         again = shlex.join(["lerobot", "train", *line])
         return f"no checkpoint was saved; begin anew with: {again}"
-    run = max(saved, key=lambda link: link.lstat().st_mtime).parents[1]
+    run = max(saved, key=lambda one: one.lstat().st_mtime).parents[1]
     # LeRobot's configuration has no place for these.
     kept = [word for word in line if word.partition("=")[0] in TRAINING_OPTIONS]
     again = shlex.join(["lerobot", "train", f"output_dir={run}", "resume=true", *kept])
@@ -526,8 +554,11 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
             _check_streaming(config)
         check_transforms(config.policy, config.dataset.image_transforms.enable)
         _check_distribution(config)
-        _check_episodes(config.dataset)
-        train, held_out = make(config)
+        opened = copy.copy(config)
+        if config.dataset.root is not None:
+            opened.dataset = replace(config.dataset, root=str(without_pattern(Path(config.dataset.root))))
+        _check_episodes(opened.dataset)
+        train, held_out = make(opened)
         check_clock(train.meta.features, train.root)
         if EPISODE_INFO in train.meta.features and not config.dataset.streaming:
             check_idling(Path(train.root))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import json
 import math
+import os
 import traceback
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
@@ -17,7 +20,17 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
 from lerobot_memobench.datasets.staging import STAGING
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Whole, count_of, first_fault, parsed, read_json, refusing
+from lerobot_memobench.io import (
+    Count,
+    Malformed,
+    Whole,
+    cache_folder,
+    count_of,
+    first_fault,
+    parsed,
+    read_json,
+    refusing,
+)
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
 
 DEFAULT_REPO_ID = "memobench/memobench"
@@ -307,6 +320,22 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     found: dict[str, Any] = read_json(folder / MANIFEST_FILE, Manifest, NO_MANIFEST)
     return found
+
+
+def without_pattern(folder: Path) -> Path:
+    """Return a path of a dataset's folder for LeRobot, which takes names such as ``obj [v2]`` for patterns of `glob`.
+
+    It is the folder itself, or a link to it in the cache: the same at every call, since LeRobot keeps a copy of the
+    tables for each path.
+    """
+    place = str(folder.absolute())
+    if glob.escape(place) == place or not folder.is_dir():
+        return folder
+    link = cache_folder() / "datasets" / hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
+    link.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        link.symlink_to(place)
+    return link
 
 
 # --- is it whole? ---
