@@ -85,7 +85,7 @@ def folder_with_checkpoint(text: str) -> Path | None:
 
 
 def checkpoints_of(run: Path) -> list[Path]:
-    """Return the checkpoint folders of a training run, whole or not: the one that ``last`` names, then the newest first.
+    """Return a training run's checkpoint folders, whole or not: the one that ``last`` names, then the newest first.
 
     ``last`` is a link. Where files are copied without links it is missing, a folder, or a file with the link's text.
     """

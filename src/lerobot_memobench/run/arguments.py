@@ -229,7 +229,9 @@ def _for_parser(flag: str, known: Mapping[str, Any]) -> str:
         return flag
     if text.startswith(INCLUDE):
         if kind is not Path and not key.endswith(("root", "_dir")):
-            raise MemobenchError(f"found {key}={text}; LeRobot's parser takes text that begins with {INCLUDE} for a file")
+            raise MemobenchError(
+                f"found {key}={text}; LeRobot's parser takes text that begins with {INCLUDE} for a file"
+            )
         text = f"./{text}"
     try:
         is_plain = all(parser.parse_string(text) == text for parser in (YAMLParser, JSONParser))

@@ -550,8 +550,8 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         from lerobot_memobench.datasets.execution_frames import ExecutionFrames, leave_out_prompts
         from lerobot_memobench.policies.memobench_mem.sampler import check_transforms
 
-        if prompt_frames is not False:
-            _check_streaming(config)
+        _check_streaming(config, prompt_frames)
+        _check_adapters(config)
         check_transforms(config.policy, config.dataset.image_transforms.enable)
         _check_distribution(config)
         opened = copy.copy(config)
@@ -559,6 +559,7 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
             opened.dataset = replace(config.dataset, root=str(without_pattern(Path(config.dataset.root))))
         _check_episodes(opened.dataset)
         train, held_out = make(opened)
+        _check_streamed(train, config.policy)
         check_clock(train.meta.features, train.root)
         if EPISODE_INFO in train.meta.features and not config.dataset.streaming:
             check_idling(Path(train.root))
@@ -583,12 +584,60 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
     return run
 
 
-def _check_streaming(config: Any) -> None:
+def _check_streaming(config: Any, prompt_frames: bool | None) -> None:
     """Refuse to stream to a policy that draws its own execution frames: it would get prompts, which do not count."""
-    if config.dataset.streaming and getattr(config.policy, "execution_only", False):
+    if not config.dataset.streaming:
+        return
+    if config.num_workers == 0:
+        raise MemobenchError(
+            "dataset.streaming=true and num_workers=0 were asked for, and LeRobot's stream gives its frames to loaders "
+            "alone; use num_workers=1 or more"
+        )
+    root = None if config.dataset.root is None else Path(config.dataset.root)
+    if root is not None and without_pattern(root) != root:
+        raise MemobenchError(
+            f"dataset.streaming=true cannot read {root}: LeRobot takes the folder's name for a pattern; rename the "
+            "folder, or use dataset.streaming=false"
+        )
+    if prompt_frames is not False and getattr(config.policy, "execution_only", False):
         raise MemobenchError(
             f"policy={config.policy.type} draws execution frames alone, and dataset.streaming=true leaves no choice of "
             "frames; use dataset.streaming=false, or prompt_frames=false to take execution frames as they come"
+        )
+
+
+def _check_streamed(dataset: Any, policy: Any) -> None:
+    """Refuse to stream several frames of a single number, such as the clock's: LeRobot cannot stack them."""
+    if hasattr(dataset.hf_dataset, "data"):
+        return
+    single = [key for key in dataset.delta_indices or {} if tuple(dataset.meta.features[key]["shape"]) == (1,)]
+    if single:
+        raise MemobenchError(
+            f"policy={policy.type} asks for several frames of {single[0]}, a single number, which LeRobot's stream "
+            "cannot give; use dataset.streaming=false"
+        )
+
+
+def _check_adapters(config: Any) -> None:
+    """Refuse adapters (LeRobot's ``peft``) that LeRobot would refuse once it has built the policy."""
+    policy = config.policy
+    if config.peft is None or policy is None:
+        return
+    from lerobot.policies.factory import get_policy_class
+    from lerobot.policies.pretrained import PreTrainedPolicy
+
+    kind = get_policy_class(policy.type)
+    # MolmoAct2 names its weights by `checkpoint_path`.
+    if not policy.pretrained_path and not getattr(policy, "checkpoint_path", None):
+        raise MemobenchError(
+            f"--peft trains adapters beside trained weights, and policy={policy.type} begins without any; name a "
+            "checkpoint by policy=, or weights by policy.pretrained_path="
+        )
+    has_targets = kind._get_default_peft_targets is not PreTrainedPolicy._get_default_peft_targets
+    if not has_targets and not config.peft.target_modules:
+        raise MemobenchError(
+            f"--peft trains adapters of some modules, and policy={policy.type} does not say of which; name them by "
+            "--peft.target_modules"
         )
 
 
