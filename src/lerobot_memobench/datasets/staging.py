@@ -56,6 +56,8 @@ STAGING = ".staging"
 """Folder of a run within its destination."""
 TEMPORARY = ".tmp-"
 REQUEST_FILE = "request.json"
+FINISHED_EARLY = "finished_early"
+"""Key of a dataset's request: whether episodes of it were left out."""
 RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
 HDF5_FILE = "demonstration.hdf5"
@@ -439,7 +441,7 @@ def remove_staging(out: Path) -> None:
 
 def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
     """Raise with the first thing that was asked for differently."""
-    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None}
+    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None, FINISHED_EARLY: False}
     earlier = {**before, **earlier}  # written before there was a choice
     for key, value in request.items():
         if earlier.get(key) != value:
