@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
+    as_path,
     disk_refusal,
     draft_of,
     file_name,
-    home_expanded,
     remove_drafts,
     telling_of_the_disk,
     write_file,
@@ -115,8 +115,15 @@ def test_what_cannot_be_read_is_not_said_to_be_unwritable(tmp_path: Path) -> Non
         ("mine=a~/x", "mine=a~/x"),
         ("policy.align=~", "policy.align=~"),
         ("~x", "~x"),
+        ("run: 2", "{here}/run: 2"),
+        ("dataset=run: 2", "dataset={here}/run: 2"),
+        ("policy.device=cuda:0", "policy.device=cuda:0"),
     ],
 )
-def test_a_home_folder_is_found_behind_a_key(word: str, leads_to: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_word_is_a_path_for_every_library(
+    word: str, leads_to: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HOME", "/home/me")
-    assert home_expanded(word) == leads_to
+    monkeypatch.chdir(tmp_path)
+    Path("run: 2").mkdir()
+    assert as_path(word) == leads_to.format(here=tmp_path)

@@ -105,15 +105,19 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_memobench"
 
 
-def home_expanded(word: str) -> str:
-    """Return a word of a command line in which a path or a value that begins with ``~/`` leads to the home folder.
+def as_path(word: str) -> str:
+    """Return a word of a command line whose path, if it or its value is one, every library reads as a path.
 
-    Not every shell expands it behind ``key=``, and none does in quotes.
+    What begins with ``~/`` leads to the home folder: not every shell expands it behind ``key=``, and none in quotes.
+    What is there and holds a colon becomes absolute: Arrow and FFmpeg read ``run: 2`` as an address.
     """
     key, equals, value = word.partition("=")
-    if value.startswith("~/"):
-        return key + equals + os.path.expanduser(value)
-    return os.path.expanduser(word) if word.startswith("~/") else word
+    path = value if equals else word
+    if path.startswith("~/"):
+        path = os.path.expanduser(path)
+    elif ":" in path and os.path.exists(path):
+        path = os.path.abspath(path)
+    return key + equals + path if equals else path
 
 
 def file_hash(path: Path) -> str:

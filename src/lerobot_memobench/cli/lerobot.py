@@ -17,14 +17,14 @@ from pathlib import Path
 
 from lerobot_memobench.cli.console import WITH_PARENT, run_command, tell
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import home_expanded
+from lerobot_memobench.io import as_path
 from lerobot_memobench.run.arguments import SHORT_FORMS, check_task_names, read_arguments, split_arguments
 from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
-    line = [home_expanded(word) for word in (sys.argv[1:] if argv is None else argv)]
+    line = [as_path(word) for word in (sys.argv[1:] if argv is None else argv)]
     again = f"begin anew with: {shlex.join(['lerobot', *line])}"
     return run_command(partial(run, line), "lerobot", again)
 

@@ -69,6 +69,8 @@ def check_destination(out: Path) -> None:
     """Raise unless ``out`` is absent, empty, or holds nothing but an unfinished run."""
     if is_dataset(out):
         raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
+    if ":" in str(out) and not out.is_absolute():
+        raise MemobenchError(f"{out} holds a colon, which Arrow reads as an address; name it by its whole path")
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
     # What an interrupted move left beside the staging folder will be replaced.
