@@ -7,6 +7,7 @@ The policy from its construction to an update (``forward``) and to an action (``
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,6 +22,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
@@ -28,6 +30,7 @@ from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_resumed
 from lerobot_memobench.policies.compatibility import PICTURE_STEP, cure, require_fresh
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
+from lerobot_memobench.policies.memobench_mem.average import WeightAverage
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     TRAINING_FILE,
@@ -71,7 +74,6 @@ from lerobot_memobench.policies.memobench_mem.sharding import check_adapters, pr
 from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
 from lerobot_memobench.policies.memobench_mem.training import (
     TrainingCurve,
-    WeightAverage,
     counted_actions,
     is_first_rank,
     losses_of,
@@ -165,6 +167,7 @@ class MemobenchMemPolicy(PI05Policy):
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
         self.average: WeightAverage | None = None
+        self.register_load_state_dict_post_hook(_restart_average)
         self.run: TrainingRun | None = None
         self.curve = TrainingCurve()
         self.rollout = Rollout(self._remembers, config.memory_stride)
@@ -629,7 +632,7 @@ class MemobenchMemPolicy(PI05Policy):
             return policy
         if policy.averages:
             average = WeightAverage(policy.trained_parameters(), policy.config.ema_decay)
-            policy.average = restore_average(average, source, revision)
+            policy.average = restore_average(policy, average, source, trained, revision)
         policy.curve = TrainingCurve.read(Path(source))
         policy._begin_training(dataset_meta)
         return policy
@@ -653,6 +656,19 @@ class MemobenchMemPolicy(PI05Policy):
         if writes:
             tensors, metadata = self.average.state()
             save_file(tensors, save_directory / TRAINING_FILE, metadata=metadata)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> MemobenchMemPolicy:
+        """Return a copy with weights, average and rollout of its own; it shares the run that it is trained in.
+
+        The copy has no graph of the last pass: `backward` goes through the original.
+        """
+        made = self.__new__(type(self))
+        memo[id(self)] = made
+        with _WithoutGraph():
+            made.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        if made.run is not None and made.attends_fused:
+            attend_fused(made.model)
+        return made
 
     # -- adapters --------------------------------------------------------------------------------------------------
 
@@ -683,6 +699,22 @@ class MemobenchMemPolicy(PI05Policy):
         names = [name for name, _ in self.named_modules()]
         own = [end for end in OWN_MODULES if any(name == end or name.endswith(f".{end}") for name in names)]
         return [*asked, *(end for end in own if end not in set(asked))]
+
+
+def _restart_average(policy: Any, keys: Any) -> None:
+    """Begin the average of loaded weights at these, so that the policy acts by them."""
+    if policy.average is not None:
+        missing = set(keys.missing_keys)
+        policy.average.begin({name: one for name, one in policy.trained_parameters().items() if name not in missing})
+
+
+class _WithoutGraph(TorchFunctionMode):
+    """Copy tensors that autograd made as plain tensors, where torch refuses to copy them."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is Tensor.__deepcopy__ and not args[0].is_leaf:
+            return args[0].detach().clone()
+        return func(*args, **(kwargs or {}))
 
 
 def _column(batch: dict[str, Tensor], key: str) -> list[int] | None:

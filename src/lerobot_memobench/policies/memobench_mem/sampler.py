@@ -46,6 +46,10 @@ class TrainingRun:
     cache: FrameLookup
     meta: Any
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> TrainingRun:
+        """Return itself: the dataset in main memory is not copied with a policy."""
+        return self
+
     def follow(self, steps: Iterable[Any]) -> None:
         """Hand this to those steps of a preprocessor that ask for it by a method ``follow``."""
         for step in steps:
