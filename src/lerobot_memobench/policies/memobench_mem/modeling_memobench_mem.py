@@ -54,6 +54,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     AHEAD,
     CHOICES,
+    EXACT,
     FRAMES,
     PHASE,
     PLACES,
@@ -258,7 +259,8 @@ class MemobenchMemPolicy(PI05Policy):
         """Return the loss of the actions plus the weighted alignment on a preprocessed training batch.
 
         A loss that is only measured (lerobot-train's ``eval_loss``: not training, no gradients) is that of the averaged
-        weights, which a checkpoint holds and rollouts act by.
+        weights, which a checkpoint holds and rollouts act by. There actions follow the subgoal that a privileged memory
+        chooses, and its own losses compare with the true one.
 
         Args:
             batch: what LeRobot's pi0.5 needs, and ``memory.*`` and ``phase`` as the preprocessor adds them.
@@ -273,6 +275,7 @@ class MemobenchMemPolicy(PI05Policy):
             MemobenchError: the batch has no memory, or pictures where it should have their tokens.
         """
         self._require_memory(batch)
+        batch = self.perception.observed(batch)
         if self.averages and self.average is None and self.training:
             self.average = WeightAverage(self.trained_parameters(), self.config.ema_decay)
         measures = not self.training and not torch.is_grad_enabled()
@@ -280,6 +283,8 @@ class MemobenchMemPolicy(PI05Policy):
         computing = self._acting() if measures else self.precision.computing(self._device)
         with computing, quick_products() if quick else contextlib.nullcontext():
             memory = self.read_memory(batch)
+            if measures and self.config.privileged_memory:  # whose losses are of the labels, and actions of its choice
+                memory = self.read_memory(_without_labels(batch))
             per_sample, total, logged = self._action_loss(batch)
             for name, loss in self._memory_losses(batch).items():
                 per_sample, total = per_sample + loss, total + loss.mean()
@@ -320,7 +325,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Read what the samples of a batch remember, and hand it to the model; None without a memory."""
         if self.model.memory is None:
             return None
-        parts = batch[FRAMES], batch[STEPS], batch[PLACES], batch.get(SUBGOALS), batch.get(AHEAD)
+        parts = batch[FRAMES], batch[STEPS], batch[PLACES], batch.get(SUBGOALS), batch.get(AHEAD), batch.get(EXACT)
         histories = Histories(*parts).to(self._device)
         memory = self.model.memory.replay(histories, self._query(batch))
         self.model.set_memory(memory)
@@ -480,7 +485,7 @@ class MemobenchMemPolicy(PI05Policy):
         words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
         with self._acting():
             if training:
-                self.read_memory({name: value for name, value in batch.items() if name not in (SUBGOAL, SUBGOALS)})
+                self.read_memory(_without_labels(batch))
             elif self._remembers:
                 self._require_history(rows)
                 memory = self.remembered(batch, rows)
@@ -715,6 +720,11 @@ class _WithoutGraph(TorchFunctionMode):
         if func is Tensor.__deepcopy__ and not args[0].is_leaf:
             return args[0].detach().clone()
         return func(*args, **(kwargs or {}))
+
+
+def _without_labels(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return a batch without the true subgoals, by which a privileged memory chooses as in a rollout."""
+    return {name: value for name, value in batch.items() if name not in (SUBGOAL, SUBGOALS)}
 
 
 def _column(batch: dict[str, Tensor], key: str) -> list[int] | None:
