@@ -69,11 +69,11 @@ class TrainingRun:
             if np.allclose(found[ACTION]["mean"], columns[ACTION].mean(axis=0), atol=1e-4):
                 raise MemobenchError(
                     f"The dataset {self.meta.root} has statistics of absolute actions, and "
-                    "--policy.use_relative_actions=true normalises relative ones; recompute them by `lerobot-edit-dataset "
-                    "--operation.type=recompute_stats --operation.relative_action=true "
-                    f"--operation.chunk_size={self.config.chunk_size}`, or leave use_relative_actions out."
+                    "--policy.use_relative_actions=true normalises relative ones; recompute them "
+                    "(`lerobot-edit-dataset --operation.type=recompute_stats --operation.relative_action=true "
+                    f"--operation.chunk_size={self.config.chunk_size}`) or leave use_relative_actions out."
                 )
-        found[ACTION]["std"] = found[ACTION]["std"] + STILL
+        found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + STILL
         return found
 
     def follow(self, steps: Iterable[Any]) -> None:
@@ -140,7 +140,7 @@ def _with_statistics(given: Any, run: TrainingRun) -> Any:
         return given
     return {
         key: run.statistics[key]
-        if key in run.statistics and value is run.meta.stats[key]
+        if key in run.statistics and value is run.meta.stats.get(key)
         else _with_statistics(value, run)
         for key, value in given.items()
     }
