@@ -40,7 +40,6 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
-from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_FILE
 from lerobot_memobench.policies.checkpoint import (
     LAST,
     as_trained,
@@ -49,7 +48,6 @@ from lerobot_memobench.policies.checkpoint import (
     checkpoint_type,
     checkpoints_of,
     differing,
-    local_folder,
     read_json,
     text_of_link,
 )
@@ -212,27 +210,14 @@ def check_numbers(arguments: LerobotArguments) -> None:
 
 
 def with_own_memory(arguments: LerobotArguments) -> LerobotArguments:
-    """Return arguments in which a memory that is another one than that of the checkpoint it begins with has its own
-    defaults: LeRobot would take the checkpoint's, which were those of the other memory.
+    """Return arguments in which a memory that is another one than that of the checkpoint or recipe it begins with has
+    its own defaults.
     """
-    path, memory = arguments.get("policy.path"), arguments.get("policy.memory")
-    folder = None if path is None else local_folder(path)
-    if folder is None or memory is None or checkpoint_type(str(folder)) != "memobench_mem":
-        return arguments
-    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FRAMES
+    from lerobot_memobench.policies.memobench_mem.inherited import of_another_memory
 
-    held = read_json(folder / POLICY_FILE)
-    fusion = held.get("memory_fusion")  # alone in files from before there were several memories
-    if memory == (held.get("memory") or ("none" if fusion == "none" else "frames")):
-        return arguments
-    own = {
-        "memory_stride": "null",
-        "memory_fusion": "null",
-        "memory_frames": MEMORY_FRAMES,
-        "memory_phase": False,
-    }
-    for name, value in own.items():
-        arguments = arguments.default(f"policy.{name}", value)
+    for name, value in of_another_memory(arguments.flags).items():
+        if name != "memory_settings":  # LeRobot would merge these; the configuration leaves out those of another
+            arguments = arguments.default(f"policy.{name}", "null" if value is None else value)
     return arguments
 
 
