@@ -100,6 +100,26 @@ def file_name(text: object, what: str) -> str:
     return text
 
 
+def cache_folder() -> Path:
+    """Return the folder for files that this package can make again."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_memobench"
+
+
+def as_path(word: str) -> str:
+    """Return a word of a command line whose path, if it or its value is one, every library reads as a path.
+
+    What begins with ``~/`` leads to the home folder: not every shell expands it behind ``key=``, and none in quotes.
+    What is there and holds a colon becomes absolute: Arrow and FFmpeg read ``run: 2`` as an address.
+    """
+    key, equals, value = word.partition("=")
+    path = value if equals else word
+    if path.startswith("~/"):
+        path = os.path.expanduser(path)
+    elif ":" in path and os.path.exists(path):
+        path = os.path.abspath(path)
+    return key + equals + path if equals else path
+
+
 def file_hash(path: Path) -> str:
     """Return the sha256 (hex) of a file; one that has not changed is read once per process."""
     found = os.stat(path)

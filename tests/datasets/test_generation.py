@@ -26,7 +26,7 @@ import pytest
 
 from lerobot_memobench.datasets import generation, recording
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_dataset
 from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs import processes
@@ -154,7 +154,7 @@ def test_a_manifest_that_does_not_say_how_long_an_episode_is(tasks, recorded, tm
         run(tasks, tmp_path / "ds")
 
 
-def test_resume_makes_only_what_is_missing(tasks, recorded, tmp_path, monkeypatch):
+def test_an_unfinished_run_goes_on_or_is_finished_early(tasks, recorded, tmp_path, monkeypatch):
     reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
     inner = recording.record
 
@@ -170,9 +170,25 @@ def test_resume_makes_only_what_is_missing(tasks, recorded, tmp_path, monkeypatc
     assert not is_dataset(tmp_path / "ds")
     monkeypatch.setattr(recording, "record", inner)
     recorded.clear()
+    early = tmp_path / "early"
+    shutil.copytree(tmp_path / "ds", early)
     run(tasks, tmp_path / "ds")
     assert recorded == [("task_b", 10_000), ("task_b", 10_001)]
     assert tree_hash(tmp_path / "ds") == reference
+
+    recorded.clear()
+    summary = run(tasks, early, finish=True)
+    assert recorded == []
+    assert [(task.name, task.solved, task.episodes) for task in summary.tasks] == [("task_a", 2, 2), ("task_b", 0, 0)]
+    assert episode_count(early) == 2
+    assert "2 of 4 seeds were run" in (early / "README.md").read_text()
+    assert not (early / ".staging").exists()
+    with pytest.raises(MemobenchError, match="finished_early=True"):
+        run(tasks, early)
+    for folder in (early, tmp_path / "nothing"):
+        with pytest.raises(MemobenchError, match="no unfinished run"):
+            run(tasks, folder, finish=True)
+    assert not (tmp_path / "nothing").exists()
 
 
 def tree_hash_of_run(tasks, out):
@@ -525,7 +541,7 @@ def test_slurm_gets_a_script_and_a_last_job(tasks, recorded, tmp_path, monkeypat
         ". /opt/venv/bin/activate",
         f"launch_pickled_pipeline {out}_slurm/make/executor.pik",
         f"launch_pickled_pipeline {out}_slurm/finish/executor.pik",
-        "--dependency=afterok:4711",
+        "--dependency=afterany:4711",
     ):
         assert line in script, line
 

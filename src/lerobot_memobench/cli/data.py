@@ -73,6 +73,9 @@ def generate(
     formats: Annotated[
         list[Format] | None, typer.Option("--format", help="lerobot (default), hdf5, or both by naming both.")
     ] = None,
+    finish: Annotated[
+        bool, typer.Option("--finish", help="Make the dataset of an unfinished run's episodes, and no other episode.")
+    ] = False,
     executor: Annotated[
         Executor, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")
     ] = Executor.PROCESSES,
@@ -114,6 +117,7 @@ def generate(
             formats=tuple(format_.value for format_ in formats or [Format.LEROBOT]),
             executor=executor.value,
             executor_options=options,
+            finish=finish,
             progress=advance,
             tell=partial(screen.print, soft_wrap=True),
             **named,

@@ -31,6 +31,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     read_info,
     read_manifest,
     undamaged,
+    without_pattern,
 )
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.errors import MemobenchError
@@ -198,7 +199,7 @@ def storyboard(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Picture:
     from lerobot.datasets import LeRobotDataset
     from PIL import Image, ImageDraw, ImageFont
 
-    dataset = LeRobotDataset("local/storyboard", root=folder)
+    dataset = LeRobotDataset("local/storyboard", root=without_pattern(folder))
     camera = next(key for key in map(image_key, CAMERAS) if key in dataset.meta.features)
     chosen = [next(row for row in rows if row["memory_type"] == name) for name in ordered_types(rows)]
     caption, title = 56, 26

@@ -33,12 +33,14 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
 from lerobot_memobench.datasets.staging import (
+    FINISHED_EARLY,
     FORMATS,
     HDF5,
     LEROBOT,
     STAGING,
     compare_requests,
     episodes_folder,
+    remove_staging,
     staged,
 )
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -82,6 +84,7 @@ def generate(
     executor: str = "processes",
     executor_options: Mapping[str, Any] | None = None,
     repo_id: str = DEFAULT_REPO_ID,
+    finish: bool = False,
     progress: ProgressCallback | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> GenerationSummary:
@@ -97,6 +100,7 @@ def generate(
             ``out``/hdf5; or both.
         workers: episodes made at a time. executor, executor_options: where (`jobs.executors`); the result is the same.
             On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
+        finish: make the dataset of an unfinished run's episodes, and no other episode.
         tell: called, before the first episode, with about how large the dataset will be and how long it will take.
         referent, images, image_size, demonstration_prompt, perturb, policy: see `recording.RecordingSettings`.
 
@@ -127,6 +131,8 @@ def generate(
     formats = _checked_formats(formats, settings)
     plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, formats, repo_id)
     options = options_text(executor, executor_options or {}, NEEDS)
+    if finish:
+        return _finish_early(plan, Path(out))
     return _carry_out(plan, Path(out), workers, executor=executor, options=options, progress=progress, tell=tell)
 
 
@@ -221,14 +227,31 @@ def _carry_out(
         )
         if not complete:
             return GenerationSummary(None, summarise([], plan.tasks, out).tasks, submitted=True)
-        episodes = [staged(job) for job in jobs]
-        rows = [{**episode.info, "failure": episode.failure} for episode in episodes]
-        summary = summarise(rows, plan.tasks, out)
-        if summary.folder is not None:
-            manifest = {"request": plan.request}
-            assemble(episodes, out, formats=plan.formats, repo_id=plan.repo_id, made_by=plan.made_by, manifest=manifest)
-            shutil.rmtree(out / STAGING)
-        return summary
+        return _assembled(plan, jobs, out, plan.request, plan.made_by)
+
+
+def _finish_early(plan: _Plan, out: Path) -> GenerationSummary:
+    """Make the dataset of the episodes that an unfinished run has left."""
+    if is_dataset(out) or not (out / STAGING).is_dir():
+        raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see what it made")
+    with telling_of_the_disk(out, "what is finished stays"), episodes_folder(out, plan.request) as folder:
+        jobs = plan.jobs(folder)
+        there = [job for job in jobs if job.finished()]
+        made_by = f"{plan.made_by} The run was finished early: {len(there)} of {len(jobs)} seeds were run."
+        return _assembled(plan, there, out, {**plan.request, FINISHED_EARLY: len(there) < len(jobs)}, made_by)
+
+
+def _assembled(
+    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, request: Mapping[str, Any], made_by: str
+) -> GenerationSummary:
+    """Make the dataset of finished jobs, if one of them has an episode, and remove what it was made of."""
+    episodes = [staged(job) for job in jobs]
+    summary = summarise([{**episode.info, "failure": episode.failure} for episode in episodes], plan.tasks, out)
+    if summary.folder is not None:
+        manifest = {"request": request}
+        assemble(episodes, out, formats=plan.formats, repo_id=plan.repo_id, made_by=made_by, manifest=manifest)
+        shutil.rmtree(out / STAGING)
+    return summary
 
 
 def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
@@ -292,14 +315,14 @@ def _finished(out: Path, plan: _Plan) -> GenerationSummary:
         raise MemobenchError(
             f"{out} already holds a dataset that this command did not make; name another folder"
         ) from None
-    request = plan.request
+    request = {**plan.request, FINISHED_EARLY: False}
     earlier = {**earlier, "versions": request["versions"]}  # a finished dataset stays valid under newer versions
     compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
     if LEROBOT in plan.formats:
         check_whole(out)
     if HDF5 in plan.formats:
         _check_hdf5(out, Counter(row["task_name"] for row in manifest["episodes"] if row["failure"] is None))
-    shutil.rmtree(out / STAGING, ignore_errors=True)
+    remove_staging(out)
     return summarise(manifest["episodes"], plan.tasks, out)
 
 

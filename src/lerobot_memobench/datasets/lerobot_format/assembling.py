@@ -48,6 +48,7 @@ from lerobot_memobench.datasets.staging import (
 from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name, write_file
+from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.protocol import CAMERAS, CLOCK, CONTROL_HZ
 
 if TYPE_CHECKING:
@@ -76,17 +77,19 @@ def write_dataset(
     out = Path(out)
     check_destination(out)
     staging = out / STAGING
-    shutil.rmtree(staging, ignore_errors=True)
-    try:
-        staged = [
-            stage_demonstration(demo, staging / "episodes" / f"{number:06d}")
-            for number, demo in enumerate(demonstrations)
-        ]
-        return assemble(staged, out, repo_id=repo_id, made_by=made_by)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        if out.is_dir() and not any(out.iterdir()):
-            out.rmdir()
+    episodes = staging / "episodes"
+    staging.mkdir(parents=True, exist_ok=True)
+    with locked(staging, out):
+        try:
+            shutil.rmtree(episodes, ignore_errors=True)
+            staged = [
+                stage_demonstration(demo, episodes / f"{number:06d}") for number, demo in enumerate(demonstrations)
+            ]
+            return assemble(staged, out, repo_id=repo_id, made_by=made_by)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+            if out.is_dir() and not any(out.iterdir()):
+                out.rmdir()
 
 
 def assemble(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import json
 import math
+import os
 import shlex
 import traceback
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
@@ -22,6 +25,7 @@ from lerobot_memobench.io import (
     Count,
     Malformed,
     Whole,
+    cache_folder,
     check_fetched,
     count_of,
     first_fault,
@@ -68,6 +72,8 @@ def check_destination(out: Path) -> None:
     """Raise unless ``out`` is absent, empty, or holds nothing but an unfinished run."""
     if is_dataset(out):
         raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
+    if ":" in str(out) and not out.is_absolute():
+        raise MemobenchError(f"{out} holds a colon, which Arrow reads as an address; name it by its whole path")
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
     # What an interrupted move left beside the staging folder will be replaced.
@@ -333,6 +339,22 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     found: dict[str, Any] = read_json(folder / MANIFEST_FILE, Manifest, NO_MANIFEST)
     return found
+
+
+def without_pattern(folder: Path) -> Path:
+    """Return a path of a dataset's folder for LeRobot, which takes names such as ``obj [v2]`` for patterns of `glob`.
+
+    It is the folder itself, or a link to it in the cache: the same at every call, since LeRobot keeps a copy of the
+    tables for each path.
+    """
+    place = str(folder.absolute())
+    if glob.escape(place) == place or not folder.is_dir():
+        return folder
+    link = cache_folder() / "datasets" / hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
+    link.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        link.symlink_to(place)
+    return link
 
 
 # --- is it whole? ---
