@@ -28,5 +28,5 @@ def run(name: str, command: Callable[..., None], argv: list[str] | None = None, 
     program = f"python -m research.{name}"
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.command()(command)
-    again = f"{program}: ended by SIGTERM; go on with: {program} {shlex.join(arguments)}"
+    again = f"go on with: {program} {shlex.join(arguments)}"
     return run_app(app, arguments, program, again)

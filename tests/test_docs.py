@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import io
+import os
 import re
 import shlex
+import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -37,7 +40,7 @@ DOCS = ROOT / "docs"
 NOTES = DOCS / "research"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("**/*.md")])
 DOCUMENTS = [*PAGES, *sorted(ROOT.glob("src/**/*.md"))]
-BY_HAND = [page for page in PAGES if NOTES not in page.parents or page.name == "index.md"]
+BY_HAND = [page for page in PAGES if NOTES not in page.parents or page.name in ("index.md", "logs.md")]
 """What is kept up to date; notes are frozen."""
 MADE = {(DOCS / path).resolve() for path in (*reference.PAGES, *reference.COPIES.values())}
 """Pages that the site's build makes."""
@@ -131,9 +134,27 @@ def test_the_readme_is_short() -> None:
 
 def test_every_page_has_its_place_in_the_site() -> None:
     """The strict build says so too; here it is said without MkDocs."""
-    told = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]))
+    told = set(pages_of_the_site())
     there = {str(page.relative_to(DOCS)) for page in DOCS.glob("**/*.md")}
     assert told == there | set(reference.PAGES) | set(reference.COPIES.values())
+
+
+def pages_of_the_site() -> list[str]:
+    return re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2])
+
+
+def test_no_two_pages_share_an_address() -> None:
+    addresses = Counter(re.sub(r"(^|/)index$", "", page.removesuffix(".md")) for page in pages_of_the_site())
+    assert [address for address, count in addresses.items() if count > 1] == []
+
+
+@pytest.mark.slow
+def test_the_site_is_built_strictly(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "The memory study" in (tmp_path / "research/study/index.html").read_text()
 
 
 # --- figures ---

@@ -11,7 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import disk_refusal, draft_of, file_name, remove_drafts, telling_of_the_disk, write_file
+from lerobot_memobench.io import (
+    as_path,
+    disk_refusal,
+    draft_of,
+    file_name,
+    remove_drafts,
+    telling_of_the_disk,
+    write_file,
+)
 from lerobot_memobench.tasks.catalogue import task_names
 
 
@@ -96,3 +104,26 @@ def test_what_cannot_be_read_is_not_said_to_be_unwritable(tmp_path: Path) -> Non
     told = pytest.raises(MemobenchError, match=r"out cannot be written \(Permission denied; .*; b")
     with told, telling_of_the_disk(tmp_path / "out", "b"):
         raise here
+
+
+@pytest.mark.parametrize(
+    ("word", "leads_to"),
+    [
+        ("~/x", "/home/me/x"),
+        ("output_dir=~/x", "output_dir=/home/me/x"),
+        ("--out=~/x", "--out=/home/me/x"),
+        ("mine=a~/x", "mine=a~/x"),
+        ("policy.align=~", "policy.align=~"),
+        ("~x", "~x"),
+        ("run: 2", "{here}/run: 2"),
+        ("dataset=run: 2", "dataset={here}/run: 2"),
+        ("policy.device=cuda:0", "policy.device=cuda:0"),
+    ],
+)
+def test_a_word_is_a_path_for_every_library(
+    word: str, leads_to: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    monkeypatch.chdir(tmp_path)
+    Path("run: 2").mkdir()
+    assert as_path(word) == leads_to.format(here=tmp_path)

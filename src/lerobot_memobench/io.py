@@ -100,6 +100,26 @@ def file_name(text: object, what: str) -> str:
     return text
 
 
+def cache_folder() -> Path:
+    """Return the folder for files that this package can make again."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_memobench"
+
+
+def as_path(word: str) -> str:
+    """Return a word of a command line whose path, if it or its value is one, every library reads as a path.
+
+    What begins with ``~/`` leads to the home folder: not every shell expands it behind ``key=``, and none in quotes.
+    What is there and holds a colon becomes absolute: Arrow and FFmpeg read ``run: 2`` as an address.
+    """
+    key, equals, value = word.partition("=")
+    path = value if equals else word
+    if path.startswith("~/"):
+        path = os.path.expanduser(path)
+    elif ":" in path and os.path.exists(path):
+        path = os.path.abspath(path)
+    return key + equals + path if equals else path
+
+
 def file_hash(path: Path) -> str:
     """Return the sha256 (hex) of a file; one that has not changed is read once per process."""
     found = os.stat(path)
@@ -226,6 +246,8 @@ class Malformed(MemobenchError):
 
 PACKED = ".gz"
 """What ``gzip`` puts behind the name of a file that it compresses."""
+POINTER, LARGEST_POINTER = b"version https://git-lfs.github.com/spec/v1", 1024
+"""The first line of a Git LFS pointer, and the bytes that one has at most."""
 LARGEST_UNPACKED = 256 << 20
 """Bytes that a compressed file may become: some hundred thousand episodes."""
 
@@ -240,16 +262,36 @@ def packed(path: Path) -> Path:
     return path.with_name(path.name + PACKED)
 
 
+def check_fetched(path: Path) -> None:
+    """Refuse a file, or a folder with a file, that is a Git LFS pointer: a clone without git-lfs has no more of it.
+
+    Raises:
+        MemobenchError: naming the first such file. OSError: it cannot be read.
+    """
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if not file.is_file() or file.stat().st_size > LARGEST_POINTER:
+            continue
+        with file.open("rb") as content:
+            if content.read(len(POINTER)) == POINTER:
+                raise MemobenchError(
+                    f"{file} is a Git LFS pointer in the place of its content; run `git lfs pull` in its repository"
+                )
+
+
 def file_bytes(path: Path) -> bytes:
     """Return what a file holds; where only the same file compressed by ``gzip`` is there, what that one holds.
 
     Raises:
         FileNotFoundError: there is neither. OSError: it cannot be read, is damaged, or becomes too large.
+        MemobenchError: it is a Git LFS pointer.
     """
-    if path.suffix != PACKED and (path.exists() or not packed(path).exists()):
+    if path.suffix != PACKED and not path.exists() and packed(path).exists():
+        path = packed(path)
+    check_fetched(path)
+    if path.suffix != PACKED:
         return path.read_bytes()
     try:
-        with gzip.open(path if path.suffix == PACKED else packed(path)) as file:
+        with gzip.open(path) as file:
             content = file.read(LARGEST_UNPACKED + 1)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise OSError(f"it is no whole gzip file: {error}") from None
@@ -310,7 +352,7 @@ def checked(value: Any, schema: Any) -> Any:
 
 
 @contextlib.contextmanager
-def refusing(told: Callable[[str], MemobenchError]) -> Iterator[None]:
+def refusing(told: Callable[[str], MemobenchError], of: Path | None = None) -> Iterator[None]:
     """Let nothing but a `MemobenchError` out of a block that does nothing but read what may be damaged.
 
     LeRobot, pyarrow, PyAV, h5py and NumPy answer damaged files with errors of every type. To be kept around reading
@@ -319,12 +361,16 @@ def refusing(told: Callable[[str], MemobenchError]) -> Iterator[None]:
     Args:
         told: makes the error, from what was raised in at most a line. The file and what to do stand beside that: of
             what a library says only the first characters are left.
+        of: the file or folder that is read; a Git LFS pointer in its place is named before damage is (`check_fetched`).
     """
     try:
         yield
     except MemobenchError:
         raise
     except Exception as error:
+        if of is not None:
+            with contextlib.suppress(OSError):
+                check_fetched(of)
         raise told(f"{type(error).__name__}: {cut(' '.join(str(error).split()), LONGEST_REASON)}") from error
 
 

@@ -33,6 +33,8 @@ SPLITS = {
 }
 """What the seeds of scenes are for. The paper's were looked at between trainings: for what is developed here, they are
 validation too. The sealed ones are looked at once per release (`memobench test-sealed`)."""
+GUARDED = (SEALED, PAPER, VALIDATION)
+"""Splits of which no demonstration is made: policies are chosen or measured on them."""
 EVALUATION_SEED, EVALUATION_EPISODES = SPLITS[PAPER].start, len(SPLITS[PAPER])
 """Episode i of an evaluation has the scene of seed 7 + i, unless another split is asked for; 50 episodes of a task."""
 EVIDENCE_EPISODES = 36

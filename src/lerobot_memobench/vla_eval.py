@@ -71,7 +71,9 @@ class MEMOBench(StepBenchmark):
         seed: of episode 0.
         horizon: control steps of an execution. A ``max_steps`` of the harness that is lower ends episodes unlogged.
         demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
-        pause_steps, speed, evidence: controls, as of `MemobenchEnvConfig`. A pause begins and ends between two answers.
+        pause_steps: control, as of `MemobenchEnvConfig`. A pause begins and ends between two answers.
+        speed: control, as of `MemobenchEnvConfig`.
+        evidence: control, as of `MemobenchEnvConfig`.
         history_every: steps between the frames of the prompt that are sent.
         n_action_steps: actions executed of each answer, open-loop.
         send_wrist_image: whether that picture is sent; of this and the next two the harness takes a model server's

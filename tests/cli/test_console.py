@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
+from multiprocessing import Pipe
+from typing import Any
 
 import httpx
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError, OfflineModeIsEnabled
 from rich.console import Console, RenderableType
 
-from lerobot_memobench.cli.console import counting, one_sentence
+from lerobot_memobench.cli.console import counting, one_sentence, run_command
 from lerobot_memobench.cli.tasks import task_table
 from lerobot_memobench.evaluation.metrics import summarise
 from lerobot_memobench.evaluation.report import table
@@ -93,3 +96,34 @@ def test_a_misspelt_folder_is_seen_in_what_the_hub_was_asked_for(error: Exceptio
     assert told is not None
     assert told.startswith("what was asked for is not on this machine")
     assert "(https://hub/outputs/bowl_polcy/config.json: an error happened" in told
+
+
+def receive_from_the_dead() -> None:
+    mine, other = Pipe()
+    other.close()
+    mine.recv()
+
+
+def send_to_the_dead() -> None:
+    mine, other = Pipe()
+    other.close()
+    mine.send(1)
+
+
+def load_from_the_dead() -> None:
+    raise RuntimeError("DataLoader worker (pid 7) is killed by signal: Killed.")
+
+
+@pytest.mark.parametrize("call", [receive_from_the_dead, send_to_the_dead, load_from_the_dead])
+def test_a_killed_worker_ends_a_command_with_how_to_go_on(call: Callable[[], None], capsys: Any) -> None:
+    assert run_command(call, "lerobot", "go on with: that") == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert all(part in said for part in ("memory", "batch_size", "go on with: that"))
+
+
+def test_the_end_of_input_is_ctrl_d_at_a_prompt_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    assert run_command(input, "lerobot", "") == 130
+    with pytest.raises(EOFError):
+        run_command(lambda: (_ for _ in ()).throw(EOFError("compressed file ended")), "lerobot", "")

@@ -20,13 +20,16 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(3 * 3600)]
 
 TASKS = "turn_on_the_stove_and_turn_it_off,check_the_top_drawer_of_the_cabinet"
 KILLS = 20
-COMMON = ["env=memobench", f"tasks={TASKS}", "env.render=fast", "env.videos=-1", "batch_size=2"]
+COMMON = ["env=memobench", "env.render=fast", "env.videos=-1", "batch_size=2"]
 COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would start for longer than an episode lasts
 
 #: Within the horizon the expert reaches the stove's first checkpoint in some episodes. The random policy draws from a
 #: generator of its own; what it drew shows in the films.
-EXPERT = ["episodes=6", "horizon=70", "env.render_every=10"]
-RANDOM = ["policy=memobench_random", "episodes=6", "horizon=40"]
+EXPERT = [f"tasks={TASKS}", "episodes=6", "horizon=70", "env.render_every=10"]
+RANDOM = [f"tasks={TASKS}", "policy=memobench_random", "episodes=6", "horizon=40"]
+#: Each scene with each variant, and a pause within 120 steps.
+PACED = ["policy=memobench_random", "evidence=true", "referent=random", "episodes=6", "horizon=130", "pause_steps=10"]
+PACED += ["tasks=put_the_butter_into_the_bowl_from_the_prompt_video", "demonstration_prompt=false"]
 
 IMPORTED = ("lerobot.scripts.lerobot_eval", "lerobot_memobench.envs.memobench_env")
 IMPORTED += ("lerobot_memobench.datasets.generation", "lerobot_memobench.cli.lerobot")
@@ -89,13 +92,14 @@ def film_hashes(out: Path) -> dict[str, str]:
     return found
 
 
-@pytest.mark.parametrize("settings", [EXPERT, RANDOM], ids=["expert", "random"])
+@pytest.mark.parametrize("settings", [EXPERT, RANDOM, PACED], ids=["expert", "random", "evidence and pauses"])
 def test_killed_and_gone_on_with(server: ForkServer, tmp_path: Path, settings: list[str]) -> None:
     undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
     began = time.monotonic()
     assert start(server, undisturbed, settings, resume=False).wait() == 0
     run_s = time.monotonic() - began
     reference = comparable(undisturbed)
+    assert settings is not PACED or all(each["paused_steps"] and "variants" in each for each in reference)
 
     rng = random.Random(f"{settings}")
     kills, history = 0, []

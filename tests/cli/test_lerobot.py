@@ -27,7 +27,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.command_line import overrides
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import check_checkpoint
+from lerobot_memobench.policies.checkpoint import check_checkpoint, folder_with_checkpoint
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import (
@@ -375,6 +375,35 @@ def test_a_copy_of_a_run_has_no_link(training: Called, missing: str) -> None:
     (folder.parent / "training_state" / missing).unlink()  # killed while it was saved
     assert main(["train", "output_dir=run", "resume=true"]) == 0
     assert training.value("config_path") == "run/checkpoints/000080/pretrained_model/train_config.json"
+
+
+@pytest.mark.parametrize("last", ["000040\n", None])
+def test_a_copy_has_a_file_or_nothing_for_the_link(training: Called, last: str | None) -> None:
+    training_run(Path("run"))
+    link = Path("run/checkpoints/last")
+    link.unlink()
+    if last is not None:
+        link.write_text(last)
+    found = Path("run/checkpoints/000040" if last else "run/checkpoints/000080") / "pretrained_model"
+    assert folder_with_checkpoint("run") == found
+    assert main(["train", "output_dir=run", "resume=true"]) == 0
+    assert training.value("config_path") == str(found / "train_config.json")
+    assert not link.exists(), "LeRobot makes it"
+
+
+@pytest.mark.parametrize("text", [None, "what I thought of it"])
+def test_what_is_no_link_is_no_place_for_one(
+    text: str | None, training: Called, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = training_run(Path("run")).parent
+    link = Path("run/checkpoints/last")
+    link.unlink()
+    if text is None:
+        shutil.copytree(folder, link)
+    else:
+        link.write_text(text)
+    assert str(link) in refused(["train", "output_dir=run", "resume=true"], training, capsys)
+    assert link.exists()
 
 
 def test_a_longer_schedule_is_told_of(training: Called, capsys: pytest.CaptureFixture[str]) -> None:

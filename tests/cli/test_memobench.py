@@ -202,6 +202,7 @@ def test_generate_tells_what_became_of_every_seed(
         "policy": None,
         "workers": 1,
         "formats": ("lerobot", "hdf5"),
+        "finish": False,
         "executor": "local",
         "executor_options": {"local_tasks": 4},
     }

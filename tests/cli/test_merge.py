@@ -97,13 +97,26 @@ def test_a_part_alone_is_repeated_as_a_part(fake_lerobot: Any) -> None:
     assert fake_lerobot.ran == [(DRAWER, k) for k in range(4)]
 
 
-def test_missing_episodes_are_a_disagreement(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+INCOMPLETE = {
+    "bare": lambda episodes: [{key: each[key] for key in ("task", "episode", "referent")} for each in episodes],
+    "without steps": lambda episodes: [episodes[0], *({**each, "steps": None} for each in episodes[1:])],
+    "one alone": lambda episodes: episodes[:1],
+    "one more": lambda episodes: [*episodes, {**episodes[-1], "episode": 9}],
+    "another outcome": lambda episodes: [{**episodes[0], "success": not episodes[0]["success"]}, *episodes[1:]],
+}
+
+
+@pytest.mark.parametrize("change", INCOMPLETE)
+def test_a_card_is_repeated_only_with_the_outcome_of_every_episode(fake_lerobot: Any, change: str, capsys: Any) -> None:
     assert lerobot([*COMMAND, "output_dir=out"]) == 0
     card = json.loads(Path("out/card.json").read_text())
-    card["episodes"].append({**card["episodes"][-1], "episode": 9})
+    card["episodes"] = INCOMPLETE[change](card["episodes"])
     Path("card.json").write_text(json.dumps(card))
-    assert memobench(["rerun", "card.json", "--out", "again"]) == 1
-    assert "episode 9 is on the card and was not run here" in capsys.readouterr().out
+    capsys.readouterr()
+    status = 1 if change in ("another outcome", "without steps") else 2
+    assert memobench(["rerun", "card.json", "--out", "again"]) == status
+    assert "\nrepeated: " not in capsys.readouterr().out
+    assert Path("again").exists() == (status == 1), "an incomplete card runs nothing"
 
 
 def test_other_versions_are_told(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
@@ -218,18 +231,27 @@ def test_slurm_gets_a_job_per_part_and_one_that_merges(
     for line in (
         "#SBATCH --partition=gpu",
         "#SBATCH --array=0-3%2",
-        "--dependency=afterok:4711",
+        "--dependency=afterany:4711",  # a failed part does not leave it waiting
+        "#SBATCH --kill-on-invalid-dep=yes",
         "#SBATCH --account=lab",
         "#SBATCH --cpus-per-task=2",
         "#SBATCH --mem-per-cpu=4G",
     ):
         assert line in script, line
     assert "requeue" not in script
-    for part, ranks in (("make", range(4)), ("finish", range(1))):
-        for rank in ranks:
-            monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))
-            with open(tmp_path / "out" / "logs" / part / "executor.pik", "rb") as file:
-                dill.load(file).run()  # noqa: S301 - datatrove wrote it, in this test
+
+    def run(part: str, rank: int = 0) -> None:
+        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))
+        with open(tmp_path / "out" / "logs" / part / "executor.pik", "rb") as file:
+            dill.load(file).run()  # noqa: S301 - datatrove wrote it, in this test
+
+    for rank in (0, 1, 3):
+        run("make", rank)
+    with pytest.raises(SystemExit, match=r"^memobench: 1 of 4 jobs .*shard-3-of-4.* resume=true"):
+        run("finish")
+    assert not Path("out/report.md").exists()
+    run("make", 2)
+    run("finish")
     assert len(read_episodes("out")) == 8
     assert Path("out/report.md").is_file()
 

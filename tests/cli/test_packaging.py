@@ -94,13 +94,15 @@ def executable(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-def test_setup_compiles_once_and_goes_on_where_that_fails(tmp_path: Path) -> None:
+def test_setup_removes_only_its_own_and_compiles_once_where_that_can_be(tmp_path: Path) -> None:
     """The installers are stand-ins here, and so are the system's libraries: nothing is fetched."""
     for name in ("requirements.lock", "pyproject.toml", ".python-version", "scripts/setup", *LOCKS[1:]):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
-    executable(tmp_path / ".uv/bin/uv", "exit 0")
+    executable(tmp_path / ".uv/bin/uv", 'echo "$*" >>uv_calls')
     executable(tmp_path / ".venv/bin/memobench", "exit 0")
+    lock = (ROOT / "requirements.lock").read_text()
+    (tmp_path / ".venv/.memobench-lock").write_text(f"dropped-one==1.0 \\\n    --hash=sha256:0\n{lock}")
     executable(tmp_path / ".venv/bin/python", '[ "$1" = -c ] && exit 0; echo "$*" >>calls; exit 1')
     executable(tmp_path / "bin/ldconfig", "echo libEGL.so.1 libGLESv2.so.2 libOpenGL.so.0 libOSMesa.so")
     executable(tmp_path / "bin/ffmpeg", "exit 0")
@@ -112,6 +114,10 @@ def test_setup_compiles_once_and_goes_on_where_that_fails(tmp_path: Path) -> Non
     assert "could not be compiled; going on" in said[0]
     assert said[1] == ""
     assert (tmp_path / "calls").read_text() == "scripts/compile_imports.py src\n"
+    packages = [call for call in (tmp_path / "uv_calls").read_text().splitlines() if call.startswith("pip ")]
+    assert [call.split()[1] for call in packages] == ["install", "uninstall", "install"], "no `sync`: it removes others"
+    assert packages[1].split()[-1] == "dropped-one"
+    assert (tmp_path / ".venv/.memobench-lock").read_text() == lock
 
 
 @pytest.mark.parametrize("may", [True, False])

@@ -81,7 +81,7 @@ def work(number):
     time.sleep(600)
 
 if __name__ == "__main__":
-    with saying_how_to_go_on(lambda: "outer"), saying_how_to_go_on(lambda: "ended by SIGTERM; go on"):
+    with saying_how_to_go_on("a", lambda: "outer"), saying_how_to_go_on("b", lambda: "go on"):
         with process_pool(2) as pool:
             list(pool.map(work, range(2)))
 """
@@ -91,7 +91,7 @@ def test_whatever_was_started_ends(tmp_path: Path) -> None:
     (tmp_path / "tree.py").write_text(TREE)
     job = Job(["tree.py"], tmp_path)
     job.wait_until(lambda: len(list(tmp_path.glob("begun-*"))) == 2)
-    assert job.end() == "ended by SIGTERM; go on"
+    assert job.end() == "b: ended by SIGTERM; go on"
 
 
 def test_who_handles_the_signal_already_is_let(tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_who_handles_the_signal_already_is_let(tmp_path: Path) -> None:
         "import os, signal\n"
         "from lerobot_memobench.jobs.processes import saying_how_to_go_on\n"
         "signal.signal(signal.SIGTERM, lambda *_: os._exit(7))\n"
-        "with saying_how_to_go_on(lambda: 'not said'):\n    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "with saying_how_to_go_on('a', lambda: 'not said'):\n    os.kill(os.getpid(), signal.SIGTERM)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stderr) == (7, "")
@@ -120,15 +120,15 @@ def test_what_a_command_says(words: list[str], begins: str, monkeypatch: pytest.
     said: list[str] = []
 
     @contextlib.contextmanager
-    def saying(how: Callable[[], str]) -> Iterator[None]:
-        said.append(how())
+    def saying(program: str, how: Callable[[], str]) -> Iterator[None]:
+        said.append(f"{program}: {how()}")
         raise MemobenchError("not now")
         yield
 
     monkeypatch.setattr(console, "saying_how_to_go_on", saying)
     monkeypatch.setattr(memobench, "use_threads", lambda role: None)
     assert memobench.main(words) == 2
-    assert said == [f"memobench: ended by SIGTERM; {begins} with: {shlex.join(['memobench', *words])}"]
+    assert said == [f"memobench: {begins} with: {shlex.join(['memobench', *words])}"]
 
 
 @pytest.mark.slow

@@ -31,8 +31,10 @@ from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.datasets.replay import replay
 from lerobot_memobench.datasets.staging import EpisodeStage, stage_demonstration
 from lerobot_memobench.datasets.validate import validate
+from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.kills import hashes, killed_at
 from tests.support.short_demonstrations import beginning, drawn_steps, with_pictures
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -101,7 +103,7 @@ def test_our_own_files_come_back_as_they_were(written, stove, short, tmp_path):
 
 def test_our_own_files_replay(source, tmp_path):
     verdicts = validate(source)
-    assert [(v.episode, v.disagreement) for v in verdicts] == [
+    assert [(v.subject, v.disagreement) for v in verdicts] == [
         (f"{name}_demo.hdf5, demo_{k}", None) for name in (BUTTER, STOVE) for k in range(2)
     ]
     with h5py.File(source / f"{STOVE}_demo.hdf5", "a") as file:
@@ -338,7 +340,7 @@ def test_a_bad_attribute_ends_its_episode_or_file_alone(stove, tmp_path):
     assert summary.episodes == 1
     assert validate(tmp_path / "ds")[0].disagreement is None
     verdicts = validate(source)
-    assert [verdict.episode for verdict in verdicts if verdict.disagreement is None] == ["many.hdf5, demo_0"]
+    assert [verdict.subject for verdict in verdicts if verdict.disagreement is None] == ["many.hdf5, demo_0"]
 
 
 @pytest.mark.parametrize(
@@ -494,6 +496,21 @@ def test_a_broken_off_conversion_goes_on(written, tmp_path, monkeypatch):
     for path in reference.folder.rglob("*"):
         if path.is_file():
             assert path.read_bytes() == (tmp_path / "ds" / path.relative_to(reference.folder)).read_bytes(), path
+
+
+@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("holder", "name", "call", "after"),
+    [(os, "replace", "ds/meta", False), (os, "replace", "ds/meta", True), (VideoWriter, "add", 30, False)],
+    ids=["before the last move", "after the last move", "while pictures are encoded"],
+)
+def test_a_killed_conversion_goes_on(written, tmp_path, holder, name, call, after):
+    source = written / f"{BUTTER}_demo.hdf5"
+    convert(source, tmp_path / "undisturbed")
+    killed_at(holder, name, call, lambda: convert(source, tmp_path / "ds"), after=after)
+    assert is_dataset(tmp_path / "ds") == after
+    convert(source, tmp_path / "ds")
+    assert hashes(tmp_path / "ds") == hashes(tmp_path / "undisturbed")
 
 
 def test_metadata_that_is_none(source, tmp_path):

@@ -26,12 +26,13 @@ from lerobot_memobench.errors import MemobenchError
 
 
 @pytest.fixture
-def dataset(make_task, make_demo, tmp_path):
-    """Two memory types with images; checkpoints done at the frames 6 and 9 of 15."""
+def dataset(make_task, make_demo, tmp_path, monkeypatch):
+    """Two memory types with images; checkpoints done at the frames 6 and 9 of 15. Its name is a pattern of `glob`."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     rows = ["0" * 6 + "1" * 9, "0" * 9 + "1" * 6]
     first = make_demo(rows, task=make_task("SU", name="first"), size=64)
     second = make_demo(rows, task=make_task("SU", name="second", memory_type="object"), size=64, exec_start=4)
-    return write_dataset([first, second], tmp_path / "ds")
+    return write_dataset([first, second], tmp_path / "ds [v2]")
 
 
 def test_files_and_hashes(dataset, tmp_path):

@@ -14,12 +14,20 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_memobench.datasets.feature_cache import building
 from lerobot_memobench.datasets.feature_cache.building import build_feature_cache
 from lerobot_memobench.datasets.feature_cache.frames import resolve_subgoals
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER, dataset_fingerprint, find_cache, read_meta
+from lerobot_memobench.datasets.feature_cache.layout import (
+    FOLDER,
+    check_cache,
+    dataset_fingerprint,
+    find_cache,
+    read_meta,
+)
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
 from tests.support import synthetic_dataset
+from tests.support.kills import hashes, killed_at
 
 CAMERA = "observation.images.image"
 SUBGOALS_1 = "open the top drawer; put the bowl in the drawer"
@@ -164,6 +172,27 @@ def test_a_killed_build_goes_on(root: Path) -> None:
     assert whole.read_bytes() == resumed
 
 
+@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [("_write_tables", 1), ("_write_done", 3), ("_write_hashes", 1), ("_write_meta", 2)],
+    ids=["tables", "second episode", "hashes", "last file"],
+)
+@pytest.mark.parametrize("after", [False, True])
+def test_a_build_that_got_sigkill_goes_on(root: Path, name: str, call: int, after: bool) -> None:
+    def build() -> Path:
+        return build_feature_cache(root, "test", _Frames(), _Texts(), batch_size=10, workers=1)
+
+    undisturbed = hashes(build())
+    assert json.loads((root / FOLDER / "test" / "hashes.json").read_text()) == {
+        name: value for name, value in undisturbed.items() if name != "hashes.json"
+    }
+    shutil.rmtree(root / FOLDER)
+    killed_at(building, name, call, build, after=after)
+    assert hashes(build()) == undisturbed
+    assert check_cache(root / FOLDER / "test") is None
+
+
 @pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01", b"PK\x03\x04", None])
 def test_a_build_that_does_not_know_how_far_it_was_begins_again(root: Path, content: bytes | None) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -298,6 +327,9 @@ def test_what_decides_the_content_decides_the_name(root: Path, tmp_path: Path) -
         assert {folder.parent for folder in folders} == {place or root / FOLDER}
         assert folders[0] == find_cache(root, "tiny", place=place, **contents)
     with_place = find_cache(root, "tiny", place=tmp_path / "caches", **contents)
+    with_place.mkdir(parents=True)
+    moved = Path(shutil.copytree(root, tmp_path / "under another name"))
+    assert find_cache(moved, "tiny", place=tmp_path / "caches", **contents) == with_place
     parquet = next((root / "data").rglob("*.parquet"))
     parquet.write_bytes(parquet.read_bytes() + b" ")  # another dataset of the same name
     assert find_cache(root, "tiny", place=tmp_path / "caches", **contents) != with_place

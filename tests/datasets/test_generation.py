@@ -26,10 +26,13 @@ import pytest
 
 from lerobot_memobench.datasets import generation, recording
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_dataset
+from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs import processes
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
+from tests.support.kills import hashes as tree_hash
+from tests.support.kills import killed_at
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
@@ -66,14 +69,6 @@ def recorded(make_demo, monkeypatch):
     monkeypatch.setattr(recording, "record", record)
     monkeypatch.setattr(recording, "model_file", lambda task, poses: "<mujoco/>")
     return calls
-
-
-def tree_hash(root: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 def run(tasks, out, episodes=2, **more):
@@ -159,7 +154,7 @@ def test_a_manifest_that_does_not_say_how_long_an_episode_is(tasks, recorded, tm
         run(tasks, tmp_path / "ds")
 
 
-def test_resume_makes_only_what_is_missing(tasks, recorded, tmp_path, monkeypatch):
+def test_an_unfinished_run_goes_on_or_is_finished_early(tasks, recorded, tmp_path, monkeypatch):
     reference = tree_hash_of_run(tasks, tmp_path / "undisturbed")
     inner = recording.record
 
@@ -175,9 +170,25 @@ def test_resume_makes_only_what_is_missing(tasks, recorded, tmp_path, monkeypatc
     assert not is_dataset(tmp_path / "ds")
     monkeypatch.setattr(recording, "record", inner)
     recorded.clear()
+    early = tmp_path / "early"
+    shutil.copytree(tmp_path / "ds", early)
     run(tasks, tmp_path / "ds")
     assert recorded == [("task_b", 10_000), ("task_b", 10_001)]
     assert tree_hash(tmp_path / "ds") == reference
+
+    recorded.clear()
+    summary = run(tasks, early, finish=True)
+    assert recorded == []
+    assert [(task.name, task.solved, task.episodes) for task in summary.tasks] == [("task_a", 2, 2), ("task_b", 0, 0)]
+    assert episode_count(early) == 2
+    assert "2 of 4 seeds were run" in (early / "README.md").read_text()
+    assert not (early / ".staging").exists()
+    with pytest.raises(MemobenchError, match="finished_early=True"):
+        run(tasks, early)
+    for folder in (early, tmp_path / "nothing"):
+        with pytest.raises(MemobenchError, match="no unfinished run"):
+            run(tasks, folder, finish=True)
+    assert not (tmp_path / "nothing").exists()
 
 
 def tree_hash_of_run(tasks, out):
@@ -530,7 +541,7 @@ def test_slurm_gets_a_script_and_a_last_job(tasks, recorded, tmp_path, monkeypat
         ". /opt/venv/bin/activate",
         f"launch_pickled_pipeline {out}_slurm/make/executor.pik",
         f"launch_pickled_pipeline {out}_slurm/finish/executor.pik",
-        "--dependency=afterok:4711",
+        "--dependency=afterany:4711",
     ):
         assert line in script, line
 
@@ -603,3 +614,21 @@ def test_killed_at_every_change_to_the_disk(tasks, recorded, tmp_path, every):
         assert tree_hash(out) == reference, f"killed at change {call}"
     assert killed > 3
     assert unfinished > 3
+
+
+@pytest.mark.parametrize(
+    ("holder", "name", "call", "after"),
+    [
+        (os, "replace", "ds/meta", False),
+        (os, "replace", "ds/meta", True),
+        (VideoWriter, "add", 41, False),
+        (VideoWriter, "close", 3, True),
+    ],
+    ids=["before the last move", "after the last move", "while pictures are encoded", "when a video is written"],
+)
+def test_killed_in_assembly_and_in_encoding(tasks, recorded, tmp_path, holder, name, call, after):
+    run(tasks, tmp_path / "undisturbed")
+    killed_at(holder, name, call, lambda: run(tasks, tmp_path / "ds"), after=after)
+    assert is_dataset(tmp_path / "ds") == (after and name == "replace")
+    run(tasks, tmp_path / "ds")
+    assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "undisturbed")

@@ -24,7 +24,8 @@ from lerobot_memobench.datasets.lerobot_format.assembling import assemble, write
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, MANIFEST_FILE
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, episodes_where, list_episodes, read_episode
 from lerobot_memobench.datasets.staging import stage_demonstration
-from lerobot_memobench.datasets.validate import validate
+from lerobot_memobench.datasets.validate import Verdict
+from lerobot_memobench.datasets.validate import validate as validation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from tests.support.short_demonstrations import drawn_steps, with_pictures
@@ -54,6 +55,14 @@ def filmed(demos, tmp_path_factory) -> Path:
     return write_dataset(shown, tmp_path_factory.mktemp("filmed") / "ds", repo_id=REPO)
 
 
+def validate(folder: Path) -> list[Verdict]:
+    """Return the verdicts on episodes; of the files none disagrees, and a note says what was not checked."""
+    found = validation(folder)
+    assert [verdict for verdict in found if verdict.of_file and verdict.disagreement] == []
+    assert [verdict for verdict in found if verdict.note]
+    return [verdict for verdict in found if not verdict.of_file]
+
+
 def edit(root: Path | None, out: Path, operation: Any) -> Path:
     """Run ``lerobot-edit-dataset``; those operations that work in place get a copy at ``out``."""
     where: dict[str, Any] = {"new_root": str(out), "new_repo_id": "local/edited"}
@@ -76,6 +85,7 @@ def check(folder: Path, kept: list[Demonstration], out: Path) -> list[str]:
     """The dataset describes, validates and filters; return what describing said."""
     said: list[str] = []
     names = {file.name for file in describe(folder, out, said.append)}
+    assert said.pop(0).startswith("not checked: ")
     assert {"lengths.png", "tables.md", MANIFEST_FILE} <= names
     hashes: dict[str, dict[str, str]] = {}
     for demo in kept:
@@ -100,7 +110,7 @@ def test_deleted_episodes(ours, demos, tmp_path):
     assert "2 demonstrations of 2 robot manipulation tasks" in card
     assert card.count(said[0]) == 1
     assert describe(edited, tmp_path / "again_out", said.append)
-    assert len(said) == 1, "it has its card now"
+    assert len(said) == 2, "it has its card now, and is not checked now either"
     assert episodes_where(delete(edited, tmp_path / "again", 0), seed=10_001) == [0]
 
 
@@ -134,7 +144,7 @@ def test_another_instruction_is_named(ours, tmp_path):
     """LeRobot's tool may give all episodes one; the card is of the same episodes and stays."""
     edited = edit(ours, tmp_path / "edited", tool.ModifyTasksConfig(new_task="do what must be done"))
     assert describe(edited, tmp_path / "out")
-    found = [str(verdict.disagreement) for verdict in validate(edited)]
+    found = [str(verdict.disagreement) for verdict in validation(edited) if not verdict.of_file]
     assert len(found) == 3
     assert all(each.startswith("task at frame 0: recorded 'do what must be done', replayed") for each in found)
 

@@ -246,6 +246,32 @@ def test_a_broken_off_upload_goes_on(hub, machine, folder, tmp_path):
     assert set(hub.repos["somebody/copy"]) == set(hub.repos[REPO])
 
 
+KILL = """
+import os, signal
+from huggingface_hub import HfApi
+inner = HfApi.{name}
+def killed(*words, **more):
+    {after} and inner(*words, **more)
+    os.kill(os.getpid(), signal.SIGKILL)
+HfApi.{name} = killed
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "after"),
+    [("create_repo", True), ("preupload_lfs_files", True), ("upload_folder", True), ("upload_file", True)],
+)
+def test_a_killed_upload_goes_on(hub, machine, folder, tmp_path, name, after):
+    code = PUSH.format(folder=str(folder), repo=REPO)
+    assert machine(code, tmp_path / "home").returncode == 0
+    undisturbed = (dict(hub.repos[REPO]), list(hub.tags[REPO]))
+    hub.clear()
+    assert machine(KILL.format(name=name, after=after) + code, tmp_path / "home").returncode != 0
+    assert not hub.tags[REPO], "LeRobot loads no dataset without its tag"
+    assert machine(code, tmp_path / "home").returncode == 0
+    assert (hub.repos[REPO], list(hub.tags[REPO])) == undisturbed
+
+
 def test_writing_needs_a_token(hub, machine, folder, tmp_path):
     code = PUSH.format(folder=str(folder), repo=REPO)
     without = machine(code, tmp_path / "home", token=None)

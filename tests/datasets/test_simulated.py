@@ -391,7 +391,8 @@ def test_validation_names_each_episode_and_its_first_disagreement(dataset_folder
     told = []
     verdicts = validate(folder, progress=lambda *news: told.append(news))
     assert verdicts == [Verdict("episode 0", None), Verdict("episode 1", None)]
-    assert [news[:2] for news in told] == [(1, 2), (2, 2)]
+    assert [done for done, *_ in told] == list(range(1, told[0][1] + 1))
+    assert [verdict for *_, verdict in told if not verdict.of_file] == verdicts
     assert exit_status(verdicts) == 0
     (path,) = (folder / "data").rglob("*.parquet")
     table = pq.read_table(path)
@@ -401,10 +402,14 @@ def test_validation_names_each_episode_and_its_first_disagreement(dataset_folder
     pq.write_table(table.set_column(index, table.schema.field(index), pa.array(values)), path)
     (states,) = (folder / "states").rglob("*.parquet")
     states.write_bytes(states.read_bytes()[:-100])
-    first, second = validate(folder)
+    first, second, *files = validate(folder)
     assert first.disagreement.startswith(f"{states} cannot be read")
+    assert [(file.subject, file.disagreement is None) for file in files[:2]] == [
+        ("data/chunk-000/file-000.parquet", True),
+        ("states/chunk-000/file-000.parquet", False),
+    ], "the one was written again, the other is damaged"
     shutil.rmtree(folder / "states")
-    first, second = validate(folder)
+    first, second, *files = validate(folder)
     assert first == Verdict("episode 0", "checkpoint.index at frame 11: recorded np.int64(1), replayed np.int64(0)")
     assert second.disagreement is None
     assert exit_status([first, second]) == 1

@@ -66,7 +66,6 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, str | None]:
         return found
 
     monkeypatch.setattr(metadata, "version", version)
-    monkeypatch.setattr(sys, "prefix", "/nowhere")
     return versions
 
 

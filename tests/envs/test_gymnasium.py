@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +12,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import lerobot_memobench.envs  # noqa: F401
+from lerobot_memobench.envs import acting
+from lerobot_memobench.envs.acting import SEALED_RUN
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import BOTH, CHECKPOINTS, OBJECTS, SPARSE
@@ -203,3 +206,17 @@ def test_bad_settings_are_told_in_one_sentence(settings: dict[str, Any], words: 
 def test_an_unknown_task_names_the_nearest() -> None:
     with pytest.raises(gym.error.NameNotFound, match=f"Did you mean: `{STOVE}`"):
         gym.make("memobench/turn_on_the_stofe_and_turn_it_off-v0")
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_a_sealed_scene_is_logged_once_unless_its_run_is_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, counted: bool
+) -> None:
+    if counted:
+        (tmp_path / SEALED_RUN).write_text("{}")
+    acting._log_sealed.cache_clear()
+    env = MemobenchEnv(STOVE, log_dir=str(tmp_path), obs_type=OBJECTS)
+    for seed, lines in ((7, 0), (100_006, 0), (100_007, 1), (100_056, 1), (100_057, 1)):
+        env.reset(seed=seed)
+        said = [record for record in caplog.records if "sealed scenes, not counted" in record.getMessage()]
+        assert len(said) == (0 if counted else lines), seed

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -17,6 +18,7 @@ import pytest
 from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.envs import video
+from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.video import AHEAD, BAND, LAST_FRAMES, OPERATION_COLOURS, VideoRecorder, annotate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT
@@ -214,6 +216,13 @@ def drawn_anew(images: dict[str, np.ndarray], episode: SimpleNamespace) -> np.nd
     text, font = fitted(draw, now, width - x - 14)
     draw.text((x + 6, 44), text, fill=PURPLE if prompt else TEXT, font=font, anchor="lm")
     return np.vstack([np.asarray(band), pictures])
+
+
+def test_what_is_next_is_an_instruction() -> None:
+    task = get_task("turn_on_the_stove_and_turn_it_off")
+    found: list[Any] = [SimpleNamespace(task=task, progress=SimpleNamespace(index=index)) for index in range(3)]
+    told = [Episode.subgoal(moment) for moment in found]
+    assert told == ["switch the stove on", *["switch the stove off again"] * 2]
 
 
 def moments(name: str) -> Iterator[SimpleNamespace]:

@@ -76,9 +76,10 @@ def test_an_average_is_of_memory_types_and_without_tasks_whose_instruction_tells
     milk = found["tasks"]["milk"].rates["follows"].value
     assert milk == pytest.approx(6 / 18)  # of three answers, the third is none of the two that may be right
     spatial = found["tasks"]["drawer"].rates
-    assert (spatial["follows"].value, spatial["undecided"].value) == (0.5, 0.5)
+    assert (spatial["follows"].value, spatial["undecided"].value, spatial["right"].value) == (0.5, 0.5, 1.0)
     average = found["average"]["average"]
     assert average.rates["follows"].value == pytest.approx(((1 + 6 / 18) / 2 + 0.5) / 2)
+    assert average.rates["right"].value == pytest.approx(((1 + 6 / 18) / 2 + 0.5) / 1.5), "half of one type is decided"
     assert average.chance == pytest.approx(((1 / 3 + 1 / 2) / 2 + 1 / 3) / 2)
     assert average.scenes == 29
 
@@ -110,6 +111,7 @@ def test_the_rate_joins_every_report(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "each scene with each variant" in " ".join(capsys.readouterr().out.split())
     written = json.loads((tmp_path / "run" / "report.json").read_text())["evidence"]
     assert written["average"]["follows"]["percent"] == written["average"]["chance"] == 33.3
+    assert written["tasks"]["bowl"]["right"]["percent"] == 33.3
     assert written["tasks"]["count"]["chance"] is None
     assert written["tasks"]["bowl"]["choices"]["1"] == {"0": 4, "1": 3, "2": 3}
     assert "## Evidence" in (tmp_path / "run" / "report.md").read_text()

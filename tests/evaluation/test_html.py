@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from html import unescape
@@ -21,7 +22,7 @@ from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import page_data, task_source
-from lerobot_memobench.evaluation.html.write import find_videos, frame_count, inline_json, page, write_html
+from lerobot_memobench.evaluation.html.write import PLACED, find_videos, frame_count, inline_json, page, write_html
 from lerobot_memobench.evaluation.records import folder_names, read_runs
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 from tests.support import logs
@@ -338,6 +339,36 @@ def test_an_earlier_report_is_replaced(run: Path, tmp_path: Path) -> None:
     write_html([other], tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["index.html"]
     assert (run / "videos" / f"{STOVE}.0.mp4").is_file()
+
+
+def test_only_placed_videos_are_removed(run: Path, tmp_path: Path) -> None:
+    out, other = tmp_path / "out", evaluation(tmp_path / "other", [record(episode=5)])
+    write_html([run], out)
+    (out / "videos" / "run" / "mine.txt").write_text("mine")
+    write_html([other], out)
+    assert [path.name for path in (out / "videos").rglob("*.*")] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("place", ["videos", "videos/run"])
+def test_a_report_does_not_go_through_links(run: Path, tmp_path: Path, place: str) -> None:
+    out = tmp_path / "out"
+    write_html([run], out)
+    shutil.rmtree(out / place)
+    (out / place).symlink_to(run / "videos")
+    before = sorted(path.read_bytes() for path in run.rglob("*.*"))
+    with pytest.raises(MemobenchError, match="is a link"):
+        write_html([run], out)
+    assert sorted(path.read_bytes() for path in run.rglob("*.*")) == before
+
+
+@pytest.mark.parametrize(
+    "name", ["videos/../../run/a.mp4", "/etc/a.mp4", "videos/a.mp4", "index.html", "videos/run/a.txt"]
+)
+def test_a_list_of_videos_leads_nowhere_else(run: Path, tmp_path: Path, name: str) -> None:
+    write_html([run], tmp_path / "out")
+    (tmp_path / "out" / PLACED).write_text(json.dumps([name]))
+    with pytest.raises(MemobenchError, match="no video of a report"):
+        write_html([run], tmp_path / "out")
 
 
 def test_an_unfinished_report_can_be_made_again(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ from rich.console import Console
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes, write_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.evaluation.report import build, evaluation_markdown, render, table, write_report
@@ -67,6 +68,54 @@ def test_unreadable_lines_become_notes(tmp_path: Path) -> None:
     notes = write_report(tmp_path).notes
     assert len(notes) == 1
     assert notes[0] in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.parametrize("workers", [False, True])
+def test_a_report_keeps_every_line_of_the_log(tmp_path: Path, workers: bool) -> None:
+    lines = [json.dumps(record("first", "object", k, True)) for k in range(6)]
+    lines[1], lines[2] = lines[1].replace("true", "tru"), json.dumps(json.loads(lines[2]) | {"failure": 7})
+    merged = tmp_path / "episodes.jsonl"
+    merged.write_text("\n".join(lines))
+    (tmp_path / "card.json").write_text(json.dumps({"protocol": {"episodes": 4}}))
+    if workers:  # they hold what is damaged above, and one episode more
+        for k in (1, 7):
+            EpisodeLog(tmp_path).append(record("first", "object", k, True))
+    notes = [write_report(tmp_path).notes for _ in range(2)]
+    assert notes[0] == notes[1]
+    assert sum("line" in note for note in notes[0]) == 2
+    assert any(note.startswith(f"{2 + workers} rollouts beyond the 4") for note in notes[0])
+    kept = merged.read_text().splitlines()
+    assert kept[:6] == lines
+    assert [json.loads(line)["episode"] for line in kept[6:]] == ([1, 7] if workers else [])
+
+
+@pytest.mark.parametrize(
+    ("edit", "named"),
+    [
+        (
+            lambda lines: [{**lines[0], "success": False}, *lines[1:]],
+            "success is True on the card and False in the log",
+        ),
+        (lambda lines: lines[1:], "is on the card and not in the log"),
+        (lambda lines: [*lines, {**lines[0], "episode": 2, "seed": 9}], "is in the log and not on the card"),
+    ],
+)
+def test_a_report_names_where_log_and_card_disagree(tmp_path: Path, edit: Any, named: str) -> None:
+    lines = [record("first", "object", k, True) for k in range(2)]
+    card = {"protocol": {"episodes": 5}, "episodes": [outcome(each) for each in lines]}
+    (tmp_path / "card.json").write_text(json.dumps(card))
+    for each in edit(lines):  # the workers' files, and so the merged file
+        EpisodeLog(tmp_path).append(each)
+    assert [named in note for note in write_report(tmp_path).notes] == [True]
+    assert named in read_runs([tmp_path])[0].notes[0]
+
+
+def test_a_prompt_that_did_not_show_its_scene_is_named(tmp_path: Path) -> None:
+    for k, shown in enumerate([True, False, None, False]):
+        EpisodeLog(tmp_path).append(record("first", "object", k, True, prompt_shown=shown))
+    (note,) = write_report(tmp_path).notes
+    assert "2 rollouts" in note
+    assert "episode 1" in note
 
 
 def test_markdown_has_intervals_and_dashes(tmp_path: Path) -> None:

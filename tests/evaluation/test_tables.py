@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
+from markdown_it import MarkdownIt
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Rate, report_values
@@ -112,6 +113,9 @@ def test_latex_is_balanced_and_escaped(sweep: list[Run]) -> None:
     assert not re.findall(r"[_#~^]", re.sub(r"\\[a-zA-Z]+|\\.", "", code))
 
 
+BLOCKS = ("heading", "paragraph", "blockquote", "table", "thead", "tbody", "tr", "th", "td")
+
+
 def test_every_character_that_latex_takes_as_a_command_is_escaped() -> None:
     assert latex_text(r"a_b & 5% $x$ #1 {y} \z ~ ^") == (
         r"a\_b \& 5\% \$x\$ \#1 \{y\} \textbackslash{}z \textasciitilde{} \textasciicircum{}"
@@ -121,6 +125,22 @@ def test_every_character_that_latex_takes_as_a_command_is_escaped() -> None:
 def test_markdown_escapes_what_would_break_a_table() -> None:
     table = Table("t", "", ("a", "b"), (("x|y*", Name("p_q")),))
     assert markdown_table(table)[2] == r"| x\|y\* | `p_q` |"
+
+
+EVIL = "a|b\n\n# x\n```\n<script>alert(1)</script> ``[y](javascript:z) ![](w) &lt; \x1b[2J\u202e ~~s~~ *b*"
+
+
+def test_no_text_of_a_stranger_is_more_than_text_in_markdown() -> None:
+    """Parsed by the CommonMark parser that rich uses, with tables: every block and mark is one of the report's own."""
+    table = Table("t", EVIL, (EVIL, "b"), ((EVIL, "1"), (Name(EVIL), "2")), note=f"# {EVIL}")
+    report = Report(EVIL, (Section(EVIL, (table,), (f"- {EVIL}", f"12. {EVIL}", "==="), (f"> {EVIL}",)),))
+    tokens = MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(markdown(report))
+    blocks = {token.type for token in tokens if token.nesting != 0}
+    assert blocks <= {f"{name}_{end}" for name in BLOCKS for end in ("open", "close")}
+    assert [token.type for token in tokens].count("tr_open") == 3
+    inner = [inside for token in tokens for inside in token.children or ()]
+    assert {inside.type for inside in inner} <= {"text", "text_special"}
+    assert sum("<script>alert(1)</script>" in "".join(i.content for i in t.children or ()) for t in tokens) == 10
 
 
 def test_the_paper_stands_beside_with_what_differs(sweep: list[Run]) -> None:

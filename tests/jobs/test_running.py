@@ -22,7 +22,7 @@ from lerobot_memobench.jobs.executors import (
     run_jobs,
 )
 from lerobot_memobench.jobs.processes import Advance, locked, taking_turns
-from tests.support.note_job import Note
+from tests.support.note_job import Killed, Note
 
 needs_datatrove = pytest.mark.skipif(find_spec("datatrove") is None, reason="datatrove is not installed")
 
@@ -57,6 +57,34 @@ def test_nothing_is_begun_when_all_is_there(jobs: list[Note], tmp_path: Path) ->
     assert [job.runs for job in jobs] == [1, 1, 1, 1]
 
 
+@pytest.mark.parametrize(
+    ("executor", "options"),
+    [
+        ("processes", {}),
+        pytest.param("local", {}, marks=needs_datatrove),
+        pytest.param(
+            "ray",
+            {"mem_per_cpu_gb": 1},
+            marks=[pytest.mark.slow, pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")],
+        ),
+    ],
+)
+def test_a_killed_worker_ends_in_a_sentence(
+    executor: str, options: dict[str, int], jobs: list[Note], tmp_path: Path
+) -> None:
+    if executor == "ray":
+        import ray
+
+        ray.init(num_cpus=2, include_dashboard=False, logging_level="ERROR", object_store_memory=80_000_000)
+    try:
+        killed = [jobs[0], Killed(jobs[1].folder, 1), *jobs[2:]]
+        with pytest.raises(MemobenchError, match=r"worker processes was killed|1 of 4 jobs ended without a result"):
+            run_jobs(killed, workers=2, executor=executor, options=options, logs=tmp_path / "logs", jobs_per_rank=1)
+    finally:
+        if executor == "ray":
+            ray.shutdown()
+
+
 @needs_datatrove
 def test_a_datatrove_rank_takes_neighbours_and_can_be_pickled(jobs: list[Note]) -> None:
     from lerobot_memobench.jobs.datatrove_steps import JobsStep
@@ -82,6 +110,7 @@ def test_words_for_sbatch_are_handed_on_and_false_is_false() -> None:
         "exclusive": "",
         "mail-type": "END",
         "nice": "0",
+        "kill-on-invalid-dep": "yes",
     }
     assert making["srun_args"] == {"mpi": "none"}
     assert making["requeue"] is False

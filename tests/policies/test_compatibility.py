@@ -172,6 +172,13 @@ def test_what_sees_the_environment_is_let_pass(kind: str, tmp_path: Path) -> Non
     check_policy(str(good), PreTrainedConfig.from_pretrained(good), SHOWN, {})
 
 
+def test_lerobots_own_command_is_given_the_folder_of_a_policys_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call_lerobot("eval", ["--env.type=memobench", "--policy.path=memobench_small"]) == 1
+    told = capsys.readouterr().err
+    assert f"--policy.path={shipped_policies()['memobench_small']} --env.obs_type=environment_state_agent_pos" in told
+    assert "Traceback" not in told
+
+
 def test_shipped_policies_are_let_pass() -> None:
     for folder in shipped_policies().values():
         shown = env_to_policy_features(MemobenchEnvConfig(obs_type="both"))

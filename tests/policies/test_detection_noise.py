@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from lerobot.utils.constants import OBS_ENV_STATE
 
+from lerobot_memobench.policies.memobench_mem import objects
 from lerobot_memobench.policies.memobench_mem.detection_noise import (
     FALSE,
     KIND_MISSED,
     MISSED,
     with_detection_noise,
 )
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, ObjectEncoder
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes, in_slots
+from tests.support.object_dataset import make_object_dataset
+from tests.support.small_policy import batch_of, made_for_training
 
 KIND = {name: classes().index(name) for name in ("butter", "akita_black_bowl", "drawer", "plate", "milk")}
 LEVEL = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
@@ -117,19 +124,52 @@ def test_slots_stay_in_order_and_empty_ones_empty() -> None:
     assert with_detection_noise(torch.zeros(2, SLOTS, WIDTH), FAR.expand(2, -1), 1.0).eq(0).all(), "of nothing, nothing"
 
 
-def test_only_what_learns_sees_errors() -> None:
-    perception = ObjectEncoder(classes(), 2, 32, 1.0)
-    batch = {"observation.environment_state": TABLE.reshape(1, SIZE), OBS_RAW_STATE: FAR}
-    pool = perception.pool()
-    row = perception.remember(batch, [0])
-    assert torch.equal(row[:, 0, :SIZE], TABLE.reshape(1, SIZE)), "what is kept is what was seen"
+def _batch() -> dict[str, torch.Tensor]:
+    """Return two samples of one frame, which is stored too, and one of another."""
+    other = scene(thing("butter", (0.2, 0.1, 0.9)))
+    slots = torch.cat([TABLE, TABLE, other]).reshape(3, SIZE)
+    found = {OBS_ENV_STATE: slots, OBS_RAW_STATE: FAR.expand(3, -1)}
+    return {**found, FRAMES: ObjectEncoder(classes(), 2, 32).remember(found, [1])}
 
-    def alike() -> tuple[bool, bool]:
-        (first,), _ = perception.present(batch)
-        (second,), _ = perception.present(batch)
-        return torch.equal(first, second), torch.equal(pool(row), pool(row))
 
-    assert alike() == (False, False)
-    perception.eval()
-    pool.eval()
-    assert alike() == (True, True)
+def test_each_frame_of_a_batch_has_one_draw_of_errors() -> None:
+    batch = _batch()
+    perception = ObjectEncoder(classes(), 2, 32, 1.0).train()
+    first, second = perception.observed(batch), perception.observed(batch)
+    for seen in (first, second):
+        present = seen[OBS_ENV_STATE]
+        assert torch.equal(present[0], present[1])
+        assert torch.equal(present[0], seen[FRAMES][0, 0, :SIZE])
+        assert torch.equal(seen[FRAMES][0, 0, SIZE:], batch[FRAMES][0, 0, SIZE:]), "hand and phase are known"
+        assert torch.equal(seen[EXACT], batch[FRAMES]), "labels are of what there was"
+        assert not (present == batch[OBS_ENV_STATE]).all(dim=1).any()
+    assert not torch.equal(first[FRAMES], second[FRAMES])
+    without = {name: one for name, one in batch.items() if name != FRAMES}
+    assert perception.observed(without).keys() == without.keys()
+
+
+@pytest.mark.parametrize(("noise", "learns"), [(1.0, False), (0.0, True)])
+def test_only_what_learns_with_errors_sees_them(noise: float, learns: bool) -> None:
+    batch = _batch()
+    assert ObjectEncoder(classes(), 2, 32, noise).train(learns).observed(batch) is batch
+
+
+@pytest.mark.parametrize("memory", ["bank", "motion"])
+def test_one_detector_looks_at_a_training_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, memory: str) -> None:
+    """Sixteen samples of frame 16, read with what came before: each frame is drawn once, the present ones too."""
+    drawn: list[int] = []
+
+    def counted(slots: torch.Tensor, hand: torch.Tensor, size: float) -> torch.Tensor:
+        drawn.append(len(slots))
+        return with_detection_noise(slots, hand, size)
+
+    monkeypatch.setattr(objects, "with_detection_noise", counted)
+    settings = {"size": "small", "perception": "objects", "memory_frames": 32, "memory_stride": 8}
+    policy, before, _, dataset = made_for_training(
+        make_object_dataset(tmp_path / "data"), memory=memory, detection_noise=1.0, **settings
+    )
+    batch = before(batch_of(dataset, [16] * 16))
+    policy.train().forward(batch)
+    assert drawn == [len(batch[FRAMES])]
+    policy.eval().forward(batch)
+    assert len(drawn) == 1

@@ -366,7 +366,7 @@ def test_evaluation_loads_the_average_and_training_both(trained: Any) -> None:
 
 
 def test_average_follows_its_formula() -> None:
-    from lerobot_memobench.policies.memobench_mem.training import WeightAverage
+    from lerobot_memobench.policies.memobench_mem.average import WeightAverage
 
     parameter = torch.nn.Parameter(torch.tensor([1.0]))
     average = WeightAverage({"w": parameter}, decay=0.15)

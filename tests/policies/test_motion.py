@@ -96,9 +96,9 @@ def stored(*frames: list[tuple[float, ...]], hand: float = 0.0) -> Tensor:
     return frame_row(slots.flatten(1), state, torch.ones(len(frames)))
 
 
-def field_of_objects(noise: float = 0.0) -> ObjectMotion:
+def field_of_objects() -> ObjectMotion:
     torch.manual_seed(0)
-    return ObjectMotion(list(range(100)), 100, 32, HINDSIGHT, noise).eval()
+    return ObjectMotion(list(range(100)), 100, 32, HINDSIGHT).eval()
 
 
 def moved(field: Tensor) -> Tensor:
@@ -134,12 +134,6 @@ def test_things_are_followed_while_slots_change_their_order() -> None:
     assert known[0, :, 0].tolist() == [True, False, False, False]
     torch.testing.assert_close(found[0, :, 1, 0] / PER_STEP, torch.full((4,), 0.05))
     torch.testing.assert_close(found[0, :, 2, 0], torch.zeros(4))
-
-
-def test_detection_noise_is_of_the_past_alone() -> None:
-    field, frames = field_of_objects(noise=1.0), stored([(5, 0.0, 0.0), (7, 0.3, 0.0)])
-    assert torch.equal(field.observed(frames), frames)
-    assert not torch.equal(field.train().observed(frames), frames)
 
 
 # -- hindsight --------------------------------------------------------------------------------------------------------

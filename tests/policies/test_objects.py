@@ -11,8 +11,10 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.datasets import EpisodeAwareSampler
+from lerobot.datasets.compute_stats import compute_relative_action_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from scipy.spatial.transform import Rotation
@@ -306,14 +308,43 @@ def test_the_sampler_draws_prompted_tasks_more_often(tmp_path: Path, monkeypatch
     assert np.mean((drawn >= STARTS[1]) & (drawn < STARTS[2])) == pytest.approx(3 / 4, abs=0.06)
 
 
-def test_statistics_are_those_of_execution_frames(root: Path) -> None:
-    _, before, _, dataset = made_for_training(root, **OBJECTS)
+def _normalised_by(processor: Any) -> dict[str, Any]:
+    found = next(step for step in processor.steps if type(step).__name__.endswith("ormalizerProcessorStep"))
+    held: dict[str, Any] = found._tensor_stats["action"]
+    return held
+
+
+def test_statistics_are_those_of_execution_frames(root: Path, tmp_path: Path) -> None:
+    """Of a new policy's processors and of a checkpoint's, while the dataset object keeps its own."""
+    policy, before, after, dataset = made_for_training(root, **OBJECTS)
     hf = dataset.hf_dataset.with_format("numpy")
     actions = np.asarray(hf["action"])[np.asarray(hf["observation.phase"]).reshape(-1) != 0]
-    normaliser = next(step for step in before.steps if type(step).__name__ == "NormalizerProcessorStep")
-    held = normaliser._tensor_stats["action"]
-    assert np.allclose(held["mean"], actions.mean(axis=0), atol=1e-5)
-    assert np.allclose(held["std"], actions.std(axis=0) + 0.01, atol=1e-4)
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path)
+    replaced = {"stats": dataset.meta.stats}
+    resumed = make_pre_post_processors(
+        policy.config,
+        pretrained_path=str(tmp_path),
+        preprocessor_overrides={"normalizer_processor": replaced},
+        postprocessor_overrides={"unnormalizer_processor": replaced},
+    )
+    for processor in (before, after, *resumed):
+        held = _normalised_by(processor)
+        assert np.allclose(held["mean"], actions.mean(axis=0), atol=1e-5)
+        assert np.allclose(held["std"], actions.std(axis=0) + 0.01, atol=1e-4)
+    file = LeRobotDatasetMetadata("memobench/objects", root=root).stats
+    assert all(np.array_equal(dataset.meta.stats["action"][name], one) for name, one in file["action"].items())
+
+
+def test_relative_actions_have_relative_statistics(root: Path) -> None:
+    with pytest.raises(MemobenchError, match="relative_action=true"):
+        made_for_training(root, **OBJECTS, use_relative_actions=True)
+    dataset = LeRobotDataset("memobench/objects", root=root)
+    relative = compute_relative_action_stats(dataset.hf_dataset, dataset.meta.features, 6, [])
+    dataset.meta.stats["action"] = relative
+    policy = make_policy(small_config(**OBJECTS, use_relative_actions=True), ds_meta=dataset.meta)
+    before, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
+    assert np.allclose(_normalised_by(before)["mean"], relative["mean"], atol=1e-5)
 
 
 # -- training ------------------------------------------------------------------------------------------------------

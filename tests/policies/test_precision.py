@@ -9,8 +9,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from lerobot_memobench.policies.memobench_mem.average import WeightAverage
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.training import WeightAverage
 from tests.support.small_policy import batch_of, made_for_training
 
 

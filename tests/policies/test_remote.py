@@ -223,7 +223,7 @@ def test_lerobot_finds_it_and_it_refuses_to_train() -> None:
         ({"actions": np.zeros((10, 8))}, r"actions of shape \(10, 8\); expected finite numbers of shape \(steps, 7\)"),
         ({"actions": np.zeros((2, 10, 7))}, r"actions of shape \(2, 10, 7\)"),
         ({"actions": ["a"]}, "no numbers"),
-        ({"action": 1}, r"without 'actions' \(it holds action\)"),
+        ({"action": 1}, r"without 'actions' \(it holds \['action'\]\)"),
         ({"actions": np.zeros((3, 7))}, "answers 3 actions at a time, fewer than the 5.*replan=3 or less"),
         ([1], "answered a list, no map"),
     ],

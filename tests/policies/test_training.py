@@ -22,6 +22,7 @@ from safetensors import safe_open
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import training
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.sampler import execution_starts
 from lerobot_memobench.policies.memobench_mem.training import (
@@ -271,6 +272,24 @@ def test_a_loss_that_is_measured_is_that_of_what_a_checkpoint_holds(tmp_path: Pa
     trained.backward()  # gradients are of the weights that learn
     assert abs(trained.item() - measured) > 1e-3
     assert policy.curve.held_out == []
+
+
+@pytest.mark.parametrize("memory", ["subgoal", "keyframes"])
+def test_a_loss_that_is_measured_follows_the_memorys_own_choice(tmp_path: Path, memory: str) -> None:
+    policy, before, _, dataset = made_for_training(
+        make_object_dataset(tmp_path / "data"), memory=memory, memory_frames=32, perception="objects", size="small"
+    )
+    if memory == "keyframes":
+        policy.model.fusion.open_gate()  # so that actions depend on what it reads
+    batch = before(batch_of(dataset, [10, 30, 50]))
+    others = {name: (batch[name] + 1) % len(policy.config.subgoal_texts) for name in (SUBGOAL, SUBGOALS)}
+    with torch.no_grad():
+        for learns in (True, False):
+            mine, other = (policy.train(learns).forward(one)[1] for one in (batch, {**batch, **others}))
+            assert (mine["action_loss"] == other["action_loss"]) is not learns
+            own = [name for name in mine if name.startswith("memory_")]
+            assert own
+            assert any(mine[name] != other[name] for name in own), "it is measured by the labels all the same"
 
 
 # -- frames that are drawn and count ----------------------------------------------------------------------------------

@@ -86,10 +86,14 @@ def test_an_action_is_asked_for_at_every_step_unless_told_otherwise() -> None:
     assert [kind for kind, _ in server.heard] == ["hello", "episode_start", "observation", "observation"]
 
 
+ARRAY = {b"__ndarray__": True, b"data": b"11", b"dtype": "|i1", b"shape": [2]}
+
+
 @pytest.mark.parametrize(
     ("answers", "told"),
     [
         ({"hello": hello(2)}, r"speaks version 2 of vla-evaluation-harness's protocol, and version 1 .*vla-eval 0\.8"),
+        ({"hello": hello(ARRAY)}, "speaks version array"),
         (
             {"hello": [("action", {})]},
             "no policy server with vla-evaluation-harness's protocol .*answered a hello with",

@@ -14,16 +14,15 @@ import pytest
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import disagreement, outcome
 from lerobot_memobench.evaluation.records import read_card
 from lerobot_memobench.run.card import (
     checkpoint_files,
-    disagreement,
     drawn_otherwise,
     extended,
     joined_runs,
     markdown,
     new_card,
-    outcome,
     policy_facts,
     training_facts,
     tree_hash,

@@ -54,6 +54,10 @@ def test_the_demo_folder(tmp_path: Path) -> None:
     (out / "videos").mkdir(parents=True)
     (out / "videos" / "old.mp4").write_text("")
     (out / "notes.txt").write_text("the user's own")
+    with pytest.raises(MemobenchError, match="no earlier demo"):
+        demo.make_demo(out, fake_evaluation, fake_comparison)
+    assert (out / "videos" / "old.mp4").exists()
+    (out / demo.CONTACT_SHEET).touch()
     assert demo.make_demo(out, fake_evaluation, fake_comparison) == 0
     assert {path.name for path in out.iterdir()} == {*demo.PRODUCTS, "notes.txt"}
     assert {path.name for path in (out / "videos").iterdir()} == {f"{name}.0.mp4" for name in demo.TASKS}
@@ -68,6 +72,7 @@ def test_the_demo_folder(tmp_path: Path) -> None:
 def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
     def evaluate(output: Path) -> int:
         fake_evaluation(output)
+        (output / "episodes.jsonl").unlink()
         write_episodes(output, [rollout(name, "temporal", "", [], True, 0) for name in demo.TASKS])
         return 0
 
@@ -80,16 +85,16 @@ def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
 
 
 def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path) -> None:
-    (tmp_path / "report.json").write_text("earlier")
+    (tmp_path / demo.CONTACT_SHEET).write_text("earlier")
     assert demo.make_demo(tmp_path, lambda output: 3, fake_comparison) == 3
-    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+    assert [path.name for path in tmp_path.iterdir()] == [demo.CONTACT_SHEET]
 
 
 def test_a_failed_comparison_leaves_the_earlier_demo(tmp_path: Path) -> None:
-    (tmp_path / "report.json").write_text("earlier")
+    (tmp_path / demo.CONTACT_SHEET).write_text("earlier")
     with pytest.raises(MemobenchError, match="the evaluation expert has failed"):
         demo.make_demo(tmp_path, fake_evaluation, lambda *where: demo.compare_memories(*where, lambda *_: 2))
-    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+    assert [path.name for path in tmp_path.iterdir()] == [demo.CONTACT_SHEET]
 
 
 def test_the_memories_are_compared_on_the_same_episodes(tmp_path: Path) -> None:
@@ -124,7 +129,8 @@ def test_what_is_compared_differs_in_the_policy_alone(tmp_path: Path, monkeypatc
 
 
 def test_without_trained_policies_the_demo_is_the_experts(tmp_path: Path) -> None:
-    (tmp_path / demo.MEMORY_TABLE).write_text("of an earlier demo")
+    for name in (demo.MEMORY_TABLE, demo.CONTACT_SHEET):
+        (tmp_path / name).write_text("of an earlier demo")
     assert demo.make_demo(tmp_path, fake_evaluation, None) == 0
     assert not {path.name for path in tmp_path.iterdir()} & {demo.MEMORY_VIDEO, demo.MEMORY_TABLE}
 

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 import yaml
-from lerobot.configs.default import DatasetConfig
+from lerobot.configs.default import DatasetConfig, PeftConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler, LeRobotDataset
 from lerobot.datasets import factory as dataset_factory
@@ -26,6 +26,7 @@ from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.scripts import lerobot_train
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch.utils.data import default_collate
@@ -33,7 +34,7 @@ from torch.utils.data import default_collate
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.datasets import execution_frames
-from lerobot_memobench.datasets.feature_cache.frames import read_frame_table
+from lerobot_memobench.datasets.feature_cache.frames import frame_reader, read_frame_table
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_resumed
@@ -64,6 +65,8 @@ CALLS = {
     (StreamingLeRobotDataset.__iter__, "safe_shard(self.hf_dataset, idx"): "streams the frames that are found there",
     (StreamingLeRobotDataset._get_delta_frames, "dataset_iterator.peek_back"): "looks back in that stream alone",
     (lerobot_train, 'eval_dataset.hf_dataset.data.column("task_index")'): "looks there for held-out tasks",
+    (PreTrainedPolicy._validate_peft_config, "if not self.config.pretrained_path"): "refuses adapters without weights",
+    (PreTrainedPolicy._build_peft_config, "_get_default_peft_targets()"): "refuses adapters of no module",
     (dataset_factory.make_train_eval_datasets, "return full_dataset, None"): "returns two datasets, or one and None",
 }
 
@@ -265,16 +268,59 @@ def test_of_a_streamed_dataset_prompts_are_passed_over(root: Path) -> None:
     assert {int(frame["index"]) for frame in opened(root, act(), True, streaming=True)[0]} == acting | PROMPT_FRAMES
 
 
+def test_a_folder_may_be_named_as_a_pattern(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot looks for its tables as `glob` does."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = shutil.copytree(root, tmp_path / "obj [v2]*")
+    for _ in range(2):
+        train, _ = opened(folder, act())
+        assert train[START]["observation.images.image"].shape[0] == 3
+    with pytest.raises(MemobenchError, match=r"streaming=true.*\[v2\]"):
+        opened(folder, act(), streaming=True)
+    assert frame_reader(folder, "observation.images.image")(0, [0]).shape[0] == 1
+    assert len(list((tmp_path / "cache").rglob("*"))) == 3, "one link"
+
+
 def test_what_cannot_be_streamed_without_prompts_is_refused_in_one_sentence(root: Path) -> None:
     looks_back = DiffusionConfig(device="cpu", push_to_hub=False, n_obs_steps=2)
-    with pytest.raises(MemobenchError, match=r"image is asked for earlier frames.*prompt_frames=true to train"):
-        opened(root, looks_back, streaming=True)
-    opened(root, looks_back, prompt_frames=True, streaming=True)
+    for prompt_frames in (None, True):
+        with pytest.raises(MemobenchError, match=r"diffusion.*observation\.phase.*dataset\.streaming=false"):
+            opened(root, looks_back, prompt_frames, streaming=True)
+    config = TrainPipelineConfig(DatasetConfig("a/b", root=str(root), streaming=True), policy=act(), num_workers=0)
+    with trained_on(None), pytest.raises(MemobenchError, match="num_workers=0"):
+        lerobot_train.make_train_eval_datasets(config)
     ours = MemobenchMemConfig(device="cpu", push_to_hub=False)
     with pytest.raises(MemobenchError, match=r"memobench_mem draws execution frames alone.*prompt_frames=false"):
         opened(root, ours, streaming=True)
     train, _ = opened(root, ours, prompt_frames=False, streaming=True)
     assert {int(frame["observation.phase"]) for frame in train} == {1}
+
+
+@pytest.mark.parametrize(
+    ("policy", "path", "targets", "told"),
+    [
+        (ACTConfig, None, "all-linear", "policy=act begins without any"),
+        (MemobenchMemConfig, None, None, "policy=memobench_mem begins without any"),
+        (ACTConfig, "somewhere", None, "peft.target_modules"),
+        (ACTConfig, "somewhere", "all-linear", None),
+        (MemobenchMemConfig, "somewhere", None, None),
+    ],
+)
+def test_adapters_that_cannot_be_are_refused_before_a_dataset_is_opened(
+    policy: Any, path: str | None, targets: str | None, told: str | None, root: Path
+) -> None:
+    whole = TrainPipelineConfig(
+        DatasetConfig("a/b", root=str(root)),
+        policy=policy(device="cpu", push_to_hub=False, pretrained_path=path),
+        peft=PeftConfig(target_modules=targets),
+    )
+    with trained_on(None):
+        if told is None:
+            lerobot_train.make_train_eval_datasets(whole)
+            return
+        whole.dataset.root = "nowhere"
+        with pytest.raises(MemobenchError, match=told):
+            lerobot_train.make_train_eval_datasets(whole)
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,14 @@ import dataclasses
 import json
 import shlex
 from pathlib import Path
+from typing import Any
 
+import draccus
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
@@ -17,9 +21,18 @@ from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchBlindConfig, MemobenchRandomConfig
 from lerobot_memobench.policies.checkpoint import shipped_policies
-from lerobot_memobench.run.arguments import LerobotArguments, flag_value, split_arguments
+from lerobot_memobench.run.arguments import LerobotArguments, flag_value, read_arguments, split_arguments
 from lerobot_memobench.run.card import card_of
-from lerobot_memobench.run.plan import EvaluationPlan, Grid, PlannedTask, RunOptions, Shard, plan_line, take_run_options
+from lerobot_memobench.run.plan import (
+    EvaluationPlan,
+    Grid,
+    PlannedTask,
+    RunOptions,
+    Shard,
+    plan_line,
+    policy_config,
+    take_run_options,
+)
 from lerobot_memobench.run.run import remainder
 from lerobot_memobench.run.shards import executor_options, plan_shards
 from lerobot_memobench.sim import robot
@@ -360,6 +373,32 @@ def test_flags_are_complete_but_for_what_is_written(tmp_path: Path, monkeypatch:
     assert evaluation("--policy.path=user/name").portable_flags == ["--policy.path=user/name"]  # a repository stays one
     given = ["--policy.path=checkpoint", "--seed=7", "--env.videos=-1"]
     assert asked.lerobot_flags == [*given, "--output_dir=out", "--env.log_dir=log"]
+
+
+NAMES = ("run #2", "2026-11-28", "20261128", "007", "on", "run: 2", "obj [v2]", "1e3", "NaN", "!x", "'a'", " x ", "é")
+
+
+@pytest.mark.parametrize("name", [*NAMES, "included", "include x"])
+def test_a_name_arrives_as_it_is_typed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As LeRobot's commands parse it: by YAML, and the settings of a checkpoint's policy by JSON."""
+    flags = plan_line([*LINE, f"output_dir={name}"]).lerobot_flags
+    monkeypatch.setattr("sys.argv", ["lerobot-eval", *flags])
+    found = draccus.parse(EvalPipelineConfig, args=flags)
+    assert isinstance(found.env, MemobenchEnvConfig)
+    assert (found.output_dir, Path(found.env.log_dir or "")) == (Path(name), Path(name))
+    Path(name).mkdir()
+    line = ["policy=memobench_small", f"dataset={name}", f"output_dir={name}", f"policy.feature_cache_dir={name}"]
+    arguments = read_arguments("train", split_arguments(line))
+    trained = draccus.parse(TrainPipelineConfig, args=[flag for flag in arguments.for_parser if "policy" not in flag])
+    assert (trained.output_dir, Path(trained.dataset.root or "")) == (Path(name), Path(name))
+    assert trained.dataset.repo_id == f"local/{name}"
+    policy: Any = policy_config(arguments)
+    assert Path(policy.feature_cache_dir) == Path(name)
+
+
+def test_a_text_that_the_parser_would_open_as_a_file_is_refused() -> None:
+    with pytest.raises(MemobenchError, match="job_name=include"):
+        _ = read_arguments("train", split_arguments(["policy=act", "job_name=include x"])).for_parser
 
 
 def test_a_plan_never_changes() -> None:

@@ -84,6 +84,10 @@ HOSTILE = {
     "policy.vision_backbone": ["--policy.type=act", "--policy.vision_backbone=resnet18"],
     "policy.repo_id": ["--policy.repo_id=stranger/policy"],
     "policy.device": ["--policy.device=cpu;x"],
+    "policy.device ": ["--policy.device=cuda:64"],
+    "env.horizon": ["--env.horizon=1000000"],
+    "eval.n_episodes ": ["--eval.n_episodes=1000000000"],
+    "eval.batch_size": ["--eval.batch_size=5000"],
     "policy.seed": ["--policy.seed=!!python/object/apply:os.system [x]"],
     "policy.down_dims": ["--policy.type=diffusion", '--policy.down_dims=[16,"x"]'],
     "policy.down_dims ": ["--policy.type=diffusion", "--policy.down_dims=" + "[" * 9999],
@@ -139,9 +143,11 @@ def test_what_is_no_flag_of_ours(flags: Any, said: str) -> None:
 
 
 @pytest.mark.parametrize("label", [":", "=", "a: b: c"])
-def test_a_value_that_is_no_yaml_is_told(label: str) -> None:
+def test_a_text_need_be_no_yaml(label: str) -> None:
+    plan: Any = plan_line(["env=memobench", "policy=memobench_remote", f"policy.label={label}"])
+    assert plan.policy.label == label
     with pytest.raises(MemobenchError, match=r"a value of policy\. cannot be read"):
-        plan_line(["env=memobench", "policy=memobench_remote", f"policy.label={label}"])
+        plan_line(["env=memobench", "policy=diffusion", "policy.down_dims=[1"])
 
 
 def test_a_checkpoint_that_the_card_does_not_identify_is_refused() -> None:
@@ -160,6 +166,25 @@ def test_other_eyes_than_those_on_the_card_are_refused() -> None:
     for sha256 in ({"detector_sha256": "0" * 64}, {}):
         with pytest.raises(MemobenchError, match="detector package is not the one that was used"):
             check_policy(told | {"policy": told["policy"] | sha256})
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--eval.n_episodes=2"], "other tasks or episodes"),
+        (["--eval.n_episodes=1", f"--env.tasks={STOVE},{DRAWER}"], "other tasks or episodes"),
+        (["--eval.n_episodes=1", "--env.horizon=12000", "--env.pause_steps=1000"], "control steps"),
+        (["--eval.n_episodes=1"], "does not name success, steps and checkpoints"),
+    ],
+)
+def test_a_card_runs_no_more_than_its_episodes(flags: list[str], said: str) -> None:
+    write_card(Path(), card([*BENCHMARK, *flags]))
+    with pytest.raises(MemobenchError, match=said):
+        rerun.repeat(Path("card.json"), None, None, lambda plan: pytest.fail("it was run"), print)
+
+
+def test_a_repetition_records_nothing() -> None:
+    assert allowed_flags([*BENCHMARK, "--eval.recording=true"]) == allowed_flags(BENCHMARK)
 
 
 @pytest.mark.parametrize("told", [{}, {"idle": 1200}])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,16 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.protocol import SPLITS
-from lerobot_memobench.run.card import card_of, markdown, write_card
+from lerobot_memobench.run.card import card_of, extended, markdown, write_card
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line
 from lerobot_memobench.run.rerun import plan_of_card
-from lerobot_memobench.run.run import held
-from lerobot_memobench.run.sealed import RUN_FILE, counted, user_ledger
+from lerobot_memobench.run.sealed import counted, scenes_hash, user_ledger
 from lerobot_memobench.run.shards import plan_shards
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import logs
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
+BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 LINE = ["env=memobench", f"tasks={STOVE}", "policy=memobench_random", "env.videos=0"]
 SEALED = [*LINE, "split=sealed"]
 
@@ -80,16 +81,42 @@ def test_seeds_are_run_under_their_own_name(words: list[str], said: str) -> None
     assert not user_ledger().exists()
 
 
-def test_nothing_is_taught_on_sealed_seeds(tmp_path: Path) -> None:
-    with pytest.raises(MemobenchError, match="seeds 100050 to 100059 reach into the sealed test's"):
-        generate([get_task(STOVE)], 10, tmp_path / "data", seed_base=100_050)
+@pytest.mark.parametrize(
+    ("asked", "split"),
+    [
+        ({"episodes": 10, "seed_base": 100_050}, "sealed"),
+        ({"episodes": 9, "seed_base": 100_000, "prompted_episodes": 1}, "sealed"),
+        ({"episodes": 1, "seed_base": 99_999, "prompted_episodes": 9}, "sealed"),
+        ({"episodes": 5, "seed_base": 7}, "paper"),
+        ({"episodes": 8, "seed_base": 0}, "paper"),
+        ({"episodes": 10_050}, "validation"),
+        ({"episodes": 1, "prompted_episodes": 10_050}, "validation"),
+        ({"episodes": 1, "seed_base": 29_999}, "validation"),
+    ],
+)
+def test_no_demonstration_has_a_scene_on_which_policies_are_measured(
+    tmp_path: Path, asked: dict[str, int], split: str
+) -> None:
+    """The largest number of episodes of any task counts, here of one without and of one with a prompt."""
+    with pytest.raises(MemobenchError, match=f"reach into the split '{split}'"):
+        generate([get_task(STOVE), get_task(BUTTER)], out=tmp_path / "data", **asked)
+    assert not (tmp_path / "data").exists()
 
 
-def test_each_start_is_counted_and_told_and_going_on_is_none() -> None:
+def numbers(*plans: EvaluationPlan) -> list[int]:
+    return [begun(plan)["sealed"]["run"] for plan in plans]
+
+
+def lines() -> list[str]:
+    return user_ledger().read_text().splitlines()
+
+
+def test_each_start_is_counted_and_going_on_is_none() -> None:
     told: list[str] = []
     plan = plan_line([*SEALED, "output_dir=a", "replan=5", "policy.smoothing=0"])
-    first, again = begun(plan, told), begun(plan, told)
-    assert first["sealed"] == again["sealed"] == {"release": first["sealed"]["release"], "run": 1, "earlier": []}
+    first = begun(plan, told)
+    assert counted(plan, dict(first), told.append)["sealed"] == first["sealed"]  # its card is read back by resume=true
+    assert (first["sealed"]["run"], first["sealed"]["earlier"]) == (1, [])
     assert told[0].startswith("sealed test: run 1 of this policy with release ")
     second = begun(plan_line([*SEALED, "output_dir=b", "policy.smoothing=0"]), told)
     assert second["sealed"]["run"] == 2
@@ -99,6 +126,33 @@ def test_each_start_is_counted_and_told_and_going_on_is_none() -> None:
     assert begun(plan_line([*SEALED, "output_dir=c", "policy.smoothing=0.5"]))["sealed"]["run"] == 1  # another policy
     assert list(second)[-1] == "episodes"  # the card's writer puts one a line
     assert "| sealed test | run 2 with release" in markdown(second)
+    assert len(lines()) == 3
+
+
+def test_neither_a_copied_nor_a_deleted_file_resets_the_count(tmp_path: Path) -> None:
+    first = plan_line([*SEALED, "output_dir=a"])
+    card = begun(first)
+    shutil.copytree("a", "c")
+    shutil.rmtree("a")
+    assert numbers(first, plan_line([*SEALED, "output_dir=c"])) == [2, 3]
+    copy = counted(plan_line([*SEALED, "output_dir=d"]), dict(card), print)  # gone on with elsewhere, with a's card
+    assert copy["sealed"]["run"] == 4
+
+
+def test_other_scenes_are_another_start() -> None:
+    card = begun(plan_line([*SEALED, "output_dir=a", "episodes=1"]))
+    wider = plan_line([*SEALED, "output_dir=a", "episodes=2"])
+    assert counted(wider, extended(card, card_of(wider)), print)["sealed"]["run"] == 2
+
+
+def test_a_card_commits_to_policy_scenes_and_time() -> None:
+    card = begun(plan_line([*SEALED, "output_dir=a", "episodes=2"]))
+    assert card["sealed"]["scenes"] == scenes_hash(card)
+    assert (
+        json.loads(lines()[0]).items() >= {key: card["sealed"][key] for key in ("policy", "scenes", "started")}.items()
+    )
+    other = card_of(plan_line([*SEALED, "output_dir=a", "episodes=2", "referent=random"]))
+    assert scenes_hash(other) != card["sealed"]["scenes"]
 
 
 def test_other_seeds_are_not_counted() -> None:
@@ -106,12 +160,12 @@ def test_other_seeds_are_not_counted() -> None:
     assert not user_ledger().exists()
 
 
-def test_the_parts_of_one_evaluation_are_one_start() -> None:
+def test_the_parts_of_one_evaluation_are_one_start_and_a_part_that_runs_again_is_another() -> None:
     whole = plan_line([*SEALED, "output_dir=a", "shards=2", "episodes=2"])
-    for job in plan_shards(whole, (), print):
-        part = plan_line(job.arguments[1:])
-        assert begun(part)["sealed"]["run"] == 1
-    assert len(user_ledger().read_text().splitlines()) == 1
+    parts = [plan_line(job.arguments[1:]) for job in plan_shards(whole, (), print)]
+    assert numbers(*parts) == [1, 1]
+    assert numbers(*parts) == [2, 2]
+    assert numbers(plan_line([*SEALED, "output_dir=b"]), parts[0], parts[1]) == [3, 4, 4]
 
 
 def test_the_count_travels_with_a_checkpoint_and_is_no_part_of_it(
@@ -125,25 +179,25 @@ def test_the_count_travels_with_a_checkpoint_and_is_no_part_of_it(
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         (folder / name).write_text(json.dumps({"steps": []}))
     files, line = checkpoint_files(folder), [f"policy={folder}" if "policy" in word else word for word in SEALED]
-    assert begun(plan_line([*line, "output_dir=a"]))["sealed"]["run"] == 1
+    assert numbers(plan_line([*line, "output_dir=a"])) == [1]
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another_user"))
-    assert begun(plan_line([*line, "output_dir=b"]))["sealed"]["run"] == 2
+    assert numbers(plan_line([*line, "output_dir=b"])) == [2]
     assert checkpoint_files(folder) == files
+    for name in ("notes.txt", "other.json", "other.safetensors"):  # nothing loads them
+        (folder / name).write_text("{}")
+    assert numbers(plan_line([*line, "output_dir=c"])) == [3]
+    steps = [{"state_file": "other.safetensors"}]
+    (folder / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
+    assert numbers(plan_line([*line, "output_dir=d"])) == [1]
+    (folder / "other.safetensors").write_text("[]")
+    assert numbers(plan_line([*line, "output_dir=e"])) == [1]
 
 
 def test_a_damaged_ledger_is_read_as_far_as_it_can_be() -> None:
     begun(plan_line([*SEALED, "output_dir=a"]))
     with user_ledger().open("a") as file:
-        file.write('{"run": \nnot JSON\n{"policy": 7}\n')
-    assert begun(plan_line([*SEALED, "output_dir=b"]))["sealed"]["run"] == 2
-
-
-def test_a_run_that_ends_before_its_first_episode_leaves_its_folder_clean() -> None:
-    plan = plan_line([*SEALED, "output_dir=a"])
-    with held(plan):
-        begun(plan)
-        assert Path("a", RUN_FILE).is_file()
-    assert not Path("a").exists()
+        file.write('{"run": \nnot JSON\n{"policy": 7}\n{"started": "2026')  # the last was cut off
+    assert numbers(*(plan_line([*SEALED, f"output_dir={name}"]) for name in "bc")) == [2, 3]
 
 
 def test_a_report_says_that_its_seeds_are_sealed_and_how_often_they_were_run(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,3 +33,11 @@ class Note:
     def runs(self) -> int:
         """How often it has been run."""
         return len((self.folder / "runs").read_text())
+
+
+class Killed(Note):
+    """Ends its process as the kernel does when memory runs out."""
+
+    def run(self) -> None:
+        """Kill this process."""
+        os.kill(os.getpid(), signal.SIGKILL)

@@ -123,6 +123,10 @@ FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)
 """What torch raises where it cannot fetch weights."""
 
 
+AT_A_PROMPT = "EOF when reading a line"
+"""Python's message where Ctrl-D is typed at a prompt; the end of a file or of a pipe is an `EOFError` too."""
+
+
 def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str) -> int:
     """Run the commands of an app as `run_command` does."""
     call = partial(app, args=list(arguments), standalone_mode=False, prog_name=program)
@@ -134,16 +138,18 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
 
     Args:
         program: as it is typed, such as ``memobench``.
-        again: what is told when SIGTERM ends it.
+        again: how to go on, said when SIGTERM ends it or a worker process is killed.
     """
     try:
-        with saying_how_to_go_on(lambda: again):
+        with saying_how_to_go_on(program, lambda: again):
             result = call()
-    except (typer.Abort, KeyboardInterrupt, EOFError):
+    except (typer.Abort, KeyboardInterrupt):
         return 130
     except typer.Exit as stop:
         return stop.exit_code
     except Exception as error:
+        if isinstance(error, EOFError) and str(error) == AT_A_PROMPT:
+            return 130
         message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
         if message is not None and type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
             print(message())

@@ -73,6 +73,9 @@ def generate(
     formats: Annotated[
         list[Format] | None, typer.Option("--format", help="lerobot (default), hdf5, or both by naming both.")
     ] = None,
+    finish: Annotated[
+        bool, typer.Option("--finish", help="Make the dataset of an unfinished run's episodes, and no other episode.")
+    ] = False,
     executor: Annotated[
         Executor, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")
     ] = Executor.PROCESSES,
@@ -114,6 +117,7 @@ def generate(
             formats=tuple(format_.value for format_ in formats or [Format.LEROBOT]),
             executor=executor.value,
             executor_options=options,
+            finish=finish,
             progress=advance,
             tell=partial(screen.print, soft_wrap=True),
             **named,
@@ -268,7 +272,9 @@ def validate(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     suite: OfSuite = None,
 ) -> int:
-    """Replay every episode in the simulator. The first disagreement of each is reported."""
+    """Replay every episode in the simulator, and read every file to its end. The first disagreement of each is
+    reported, and files that were written again.
+    """
     from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
     from lerobot_memobench.datasets.validate import exit_status
     from lerobot_memobench.datasets.validate import validate as run
@@ -278,11 +284,15 @@ def validate(
     with counting(console(), "episodes") as count:
 
         def advance(done: int, total: int, verdict: Verdict) -> None:
-            count(done, total, verdict.episode, trouble=verdict.disagreement)
+            count(done, total, verdict.subject, trouble=verdict.disagreement)
 
         verdicts = run(folder, workers=workers, progress=advance)
-    wrong = sum(verdict.disagreement is not None for verdict in verdicts)
-    say(f"{len(verdicts) - wrong} of {len(verdicts)} episodes agree")
+    for verdict in verdicts:
+        if verdict.note is not None:
+            say(f"note: {verdict.subject}: {verdict.note}")
+    episodes, files = ([each for each in verdicts if each.of_file == of_file] for of_file in (False, True))
+    agree, damaged = (sum(each.disagreement is None for each in episodes), exit_status(files))
+    say(f"{agree} of {len(episodes)} episodes agree" + damaged * ", and files of the dataset do not (above)")
     return exit_status(verdicts)
 
 

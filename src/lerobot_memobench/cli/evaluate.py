@@ -37,9 +37,9 @@ def evaluate(given: Arguments, command: Sequence[str]) -> int:
     options, given = take_run_options(given)
     arguments = read_arguments("eval", given)
     if given.wants_help or not is_benchmark(arguments, options):
-        return call_lerobot("eval", arguments.flags)
+        return call_lerobot("eval", arguments.for_parser)
     plan = make_plan(arguments, options, command)
-    with saying_how_to_go_on(lambda: f"lerobot: ended by SIGTERM; go on with: {plan.going_on}"):
+    with saying_how_to_go_on("lerobot", lambda: f"go on with: {plan.going_on}"):
         return evaluate_in_parts(plan) if options.shards else evaluate_here(plan)
 
 

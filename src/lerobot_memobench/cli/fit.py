@@ -31,9 +31,9 @@ def fit(
     """
     from lerobot_memobench.run.arguments import read_arguments, resolve_recipe, split_arguments
     from lerobot_memobench.run.gpu_memory import GIB, OVERHEAD, disk, training_of
-    from lerobot_memobench.run.training import check_numbers
+    from lerobot_memobench.run.training import check_numbers, with_own_memory
 
-    arguments = read_arguments("train", resolve_recipe(split_arguments(settings)))
+    arguments = with_own_memory(read_arguments("train", resolve_recipe(split_arguments(settings))))
     check_numbers(arguments)
     training = training_of(arguments, gpus)
     if training is None:

@@ -17,14 +17,15 @@ from pathlib import Path
 
 from lerobot_memobench.cli.console import WITH_PARENT, run_command, tell
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.io import as_path
 from lerobot_memobench.run.arguments import SHORT_FORMS, check_task_names, read_arguments, split_arguments
 from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
-    line = list(sys.argv[1:] if argv is None else argv)
-    again = f"lerobot: ended by SIGTERM; begin anew with: {shlex.join(['lerobot', *line])}"
+    line = [as_path(word) for word in (sys.argv[1:] if argv is None else argv)]
+    again = f"begin anew with: {shlex.join(['lerobot', *line])}"
     return run_command(partial(run, line), "lerobot", again)
 
 
@@ -48,7 +49,7 @@ def run(line: Sequence[str]) -> int:
         from lerobot_memobench.cli.evaluate import evaluate
 
         return evaluate(given, ("lerobot", *line))
-    return call_lerobot(name, read_arguments(name, given).flags)
+    return call_lerobot(name, read_arguments(name, given).for_parser)
 
 
 def overview(commands: Iterable[str]) -> str:

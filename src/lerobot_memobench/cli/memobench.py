@@ -25,6 +25,7 @@ from lerobot_memobench.cli.report import compare, controls, html, merge, report,
 from lerobot_memobench.cli.sealed import test_sealed
 from lerobot_memobench.cli.tasks import gallery, objects, recipe, tasks
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import as_path
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 
 __all__ = ["app", "main"]
@@ -108,10 +109,10 @@ def options(
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
-    words = list(sys.argv[1:] if argv is None else argv)
+    words = [as_path(word) for word in (sys.argv[1:] if argv is None else argv)]
     use_threads(LEARNING if words and words[0] in LEARN else ACTING)
     begins = "go on" if words and words[0] in GO_ON else "begin anew"
-    again = f"memobench: ended by SIGTERM; {begins} with: {shlex.join(['memobench', *words])}"
+    again = f"{begins} with: {shlex.join(['memobench', *words])}"
     return run_app(app, words, "memobench", again)
 
 

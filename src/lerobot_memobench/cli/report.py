@@ -14,6 +14,7 @@ import typer
 from lerobot_memobench.cli.console import console, say, tell
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of, write_file
+from lerobot_memobench.jobs.processes import HeldError, locked
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.records import Run
@@ -93,9 +94,10 @@ def report(
         if is_archive(run.folder):
             continue
         try:
-            write_report(run.folder)
-        except OSError as error:  # an archive that is only read
-            tell(f"memobench: {run.folder} cannot be written ({error.strerror or error}); no report there")
+            with locked(run.folder, run.folder):
+                write_report(run.folder)
+        except (OSError, HeldError) as error:  # an archive that is only read, or an evaluation that runs
+            tell(f"memobench: {run.folder} is not written to ({getattr(error, 'strerror', None) or error})")
     if out is not None:
         for path in write_documents(runs, out, wanted, paper):
             say(path)
@@ -312,8 +314,9 @@ def _pacing(name: str, setting: str, plain: Path, paced: Path, draws: int, out: 
 
     found, notes = paced_changes(setting, plain, paced, draws)
     if not is_archive(paced):
-        keep_changes(paced, found)
-        write_report(paced)
+        with locked(paced, paced):
+            keep_changes(paced, found)
+            write_report(paced)
     section = pacing_section(found)
     report = Report(section.title, (replace(section, title=""),), {"changes": found})
     return _show(report, notes, name, out)

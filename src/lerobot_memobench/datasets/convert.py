@@ -42,6 +42,7 @@ from lerobot_memobench.datasets.staging import (
     compare_requests,
     episode_info,
     episodes_folder,
+    remove_staging,
     stage_failure,
     staged,
 )
@@ -190,7 +191,7 @@ def convert(
                 },
                 left_out=[str(problem) for problem in problems],
             )
-    shutil.rmtree(staging, ignore_errors=True)
+        shutil.rmtree(staging, ignore_errors=True)
     if not any(out.iterdir()):
         out.rmdir()
     return ConversionSummary(out if good else None, len(good), tuple(problems), tuple(notes))
@@ -275,6 +276,6 @@ def _finished(out: Path, request: dict[str, Any]) -> ConversionSummary:
         ) from None
     compare_requests(earlier, request, f"{out} already holds a finished conversion", "name another folder")
     check_whole(out)
-    shutil.rmtree(out / STAGING, ignore_errors=True)
+    remove_staging(out)
     told = [tuple(Problem(each["file"], each["group"], each["reason"]) for each in part) for part in (left_out, notes)]
     return ConversionSummary(out, count, *told)

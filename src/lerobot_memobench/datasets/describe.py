@@ -31,6 +31,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     read_info,
     read_manifest,
     undamaged,
+    without_pattern,
 )
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.errors import MemobenchError
@@ -48,6 +49,10 @@ FRAME = 160
 """Height and width of a storyboard's pictures, pixels."""
 MOST_FRAMES = 6
 
+UNCHECKED = (
+    "not checked: values of tables, pictures of videos, statistics, states, hashes, HDF5 files and feature caches; "
+    "`memobench validate {folder}` checks them"
+)
 Say = Callable[[str], None]
 
 
@@ -68,6 +73,7 @@ def describe(folder: Path, out: Path, say: Say = lambda _: None) -> list[Path]:
         tables = card_tables(card or card_from_frames(folder, rows))
         board = storyboard(folder, rows) if (folder / "videos").is_dir() else None
         manifest = read_manifest(folder) if hashes.is_file() else _manifest_of(rows)
+    say(UNCHECKED.format(folder=folder))
     if card is None:
         say(EDITED)
         _put_card(folder, rows, say)
@@ -193,7 +199,7 @@ def storyboard(folder: Path, rows: Sequence[Mapping[str, Any]]) -> Picture:
     from lerobot.datasets import LeRobotDataset
     from PIL import Image, ImageDraw, ImageFont
 
-    dataset = LeRobotDataset("local/storyboard", root=folder)
+    dataset = LeRobotDataset("local/storyboard", root=without_pattern(folder))
     camera = next(key for key in map(image_key, CAMERAS) if key in dataset.meta.features)
     chosen = [next(row for row in rows if row["memory_type"] == name) for name in ordered_types(rows)]
     caption, title = 56, 26

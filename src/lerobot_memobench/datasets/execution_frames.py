@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Subset
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, EXECUTION, OBS_PHASE
 
 if TYPE_CHECKING:
@@ -31,14 +30,12 @@ def leave_out_prompts(dataset: Any) -> int | None:
     Args:
         dataset: LeRobot's, opened to be read. One without our columns stays as it is. Of one that is streamed, the
             frames of prompts are passed over as they come: None, nobody knows how many there will be.
-
-    Raises:
-        MemobenchError: it is streamed, and a video is asked for frames before the present one.
     """
     if not set(dataset.meta.features) >= COLUMNS:
         return 0
     if not hasattr(dataset.hf_dataset, "data"):
-        _leave_out_of_stream(dataset)
+        # What LeRobot looks back to in the stream then ends where the execution begins.
+        dataset.hf_dataset = dataset.hf_dataset.filter(_acts, input_columns=[OBS_PHASE])
         return None
     episodes = dataset.meta.episodes
     begin, end = (np.array(episodes[name], dtype=np.int64) for name in (BEGIN, END))
@@ -47,20 +44,6 @@ def leave_out_prompts(dataset: Any) -> int | None:
     starts = np.where(np.isin(np.arange(len(begin)), _column(dataset, "episode_index")), starts, begin)  # those opened
     dataset.meta.episodes = episodes.remove_columns(BEGIN).add_column(BEGIN, starts)
     return int((starts - begin).sum())
-
-
-def _leave_out_of_stream(dataset: Any) -> None:
-    """Let LeRobot see no prompt frame: what it looks back to in the stream then ends where the execution begins.
-
-    Videos it opens at any time of an episode, prompts included.
-    """
-    past = [key for key in dataset.meta.video_keys if min((dataset.delta_indices or {}).get(key, [0])) < 0]
-    if past:
-        raise MemobenchError(
-            f"{past[0]} is asked for earlier frames, which may be of a prompt, and a dataset that is streamed does not "
-            "tell where that ends; use dataset.streaming=false, or prompt_frames=true to train on prompts"
-        )
-    dataset.hf_dataset = dataset.hf_dataset.filter(_acts, input_columns=[OBS_PHASE])
 
 
 def _acts(phase: float) -> bool:

@@ -33,12 +33,14 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
 from lerobot_memobench.datasets.staging import (
+    FINISHED_EARLY,
     FORMATS,
     HDF5,
     LEROBOT,
     STAGING,
     compare_requests,
     episodes_folder,
+    remove_staging,
     staged,
 )
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -46,7 +48,7 @@ from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, tel
 from lerobot_memobench.jobs.executors import Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.protocol import DEMONSTRATION_SEED, IMAGE_SIZE, SEALED, SPLITS
+from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
 from lerobot_memobench.tasks.task import Task, referent_text
 
 WEIGHTS = "model.safetensors"
@@ -82,6 +84,7 @@ def generate(
     executor: str = "processes",
     executor_options: Mapping[str, Any] | None = None,
     repo_id: str = DEFAULT_REPO_ID,
+    finish: bool = False,
     progress: ProgressCallback | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> GenerationSummary:
@@ -97,13 +100,14 @@ def generate(
             ``out``/hdf5; or both.
         workers: episodes made at a time. executor, executor_options: where (`jobs.executors`); the result is the same.
             On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
+        finish: make the dataset of an unfinished run's episodes, and no other episode.
         tell: called, before the first episode, with about how large the dataset will be and how long it will take.
         referent, images, image_size, demonstration_prompt, perturb, policy: see `recording.RecordingSettings`.
 
     Raises:
-        MemobenchError: nothing to do, ``out`` holds something else or a damaged dataset, another run is writing there,
-            its disk has no room (what is finished stays), or an episode could not be run at all (which no later run
-            would change).
+        MemobenchError: nothing to do, seeds of a guarded split, ``out`` holds something else or a damaged dataset,
+            another run is writing there, its disk has no room (what is finished stays), or an episode could not be run
+            at all (which no later run would change).
     """
     most = episodes if prompted_episodes is None else prompted_episodes
     if not tasks or min(episodes, most, workers) < 1:
@@ -111,12 +115,8 @@ def generate(
             f"{len(tasks)} tasks, {episodes} episodes ({most} with a prompt), {workers} workers were asked for; each "
             "must be at least 1"
         )
-    sealed = SPLITS[SEALED]
-    if seed_base <= sealed[-1] and seed_base + most > sealed[0]:
-        raise MemobenchError(
-            f"seeds {seed_base} to {seed_base + most - 1} reach into the sealed test's ({sealed[0]} to {sealed[-1]}), "
-            "which no policy is trained on; choose others, such as --seed-base 10000"
-        )
+    most = max(episodes_of(task, episodes, prompted_episodes) for task in tasks)
+    _check_seeds(range(seed_base, seed_base + most))
     check_executor(executor, executor_options)
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
     if hiding is not None and not demonstration_prompt:
@@ -131,6 +131,8 @@ def generate(
     formats = _checked_formats(formats, settings)
     plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, formats, repo_id)
     options = options_text(executor, executor_options or {}, NEEDS)
+    if finish:
+        return _finish_early(plan, Path(out))
     return _carry_out(plan, Path(out), workers, executor=executor, options=options, progress=progress, tell=tell)
 
 
@@ -225,19 +227,48 @@ def _carry_out(
         )
         if not complete:
             return GenerationSummary(None, summarise([], plan.tasks, out).tasks, submitted=True)
-        episodes = [staged(job) for job in jobs]
-        rows = [{**episode.info, "failure": episode.failure} for episode in episodes]
-        summary = summarise(rows, plan.tasks, out)
-        if summary.folder is not None:
-            manifest = {"request": plan.request}
-            assemble(episodes, out, formats=plan.formats, repo_id=plan.repo_id, made_by=plan.made_by, manifest=manifest)
-            shutil.rmtree(out / STAGING)
-        return summary
+        return _assembled(plan, jobs, out, plan.request, plan.made_by)
+
+
+def _finish_early(plan: _Plan, out: Path) -> GenerationSummary:
+    """Make the dataset of the episodes that an unfinished run has left."""
+    if is_dataset(out) or not (out / STAGING).is_dir():
+        raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see what it made")
+    with telling_of_the_disk(out, "what is finished stays"), episodes_folder(out, plan.request) as folder:
+        jobs = plan.jobs(folder)
+        there = [job for job in jobs if job.finished()]
+        made_by = f"{plan.made_by} The run was finished early: {len(there)} of {len(jobs)} seeds were run."
+        return _assembled(plan, there, out, {**plan.request, FINISHED_EARLY: len(there) < len(jobs)}, made_by)
+
+
+def _assembled(
+    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, request: Mapping[str, Any], made_by: str
+) -> GenerationSummary:
+    """Make the dataset of finished jobs, if one of them has an episode, and remove what it was made of."""
+    episodes = [staged(job) for job in jobs]
+    summary = summarise([{**episode.info, "failure": episode.failure} for episode in episodes], plan.tasks, out)
+    if summary.folder is not None:
+        manifest = {"request": request}
+        assemble(episodes, out, formats=plan.formats, repo_id=plan.repo_id, made_by=made_by, manifest=manifest)
+        shutil.rmtree(out / STAGING)
+    return summary
 
 
 def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
     """Return how many demonstrations of a task `generate` is asked for."""
     return episodes if task.prompt is None or prompted_episodes is None else prompted_episodes
+
+
+def _check_seeds(seeds: range) -> None:
+    """Refuse demonstrations of scenes on which policies are chosen or measured (`protocol.GUARDED`)."""
+    for name in GUARDED:
+        split = SPLITS[name]
+        if seeds[0] <= split[-1] and seeds[-1] >= split[0]:
+            raise MemobenchError(
+                f"seeds {seeds[0]} to {seeds[-1]} reach into the split '{name}' ({split[0]} to {split[-1]}), on which "
+                f"no policy is trained; ask for seeds within {DEMONSTRATION_SEED} to {SPLITS['demonstrations'][-1]}, "
+                f"such as --seed-base {DEMONSTRATION_SEED}; evaluate policy=memobench_expert to measure the expert"
+            )
 
 
 def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> tuple[str, ...]:
@@ -284,14 +315,14 @@ def _finished(out: Path, plan: _Plan) -> GenerationSummary:
         raise MemobenchError(
             f"{out} already holds a dataset that this command did not make; name another folder"
         ) from None
-    request = plan.request
+    request = {**plan.request, FINISHED_EARLY: False}
     earlier = {**earlier, "versions": request["versions"]}  # a finished dataset stays valid under newer versions
     compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
     if LEROBOT in plan.formats:
         check_whole(out)
     if HDF5 in plan.formats:
         _check_hdf5(out, Counter(row["task_name"] for row in manifest["episodes"] if row["failure"] is None))
-    shutil.rmtree(out / STAGING, ignore_errors=True)
+    remove_staging(out)
     return summarise(manifest["episodes"], plan.tasks, out)
 
 

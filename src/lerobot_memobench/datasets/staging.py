@@ -49,13 +49,15 @@ from lerobot_memobench.io import (
     short,
     write_file,
 )
-from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
 
 STAGING = ".staging"
 """Folder of a run within its destination."""
 TEMPORARY = ".tmp-"
 REQUEST_FILE = "request.json"
+FINISHED_EARLY = "finished_early"
+"""Key of a dataset's request: whether episodes of it were left out."""
 RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
 HDF5_FILE = "demonstration.hdf5"
@@ -430,9 +432,16 @@ def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
         yield folder.absolute()
 
 
+def remove_staging(out: Path) -> None:
+    """Remove the staging folder of a finished run, unless a run is at work there."""
+    staging = out / STAGING
+    with contextlib.suppress(FileNotFoundError, HeldError), locked(staging, out):
+        shutil.rmtree(staging, ignore_errors=True)
+
+
 def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
     """Raise with the first thing that was asked for differently."""
-    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None}
+    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None, FINISHED_EARLY: False}
     earlier = {**before, **earlier}  # written before there was a choice
     for key, value in request.items():
         if earlier.get(key) != value:

@@ -1,4 +1,4 @@
-"""Validate a folder: replay every episode and name those that do not come out as they were recorded.
+"""Validate a folder: replay every episode, read every file to its end, and name what is not as it was recorded.
 
 The folder may hold a LeRobotDataset, HDF5 files of this package in the published layout, or both.
 """
@@ -6,29 +6,42 @@ The folder may hold a LeRobotDataset, HDF5 files of this package in the publishe
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader
+from lerobot_memobench.datasets.feature_cache.layout import FOLDER as CACHES
+from lerobot_memobench.datasets.feature_cache.layout import check_cache
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, Unusable, find_files, usable_or_named
 from lerobot_memobench.datasets.hdf5.restore import restore, task_of
+from lerobot_memobench.datasets.lerobot_format.files import (
+    NO_HASHES,
+    check_file,
+    check_manifest,
+    dataset_files,
+)
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
+    INFO_FILE,
+    MANIFEST_FILE,
+    STATS_FILE,
     check_clock,
     check_whole,
     episode_count,
     image_key,
     is_dataset,
     read_info,
+    read_manifest,
 )
 from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace, check_idling, list_episodes, read_episode
 from lerobot_memobench.datasets.replay import Pictures, replay
+from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import refusing
 from lerobot_memobench.jobs.processes import process_pool
@@ -38,15 +51,19 @@ from lerobot_memobench.tasks.task import Task
 
 @dataclass(frozen=True)
 class Verdict:
-    """Outcome of replaying one episode.
+    """Outcome of replaying one episode, or of checking a file.
 
     Attributes:
-        episode: ``episode 3`` of the dataset, or a file and its group.
+        subject: ``episode 3`` of the dataset, a file and its group, or a file.
         disagreement: the first one, as a sentence; None when everything agrees.
+        note: on a file, what is no disagreement.
+        of_file: whether the subject is a file.
     """
 
-    episode: str
+    subject: str
     disagreement: str | None
+    note: str | None = None
+    of_file: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,11 +96,30 @@ class _Check:
             return None if found is None else str(found)
         with PublishedFile(self.path) as file:
             published = file.read(self.group)
+            for _ in file.images(self.group):
+                pass  # each picture is decoded, and eight of them are drawn again
             if "seed" not in published.extras or int(published.extras["seed"]) < 0:
                 return "it has no seed, so its scene cannot be made again"
             restored = restore(task_of(file, published), published)
             found = replay(restored, pictures=lambda frames: file.pictures(self.group, frames))
             return None if found is None else str(found)
+
+
+@dataclass(frozen=True)
+class _FileCheck:
+    """A file of the dataset in ``folder``, or what it says, to be checked in any process."""
+
+    folder: Path
+    name: str
+    check: Callable[[], str | None]
+
+    def run(self) -> Verdict:
+        """Check it."""
+        try:
+            with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}"), self.folder / self.name):
+                return Verdict(self.name, None, self.check(), of_file=True)
+        except MemobenchError as error:
+            return Verdict(self.name, str(error), of_file=True)
 
 
 ValidationProgress = Callable[[int, int, Verdict], None]
@@ -97,25 +133,28 @@ def validate(
     tasks: Mapping[str, Task] | None = None,
     progress: ValidationProgress | None = None,
 ) -> list[Verdict]:
-    """Replay the episodes of a folder (or of an HDF5 file) and return a verdict for each, in their order.
+    """Replay the episodes of a folder (or of an HDF5 file) and check its files.
 
     States, success, instruction, numbering, every checkpoint column, subgoal texts, language rows, key frames and the
-    scene must come out exactly; some frames of each camera must be near to what the simulator draws.
+    scene must come out exactly; some frames of each camera must be near to what the simulator draws. Every file is read
+    to its end and compared with its hash, statistics with those of the frames, the manifest with the episodes.
+
+    Returns:
+        A verdict for each episode, in their order, then one for each file that disagrees or of which there is a note.
 
     Args:
         folder: what to check.
         workers: processes.
         tasks: tasks by name that are not those of the catalogue.
-        progress: called after each episode.
+        progress: called after each episode and file.
 
     Raises:
-        MemobenchError: there is nothing to check; or every episode agrees, and the dataset tells of others (see
-            `check_whole`).
+        MemobenchError: there is nothing to check.
     """
     folder = Path(folder).absolute()
     if workers < 1:
         raise MemobenchError(f"{workers} workers were asked for; it must be at least 1")
-    checks = _checks(folder, tasks)
+    checks: list[_Check | _FileCheck] = [*_checks(folder, tasks), *_file_checks(folder)]
     verdicts: dict[int, Verdict] = {}
 
     def note(number: int, verdict: Verdict) -> None:
@@ -132,9 +171,7 @@ def validate(
             for future in as_completed(futures):
                 note(futures[future], future.result())
     found = [verdicts[number] for number in range(len(checks))]
-    if is_dataset(folder) and not exit_status(found):
-        check_whole(folder)
-    return found
+    return [verdict for verdict in found if not verdict.of_file or verdict.disagreement or verdict.note]
 
 
 def _pictures(folder: Path, episode: int) -> Pictures | None:
@@ -159,6 +196,31 @@ def _reader(folder: Path, camera: str) -> FrameReader:
 def exit_status(verdicts: Sequence[Verdict]) -> int:
     """Return 0 when everything agreed, else 1."""
     return 1 if any(verdict.disagreement is not None for verdict in verdicts) else 0
+
+
+def _file_checks(folder: Path) -> Iterator[_FileCheck]:
+    """Yield a check of each file of a dataset, or of those HDF5 files of one that ``folder`` names."""
+    root = next((place for place in (folder, *folder.parents[:2]) if (place / MANIFEST_FILE).is_file()), folder)
+    written = None
+    with contextlib.suppress(MemobenchError, FileNotFoundError):  # `check_manifest` names its damage
+        written = read_manifest(root).get("files")
+    for name in sorted({*dataset_files(root), *(written or {})}):
+        if (root / name).is_relative_to(folder):
+            yield _FileCheck(root, name, partial(check_file, root / name, (written or {}).get(name)))
+    if not is_dataset(folder):
+        return
+    if written is None:
+        yield _FileCheck(folder, MANIFEST_FILE, partial(str, NO_HASHES))
+    yield _FileCheck(folder, INFO_FILE.as_posix(), partial(check_whole, folder))
+    names = measured(read_info(folder)["features"])
+    cameras = [name for name in names if name.startswith(image_key(""))]
+    for chosen in ([name for name in names if name not in cameras], *([camera] for camera in cameras)):
+        yield _FileCheck(folder, STATS_FILE.as_posix(), partial(check_statistics, folder, chosen))
+    if (folder / MANIFEST_FILE).exists():
+        yield _FileCheck(folder, MANIFEST_FILE, partial(check_manifest, folder))
+    for cache in sorted((folder / CACHES).glob("*")):
+        if cache.is_dir():
+            yield _FileCheck(folder, f"{CACHES}/{cache.name}", partial(check_cache, cache))
 
 
 def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:

@@ -104,7 +104,7 @@ def package_versions() -> Iterator[Finding]:
         if found is None or not wanted.contains(found, prereleases=True):
             detail = "not installed" if found is None else f"{found}; supported is {wanted}"
             fix = INSTALL_ROBOSUITE if name == "robosuite" else f'pip install "{name}{wanted}"'
-            yield Finding(name, "failed", detail, _by_setup(fix))
+            yield Finding(name, "failed", detail, fix)
         else:
             yield Finding(name, "ok", found + (f" (supported {wanted})" if str(wanted) else ""))
 
@@ -114,15 +114,10 @@ def physics() -> Finding:
     found = _installed("mujoco") or "not installed"
     if found.startswith("3.") and (other := _installed("mujoco-core")):
         fix = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install mujoco=={found}"
-        return Finding("physics", "warning", f"MuJoCo {found} is written over the files of {other}", _by_setup(fix))
+        return Finding("physics", "warning", f"MuJoCo {found} is written over the files of {other}", fix)
     if found != PUBLISHED_MUJOCO:
         return Finding("physics", "ok", f"MuJoCo {found}; published figures are of {PUBLISHED_MUJOCO}")
     return Finding("physics", "ok", f"MuJoCo {found}, as for published figures")
-
-
-def _by_setup(command: str) -> str:
-    """Return what mends this environment: `make setup` where that made it, which brings no pip, else a command."""
-    return "run `make setup`" if (Path(sys.prefix) / ".memobench-setup").exists() else command
 
 
 def supported_versions() -> dict[str, SpecifierSet]:
@@ -156,7 +151,7 @@ def opencv() -> Finding:
         return Finding("OpenCV", "ok", f"opencv-python-headless {installed['opencv-python-headless']} alone")
     wanted = f'pip install "opencv-python-headless{supported_versions().get("opencv-python-headless", "")}"'
     fix = f"pip uninstall -y {' '.join(installed)} && {wanted}" if installed else wanted
-    return Finding("OpenCV", "warning", " and ".join(installed) or "not installed", _by_setup(fix))
+    return Finding("OpenCV", "warning", " and ".join(installed) or "not installed", fix)
 
 
 def plugin() -> Finding:
@@ -174,7 +169,7 @@ def plugin() -> Finding:
         reason = f"importing it fails: {type(error).__name__}: {error}"
         return Finding(PLUGIN, "failed", reason, "mend the import error; LeRobot only logs it")
     if missing:
-        fix = _by_setup(f"pip install --force-reinstall --no-deps {DISTRIBUTION}")
+        fix = "install it again: `pip install --force-reinstall --no-deps .` in its folder"
         return Finding(PLUGIN, "failed", f"imported, but not registered: {', '.join(missing)}", fix)
     return Finding(PLUGIN, "ok", "discovered: env memobench, policies memobench_mem, memobench_expert")
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import datetime as dt
 import hashlib
 import json
+import logging
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +22,13 @@ import yaml
 from lerobot_memobench.envs.command_line import in_file, quiet, training_runs
 from lerobot_memobench.envs.episode_log import INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
-from lerobot_memobench.io import file_hash
+from lerobot_memobench.io import file_hash, is_there
+from lerobot_memobench.protocol import SEALED, SPLITS
 
-SEALED_LEDGER = "sealed_tests.jsonl"
-"""Where it is counted how often a policy was run on the sealed seeds (`run.sealed`)."""
+logger = logging.getLogger(__name__)
+
+SEALED_LEDGER, SEALED_RUN = "sealed_tests.jsonl", "sealed.json"
+"""Files of `run.sealed`: the count of a policy's runs on the sealed seeds, and an evaluation's own run."""
 NOT_THE_CHECKPOINT = (
     *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes", SEALED_LEDGER),
     *("training_curve.png", "training_curve.json"),
@@ -208,3 +213,25 @@ def tree_hash(files: Mapping[str, str]) -> str:
     """Return one sha256 for many: of the lines ``<sha256>  <name>`` in the order of names, as sha256sum prints them."""
     lines = "".join(f"{files[name]}  {name}\n" for name in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def note_sealed(seed: int, log_dir: Path | None) -> None:
+    """Log, once per process, that a scene of the sealed test is used outside of a counted run of it.
+
+    Args:
+        seed: of the scene. log_dir: folder of the episode log; a counted run (`run.sealed`) has its number there, or
+            beside it, where it is a part of one.
+    """
+    if seed not in SPLITS[SEALED]:
+        return
+    if log_dir is None or not any(is_there(folder / SEALED_RUN) for folder in (log_dir, log_dir.parent)):
+        _log_sealed(SPLITS[SEALED])
+
+
+@cache
+def _log_sealed(split: range) -> None:
+    logger.warning(
+        "sealed scenes, not counted: seeds %d to %d are of the sealed test, whose runs `memobench test-sealed` counts",
+        split[0],
+        split[-1],
+    )

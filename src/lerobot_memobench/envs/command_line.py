@@ -81,11 +81,11 @@ def read_rename_map(told: Any) -> dict[str, str]:
     return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else {}
 
 
-def in_file(*keys: str) -> Any | None:
+def in_file(*keys: str, flags: Sequence[str] | None = None) -> Any | None:
     """Return what a local file of LeRobot's settings, or the one in a checkpoint's folder, says; None without one."""
     from lerobot.configs import parser
 
-    path = parser.parse_arg("config_path")
+    path = parser.parse_arg("config_path", flags)
     if path is None:
         return None
     file = Path(path) / "train_config.json" if Path(path).is_dir() else Path(path)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from lerobot.configs import PolicyFeature, PreTrainedConfig
+from lerobot.configs import PolicyFeature, PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_memobench.envs.acting import acting, parameters_of
@@ -54,6 +54,9 @@ PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[st
 POLICY_CHECKS: list[PolicyCheck] = []
 """What is asked of the checkpoint that LeRobot is about to evaluate; filled by `registration`, since checkpoints are
 the business of `policies`."""
+PATH_CHECKS: list[Callable[[str], None]] = []
+"""Called with the path of a checkpoint on LeRobot's command line, before LeRobot looks for it; filled like
+`POLICY_CHECKS`."""
 
 
 @EnvConfig.register_subclass("memobench")
@@ -157,6 +160,10 @@ class MemobenchEnvConfig(EnvConfig):
             check_referent("env.", self.referent)
         if self.obs_type != PIXELS:
             self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
+        if _program() in ("lerobot-eval", "lerobot-train"):
+            path = parser.get_path_arg("policy")
+            for check in PATH_CHECKS if path else ():
+                check(path)
 
     @property
     def draws(self) -> bool:
@@ -254,7 +261,6 @@ class MemobenchEnvConfig(EnvConfig):
 
     def _check_checkpoint(self, policy: Any) -> None:
         """Refuse the checkpoint on LeRobot's command line where it was made for something else than is shown here."""
-        from lerobot.configs import parser
         from lerobot.envs.utils import env_to_policy_features
 
         path = None if training_runs() else parser.get_path_arg("policy")
@@ -283,8 +289,6 @@ class MemobenchEnvConfig(EnvConfig):
         Each evaluation within a training has its own in there, ``evaluation-1`` and so on: a policy that has learned
         on is another.
         """
-        from lerobot.configs import parser
-
         # The configuration of an environment does not hold the run's output folder; LeRobot's parser tells it.
         output = parser.parse_arg("output_dir") or f"outputs/eval/{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
         folder = Path(output if self.log_dir is None else self.log_dir)
@@ -293,14 +297,16 @@ class MemobenchEnvConfig(EnvConfig):
         return next(place for k in count(1) if not (place := folder / f"evaluation-{k}").exists())
 
 
+def _program() -> str:
+    return Path(sys.argv[0]).stem.replace("_", "-")
+
+
 def _check_recording(rows: int, obs_type: str) -> None:
     """Refuse what LeRobot's own recorder cannot: pictures, and a second batch; `lerobot eval` has another.
 
     Raises:
         MemobenchError: plain ``lerobot-eval`` was asked for it.
     """
-    from lerobot.configs import parser
-
     if (parser.parse_arg("eval.recording") or "").lower() != "true":
         return
     if ROLLOUT in installed():  # `lerobot eval`, which lays its loop around LeRobot's
@@ -319,10 +325,8 @@ def _use_threads(policy: Any) -> None:
 
     Any other program of LeRobot's, such as a training that evaluates in between, keeps what it has.
     """
-    if Path(sys.argv[0]).stem.replace("_", "-") != "lerobot-eval":
+    if _program() != "lerobot-eval":
         return
-    from lerobot.configs import parser
-
     use_threads(ACTING)
     path = parser.get_path_arg("policy")
     weightless = 0 if getattr(policy, "weightless", False) else None

@@ -36,8 +36,9 @@ from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.evidence import Choice
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
+from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import DEFAULT_LEVEL, DRAWN, REFERENTS, STRICT, Task, referent_text
+from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task, referent_text
 
 
 class Fault(NamedTuple):
@@ -296,11 +297,9 @@ class Episode:
         return {key: self.sim.render(camera) for key, camera in CAMERAS.items()}
 
     def subgoal(self) -> str:
-        """Return the text of the checkpoint being worked on, at the intermediate level."""
-        if not self.task.checkpoints:
-            return self.task.language
-        index = min(self.progress.index, len(self.task.checkpoints) - 1)
-        return self.task.checkpoints[index].language[DEFAULT_LEVEL]
+        """Return the instruction for the checkpoint being worked on; that of a task without checkpoints."""
+        texts = subtask_texts(self.task)
+        return texts[min(self.progress.index, len(texts) - 1)]
 
 
 def referent_of(task: Task, seed: int) -> Task:

@@ -184,6 +184,11 @@ def evidence_line(task: Task, choice: int | None) -> dict[str, Any]:
     return {"choice": choice, "variants": len(task.random_variants), "chance": chance(task)}
 
 
+def key_of(record: Mapping[str, Any]) -> tuple[str, int, str]:
+    """Return the identity of an episode: task, number, referent."""
+    return record["task"], record["episode"], record.get("referent", "fixed")
+
+
 def not_run_record(
     task: Task, number: int, seed: int, referent: str, why: str, variants: int | None = None
 ) -> dict[str, Any]:
@@ -261,10 +266,20 @@ def _ends_torn(file: Any) -> bool:
 
 
 def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path:
-    """Write ``records`` as ``<directory>/episodes.jsonl``, whole or not at all, and return its path."""
+    """Add to ``<directory>/episodes.jsonl`` those of ``records`` that it lacks, whole or not at all; return its path.
+
+    Lines that are there stay as they are, also unreadable ones. A line that is added replaces an earlier one about the
+    same episode for readers.
+    """
     path = Path(directory) / MERGED_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    return write_file(path, "".join(json.dumps(record) + "\n" for record in records))
+    there = {key_of(record): record for record in _read_lines(path, [])} if path.is_file() else {}
+    lines = [json.dumps(record) + "\n" for record in records if there.get(key_of(record)) != record]
+    if lines or not path.is_file():
+        content = path.read_bytes() if path.is_file() else b""
+        torn = b"\n" if content and not content.endswith(b"\n") else b""
+        write_file(path, content + torn + "".join(lines).encode())
+    return path
 
 
 # --- reading ---
@@ -333,7 +348,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
         for record in _read_lines(file, found):
             policies.setdefault(record.get("policy"), (file, record))
             written = float(record.pop(WRITTEN_AT, 0.0))
-            key = (record["task"], record["episode"], record.get("referent", "fixed"))
+            key = key_of(record)
             if "not_run" not in record:
                 outcomes.setdefault(key, set()).add(record["success"])
             if key not in newest or written >= newest[key][0]:

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.envs.acting import NOBODY, Acting
+from lerobot_memobench.envs.acting import NOBODY, Acting, note_sealed
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import (
     EpisodeLog,
@@ -156,7 +156,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
         self._acting = acting
         self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
-        self._videos = Path(log_dir) / "videos" if log_dir is not None else None
+        self._log_dir = Path(log_dir) if log_dir is not None else None
         self._recorded = videos or 0
         self._video: VideoRecorder | None = None
         self._observer = Observer(obs_type, render_every)
@@ -215,6 +215,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._number = number = seed - self._seed_base
         scene, variant = scene_and_variant(self._task, number) if self._evidence else (number, None)
         self._scene_seed = self._seed_base + scene
+        note_sealed(self._scene_seed, self._log_dir)
         with self._noting():
             self.episode.reset(self._scene_seed, variant)
         if self._not_run is not None:
@@ -222,8 +223,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._describe(0)
         self._observer.begin(self.episode)
         recorded = (self._recorded == EVERY or 0 <= number < self._recorded) and self._acting.counts(seed)
-        if self._videos is not None and recorded:
-            self._video = VideoRecorder(self._videos / f"{self.task}.{number}.mp4")
+        if self._log_dir is not None and recorded:
+            self._video = VideoRecorder(self._log_dir / "videos" / f"{self.task}.{number}.mp4")
             self._video.add(self.render())
         with self._noting():
             if self._prompt_in == RESET and self.episode.phase == PROMPT:

@@ -227,7 +227,7 @@ class VideoRecorder:
         import av
 
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._container = av.open(str(self._writing.enter_context(draft_of(self._path))), "w", format="mp4")
+        self._container = av.open(str(self._writing.enter_context(draft_of(self._path.absolute()))), "w", format="mp4")
         # Ultrafast costs a tenth of a rendered frame, and more threads only add to it; crf 20 keeps small text
         # readable.
         options = {"preset": "ultrafast", "crf": "20", "threads": "1"}

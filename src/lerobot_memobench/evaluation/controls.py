@@ -10,7 +10,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, differences, read_episodes
+from lerobot_memobench.envs.episode_log import POLICY, differences, read_log
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import (
     METRICS,
@@ -126,7 +126,8 @@ def check_one_policy(folders: Sequence[Path]) -> None:
 
 def _rollouts(folder: Path, notes: list[str], inputs: list[str]) -> list[Record]:
     """Return the rollouts of an evaluation that were asked for; its policy's inputs are told in ``inputs``."""
-    found: list[Record] = [*asked_for(folder, read_episodes(folder, notes), notes)]
+    lines = asked_for(folder, read_log(folder, notes), notes)
+    found: list[Record] = [record for record in lines if "not_run" not in record]
     inputs.append(f"{folder}: {inputs_phrase(policy_inputs(found))}")
     return found
 

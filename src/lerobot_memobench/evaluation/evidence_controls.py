@@ -21,11 +21,14 @@ from lerobot_memobench.io import count_of
 AVERAGE = "average"
 RATES = ("follows", "success", "undecided")
 """The choice is the evidence's; the goal held at the end; nothing was chosen that could be told."""
+RIGHT = "right"
+"""Of the choices that could be told, the share that is the evidence's."""
 SENTENCE = (
     "Each scene was run with each variant of its task, so only the past differs. Follows: the first answer that was "
-    "acted on is the one that the evidence asks for. Chance: the best that a policy without the past can reach. "
-    "Per cent, with the 95 % interval of a bootstrap over scenes, at least Wilson's of so many. No chance is told "
-    "where the instruction tells the answer and only what was done so far is evidence; such tasks are in no average."
+    "acted on is the one that the evidence asks for; right, of the decided: among rollouts with an answer. Chance: the "
+    "best that a policy without the past can reach. Per cent, with the 95 % interval of a bootstrap over scenes, at "
+    "least Wilson's of so many. No chance is told where the instruction tells the answer and only what was done so far "
+    "is evidence; such tasks are in no average."
 )
 
 
@@ -36,7 +39,7 @@ class Evidence:
     Attributes:
         scenes, variants: how many; of several tasks the sum of scenes, and no number of variants.
         chance: of following without the past; None where the instruction tells.
-        rates: of `RATES`, with intervals.
+        rates: of `RATES` and `RIGHT`, with intervals; no `RIGHT` where nothing was decided.
     """
 
     scenes: int
@@ -126,10 +129,11 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     drawn = mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
     weights = [1 / (len(groups) * len(group) * len(task.values)) for group in groups for task in group]
     scenes = max(1.0, 1 / sum(len(task.values) * weight**2 for task, weight in zip(tasks, weights, strict=True)))
-    estimates = {}
-    for k, name in enumerate(RATES):
-        (low, high), (least, most) = percentiles(drawn[:, k]), wilson(float(rates[k]), scenes)
-        estimates[name] = Estimate(float(rates[k]), min(low, least), max(high, most))
+    estimates = {name: _estimate(rates[k], drawn[:, k], scenes) for k, name in enumerate(RATES)}
+    decided, of_draws = 1 - rates[2], 1 - drawn[:, 2]
+    if decided > 0:
+        right = drawn[of_draws > 0, 0] / of_draws[of_draws > 0]
+        estimates[RIGHT] = _estimate(rates[0] / decided, right, max(1.0, scenes * decided))
     alone = len(tasks) == 1
     chances = [[task.chance for task in group] for group in groups]
     return Evidence(
@@ -140,13 +144,18 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     )
 
 
+def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
+    (low, high), (least, most) = percentiles(drawn), wilson(min(float(rate), 1.0), scenes)
+    return Estimate(float(rate), min(low, least), max(high, most))
+
+
 # --- the report ---
 
 
 def evidence_section(evidence: FoundEvidence) -> Section:
     """Return the tables of an evaluation in which each scene was run with each variant, with a title."""
     found, notes = evidence
-    header = ("scenes", "variants", "chance", *RATES)
+    header = ("scenes", "variants", "chance", *RATES, "right, of the decided")
     kinds = [*found["memory_types"].items(), *found[AVERAGE].items()]
     tables = [
         Table("evidence_tasks", "", ("task", *header), tuple(_row(Name(n), e) for n, e in found["tasks"].items()))
@@ -159,7 +168,8 @@ def evidence_section(evidence: FoundEvidence) -> Section:
 
 def _row(name: str, found: Evidence) -> tuple[Cell, ...]:
     variants = None if found.variants is None else Count(found.variants)
-    return (name, Count(found.scenes), variants, Numbers(figure(found.chance)), *map(_cell, found.rates.values()))
+    cells = [_cell(found.rates[rate]) if rate in found.rates else None for rate in (*RATES, RIGHT)]
+    return (name, Count(found.scenes), variants, Numbers(figure(found.chance)), *cells)
 
 
 def _cell(found: Estimate) -> Numbers:
@@ -186,10 +196,11 @@ def _choices(group: Sequence[Record]) -> dict[str, dict[str, int]]:
 
 
 def _data(found: Evidence) -> dict[str, Any]:
-    rates = {
+    rates: dict[str, Any] = {
         name: {"percent": percent(rate.value), "low": percent(rate.low), "high": percent(rate.high)}
         for name, rate in found.rates.items()
     }
+    rates.setdefault(RIGHT, None)
     return {"scenes": found.scenes, "variants": found.variants, "chance": percent(found.chance), **rates}
 
 

@@ -121,17 +121,27 @@ def mixtures(records: Iterable[Record]) -> list[str]:
     return notes
 
 
+def notes_on(records: Sequence[Record]) -> list[str]:
+    """Return a sentence for each thing about rollouts that a reader of their figures must know."""
+    return faults(records) + unshown_prompts(records) + mixtures(records)
+
+
+def unshown_prompts(records: Iterable[Record]) -> list[str]:
+    """Return a sentence for each task of which demonstration prompts did not show what they had to."""
+    return [
+        f"{task}: the demonstration prompt did not show what it had to in {count_of(len(group), 'rollout')}, the first "
+        f"in episode {group[0]['episode']}; no memory of it can solve the task"
+        for task, group in by_task(record for record in records if record.get("prompt_shown") is False).items()
+    ]
+
+
 def faults(records: Iterable[Record]) -> list[str]:
     """Return a sentence for each task of which rollouts were broken off, and so failed, with the first reason."""
-    found: dict[str, list[Record]] = {}
-    for record in records:
-        if record.get("fault"):
-            found.setdefault(record["task"], []).append(record)
     return [
         f"{task}: {count_of(len(group), 'rollout')} {'was' if len(group) == 1 else 'were'} broken off and "
         f"{'counts' if len(group) == 1 else 'count'} as failed, the first in episode "
         f"{group[0]['episode']}: {group[0]['fault']}"
-        for task, group in found.items()
+        for task, group in by_task(record for record in records if record.get("fault")).items()
     ]
 
 

@@ -26,12 +26,15 @@ from lerobot_memobench.envs.episode_log import (
     Protocol,
     WholeProtocol,
     differences,
+    notes_on_not_run,
     read_episodes,
+    read_log,
     read_protocol_file,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.evidence_controls import FoundEvidence, evidence_of, ran_evidence
-from lerobot_memobench.evaluation.metrics import Record, Summary, faults, mixtures, seed_base, summarise
+from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, is_there, read_json
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -127,11 +130,15 @@ class SealedRun(TypedDict):
     """How often a policy was started on the sealed seeds (`memobench test-sealed`).
 
     Attributes:
+        started: when. policy: hash of what it loads. scenes: hash of task files, referent, seed and episodes.
         release: of this package.
         run: this start's number, from 1 on, among those of the policy with the release.
         earlier: the starts before it.
     """
 
+    started: NotRequired[str]
+    policy: NotRequired[str]
+    scenes: NotRequired[str]
     release: str
     run: Count
     earlier: list[SealedStart]
@@ -171,6 +178,7 @@ class Card(TypedDict):
     checkpoint: NotRequired[Checkpoint | None]
     runs: NotRequired[list[StartFacts]]
     sealed: NotRequired[SealedRun]
+    episodes: NotRequired[list[CardEpisode]]
 
 
 class WholeCard(TypedDict):
@@ -396,28 +404,33 @@ def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
         MemobenchError: there are none.
     """
     notes: list[str] = []
-    records = asked_for(Path(folder), read_episodes(folder, notes), notes)
+    logged = asked_for(Path(folder), read_log(folder, notes), notes)
+    records = [record for record in logged if "not_run" not in record]
     if not records:
         told = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{told}; run an evaluation first")
-    return records, notes + faults(records) + mixtures(records)
+    return records, notes + notes_on(records)
 
 
-def asked_for(folder: Path, records: list[dict[str, Any]], notes: list[str]) -> list[dict[str, Any]]:
-    """Return the rollouts without those that LeRobot's last batch held beyond what was asked for, by the card.
+def asked_for(folder: Path, lines: list[dict[str, Any]], notes: list[str]) -> list[dict[str, Any]]:
+    """Return the lines of a log to report: without episodes beyond those that the card's protocol asks for.
 
-    Logs of today hold none. Of others that are left out, ``notes`` gets a sentence.
+    ``notes`` gets a sentence for those that are left out, for disagreements of log and card, and for episodes that
+    were not run.
     """
     card = card_of(folder)
     count, base = (card.get("protocol", {}).get(key) for key in ("episodes", "seed_base"))
-    if count is None:
-        return records
-    seed = (card.get(POLICY) or {}).get("seed")
-    first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
-    kept = [record for record in records if record["episode"] < first + count]
-    if len(kept) < len(records):
-        beyond = count_of(len(records) - len(kept), "rollout")
+    kept = lines
+    if count is not None:
+        seed = (card.get(POLICY) or {}).get("seed")
+        first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
+        kept = [record for record in lines if record["episode"] < first + count]
+    if len(kept) < len(lines):
+        beyond = count_of(len(lines) - len(kept), "rollout")
         notes.append(f"{beyond} beyond the {count} of each task that were asked for left out")
+    if card.get("episodes") and (found := disagreements(card["episodes"], kept)):
+        notes.append(f"log and card disagree about {count_of(len(found), 'episode')}, the first: {found[0]}")
+    notes += notes_on_not_run(kept)
     return kept
 
 

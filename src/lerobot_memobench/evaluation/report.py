@@ -16,7 +16,7 @@ from typing import Any
 
 from rich.console import RenderableType
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, not_run, notes_on_not_run, read_log, write_episodes
+from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, not_run, read_log, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.evidence_controls import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
@@ -25,8 +25,7 @@ from lerobot_memobench.evaluation.metrics import (
     Rate,
     Row,
     Summary,
-    faults,
-    mixtures,
+    notes_on,
     percent,
     report_values,
 )
@@ -72,7 +71,10 @@ TABLES = "tables"
 
 
 def write_report(directory: str | Path, episodes: int | None = None) -> Run:
-    """Read the log under ``directory`` and write ``episodes.jsonl``, ``report.json`` and ``report.md`` into it.
+    """Read the log under ``directory`` and write ``report.json`` and ``report.md`` into it.
+
+    ``episodes.jsonl`` gets the lines of the workers' files that it lacks. The caller holds the folder (`locked`) where
+    another process may write to it.
 
     Args:
         episodes: report episodes 0 to ``episodes`` − 1 of each task; None for all. LeRobot runs whole batches, so its
@@ -86,15 +88,15 @@ def write_report(directory: str | Path, episodes: int | None = None) -> Run:
     """
     directory = Path(directory)
     notes: list[str] = []
-    logged = asked_for(directory, read_log(directory, notes), notes)
+    lines = read_log(directory, notes)
+    write_episodes(directory, lines)
+    logged = asked_for(directory, lines, notes)
     if episodes is not None:
         logged = [record for record in logged if record["episode"] < episodes]
-    write_episodes(directory, logged)
-    notes += notes_on_not_run(logged)
     records = [record for record in logged if "not_run" not in record]
     if logged and not records:
         raise MemobenchError(f"no episode in {directory} could be run; {'; '.join(notes)}")
-    notes += faults(records) + mixtures(records)
+    notes += notes_on(records)
     run = Run(directory.name, "", directory, records, read_protocol(directory), notes)
     unrun = {task: len(lines) for task, lines in not_run(logged).items()}
     figures = {**report_values(run.summary), **control_data(run), **({"not_run": unrun} if unrun else {})}

@@ -145,17 +145,17 @@ def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, 
 
 def markdown(report: Report) -> str:
     """Return a report as GitHub's Markdown."""
-    lines = [f"# {_escaped(report.title)}", ""]
+    lines = [f"# {markdown_text(report.title)}", ""]
     for section in report.sections:
-        lines += [f"## {_escaped(section.title)}", ""] if section.title else []
+        lines += [f"## {markdown_text(section.title)}", ""] if section.title else []
         for note in section.notes:
-            lines += [f"> {note}", ""]
+            lines += [f"> {_paragraph(note)}", ""]
         for sentence in section.sentences:
-            lines += [_escaped(sentence), ""]
+            lines += [_paragraph(sentence), ""]
         for table in section.tables:
-            lines += [f"### {_escaped(table.title)}", ""] if table.title else []
+            lines += [f"### {markdown_text(table.title)}", ""] if table.title else []
             lines += [*markdown_table(table), ""]
-            lines += [table.note, ""] if table.note else []
+            lines += [_paragraph(table.note), ""] if table.note else []
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
@@ -163,21 +163,31 @@ def markdown_table(table: Table) -> list[str]:
     """Return the lines of a table in GitHub's Markdown."""
     header = [f"{title} {name}".lstrip() for title, name in zip(table.titles, table.header, strict=True)]
     rule = "|".join("---" if table.is_text(column) else "---:" for column in range(len(header)))
-    lines = [f"| {' | '.join(header)} |", f"|{rule}|"]
+    lines = [f"| {' | '.join(map(markdown_text, header))} |", f"|{rule}|"]
     for index, row in enumerate(table.rows):
         cells = []
         for column, cell in enumerate(row):
             interval = " [{}, {}]" if table.intervals else None
-            words = f"`{cell}`" if isinstance(cell, Name) else _words(cell, interval, _escaped)
+            code = isinstance(cell, Name) and re.fullmatch(r"[\w.+-]+", cell)
+            words = f"`{cell}`" if code else _words(cell, interval, markdown_text)
             emphasised = (index in table.strong and isinstance(cell, str)) or (index, column) in table.best
             cells.append(f"**{words}**" if emphasised and words else words)
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
-def _escaped(words: str) -> str:
-    """Return text with every character that Markdown would take as a mark escaped; within a word ``_`` is none."""
-    return re.sub(r"([|*`<>\\]|(?<![^\W_])_|_(?![^\W_]))", r"\\\1", words)
+def markdown_text(words: str) -> str:
+    """Return text in one line with every mark of Markdown escaped, as names and notes in logs of strangers may hold.
+
+    Within a word ``_`` is none.
+    """
+    line = " ".join("".join(c if c.isprintable() else " " for c in words).split())
+    return re.sub(r"([|*`<>~\[\]\\]|&(?=#?\w+;)|(?<![^\W_])_|_(?![^\W_]))", r"\\\1", line)
+
+
+def _paragraph(words: str) -> str:
+    """Return text that begins a line, where other marks count: of headings, lists and rules."""
+    return re.sub(r"^(\d*)([-+=#.)])", r"\1\\\2", markdown_text(words))
 
 
 # --- LaTeX in the style of booktabs ---

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.jobs.processes import Advance, Job, ProgressCallback, run_in_processes
+from lerobot_memobench.jobs.processes import Advance, Job, ProgressCallback, check_finished, run_in_processes
 
 EXECUTORS = ("processes", "local", "slurm", "ray")
 """``processes``: this package's own; the others are datatrove's."""
@@ -67,7 +67,8 @@ def run_jobs(
         Whether all jobs are finished; False when they have been handed to Slurm.
 
     Raises:
-        MemobenchError: a worker was killed, or the executor is unknown, not installed or misses an option.
+        MemobenchError: a worker was killed, jobs ended without a result, or the executor is unknown, not installed or
+            misses an option.
     """
     check_executor(executor, options)
     finished = [job.finished() for job in jobs]
@@ -272,7 +273,9 @@ class Datatrove:
         with _watching(jobs, tell):
             self._making(jobs).run()
         for job in jobs:
-            tell(job)
+            if job.finished():
+                tell(job)
+        check_finished(jobs, self.logs)  # Ray's executor returns though tasks failed
 
     def submit(self, jobs: Sequence[Job], finish: Callable[[], Any] | None) -> None:
         """Hand the jobs to Slurm, and with them a last one that calls ``finish`` when they are done."""
@@ -287,20 +290,27 @@ class Datatrove:
         settings["gpus_per_task"] = 0  # it merges, or assembles
         words = settings.get(NESTED[0], {})
         settings[NESTED[0]] = {word: value for word, value in words.items() if word not in GPU_WORDS}
-        _executor_class(self.executor)([FinishStep(finish)], tasks=1, depends=making, **settings).run()
+        settings["run_on_dependency_fail"] = True  # else it would wait for ever for an array with a failed member
+        step = FinishStep(list(jobs), self.logs, finish)
+        _executor_class(self.executor)([step], tasks=1, depends=making, **settings).run()
 
     def _making(self, jobs: Sequence[Job], **settings: Any) -> Any:
         from lerobot_memobench.jobs.datatrove_steps import JobsStep
 
         ranks = max(min(self.workers, len(jobs)), -(-len(jobs) // self.jobs_per_rank))
         settings = {**settings, "logging_dir": str(self.logs / "make"), **self.arguments}
-        return _executor_class(self.executor)([JobsStep(list(jobs))], tasks=ranks, workers=self.workers, **settings)
+        apart = self.executor == "ray" or (self.executor == "local" and self.workers > 1)
+        step = JobsStep(list(jobs), apart)
+        return _executor_class(self.executor)([step], tasks=ranks, workers=self.workers, **settings)
 
     @property
     def arguments(self) -> dict[str, Any]:
         """What the executor is made with, beside the jobs, their number and the place of its logs."""
         # What is finished is known from the jobs' folders, better than from datatrove's list of completed tasks.
-        return {"skip_completed": False, **_arguments(self.executor, self.options)}
+        found = {"skip_completed": False, **_arguments(self.executor, self.options)}
+        if self.executor == "slurm":  # datatrove's job of statistics depends on the success of all members
+            found[NESTED[0]] = {"kill-on-invalid-dep": "yes", **found.get(NESTED[0], {})}
+        return found
 
 
 @contextlib.contextmanager

@@ -8,11 +8,12 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import FrameType
 from typing import Protocol
@@ -66,6 +67,25 @@ class Advance:
 ProgressCallback = Callable[[Advance], None]
 
 
+MOST_NAMED = 5
+
+
+def check_finished(jobs: Sequence[Job], logs: Path) -> None:
+    """Refuse to go on with jobs that ended without a result, as a killed one does.
+
+    Raises:
+        MemobenchError: naming them, and how to go on.
+    """
+    failed = [job.folder.name for job in jobs if not job.finished()]
+    if not failed:
+        return
+    names = ", ".join(failed[:MOST_NAMED]) + (f" and {len(failed) - MOST_NAMED} more" if failed[MOST_NAMED:] else "")
+    raise MemobenchError(
+        f"{len(failed)} of {len(jobs)} jobs ended without a result ({names}); "
+        f"see {logs}, then run the same command again (an evaluation's with resume=true), which runs these alone"
+    )
+
+
 def run_in_processes(jobs: Sequence[Job], workers: int, tell: Callable[[Job], None]) -> None:
     """Run the jobs, ``workers`` at a time; ``tell`` of each in the order in which they end."""
     with process_pool(min(workers, len(jobs))) as pool:
@@ -73,6 +93,20 @@ def run_in_processes(jobs: Sequence[Job], workers: int, tell: Callable[[Job], No
         for future in as_completed(futures):
             future.result()
             tell(futures[future])
+
+
+class WorkerKilledError(MemobenchError):
+    """A process that this one had started was killed; commands end with status 1."""
+
+    exit_code = 1
+
+
+def _is_dead_worker(error: BaseException) -> bool:
+    """Return whether an error is how multiprocessing, or a loader of torch, reports a process that is gone."""
+    if isinstance(error, RuntimeError):
+        return str(error).startswith("DataLoader worker (pid")
+    frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
+    return any(frame.f_globals.get("__name__") == Connection.__module__ for frame in frames)
 
 
 @contextlib.contextmanager
@@ -83,8 +117,8 @@ def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     try:
         yield pool
     except BrokenProcessPool:
-        raise MemobenchError(
-            f"one of {workers} worker processes was killed, perhaps because memory ran out; run the same command "
+        raise WorkerKilledError(
+            f"one of {workers} worker processes was killed, usually because memory ran out; run the same command "
             "again to go on from here, with fewer workers"
         ) from None
     finally:
@@ -111,14 +145,18 @@ def _begin_worker() -> None:
 
 
 @contextlib.contextmanager
-def saying_how_to_go_on(how: Callable[[], str]) -> Iterator[None]:
-    """While this lasts, SIGTERM (a job is preempted, its time is up) ends this process and all that it has started.
+def saying_how_to_go_on(program: str, how: Callable[[], str]) -> Iterator[None]:
+    """While this lasts, say how to go on where SIGTERM ends the process, or where a worker of it is killed.
 
-    Nothing is waited for: what is on the disk is whole, as after any kill. In another thread than the main one, and
-    where somebody else handles the signal, nothing changes.
+    SIGTERM (a job is preempted, its time is up) ends this process and all that it has started. Nothing is waited for:
+    the files on the disk are whole, as after any kill. In another thread than the main one, and where the signal has
+    another handler, the signal is left alone.
 
     Args:
-        how: returns what is said on stderr. An inner one takes the place of an outer one meanwhile.
+        program: as it is typed. how: returns how to go on. An inner one takes the place of an outer one meanwhile.
+
+    Raises:
+        WorkerKilledError: a worker process was killed.
     """
     own = os.getpid()
 
@@ -127,21 +165,29 @@ def saying_how_to_go_on(how: Callable[[], str]) -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return
-        try:
-            os.write(2, f"{how()}\n".encode())  # no stream: the signal may have come while one was being written to
+        try:  # no stream: the signal may have come while one was being written to
+            os.write(2, f"{program}: ended by SIGTERM; {how()}\n".encode())
         finally:
             _kill_descendants()
             os._exit(128 + number)
 
     before = signal.getsignal(signal.SIGTERM) if threading.current_thread() is threading.main_thread() else None
-    if before is not signal.SIG_DFL and getattr(before, "__qualname__", None) != end.__qualname__:
-        yield
-        return
-    signal.signal(signal.SIGTERM, end)
+    ours = before is signal.SIG_DFL or getattr(before, "__qualname__", None) == end.__qualname__
+    if ours:
+        signal.signal(signal.SIGTERM, end)
     try:
         yield
+    except (EOFError, ConnectionError, RuntimeError) as error:
+        if not _is_dead_worker(error):
+            raise
+        traceback.clear_frames(error.__traceback__)  # CPython 3.12.1 crashes where it collects a pipe's buffer in them
+        raise WorkerKilledError(
+            "a worker process was killed, usually because memory ran out; choose a smaller batch_size, or fewer workers"
+            f"; {how()}"
+        ) from error
     finally:
-        signal.signal(signal.SIGTERM, before)
+        if ours:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _kill_descendants() -> None:
@@ -181,24 +227,38 @@ def _descendants(root: int) -> set[int]:
     return found
 
 
+class HeldError(MemobenchError):
+    """Another run is writing to a folder."""
+
+
 @contextlib.contextmanager
 def locked(staging: Path, out: Path) -> Iterator[None]:
     """Let one run at a time write to ``out``.
 
-    The lock is held on the folder ``staging`` itself and leaves nothing behind.
+    The lock is held on the folder, or file, ``staging`` itself and leaves nothing behind. Take it before anything in
+    ``out`` is written or removed.
 
     Raises:
-        MemobenchError: another run holds it, or the system is Windows, which locks no folders.
+        HeldError: another run holds it.
+        MemobenchError: the system is Windows, which locks no folders.
     """
-    if sys.platform == "win32":
+    if sys.platform == "win32" and staging.is_dir():
         raise MemobenchError(unsupported_system())
-    descriptor = os.open(staging, os.O_RDONLY)
+    descriptor = os.open(staging, os.O_RDONLY if staging.is_dir() else os.O_RDWR)
     try:
-        if not lock_descriptor(descriptor, blocking=False):
-            raise MemobenchError(f"another run is writing to {out}; wait for it to end or name another folder")
+        if not (lock_descriptor(descriptor, blocking=False) and _is_at(staging, descriptor)):
+            raise HeldError(f"another run is writing to {out}; wait for it to end or name another folder")
         yield
     finally:
         os.close(descriptor)
+
+
+def _is_at(folder: Path, descriptor: int) -> bool:
+    """Return whether an open folder has not been removed, or replaced, by the run that held it until now."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), folder.stat())
+    except FileNotFoundError:
+        return False
 
 
 @contextlib.contextmanager

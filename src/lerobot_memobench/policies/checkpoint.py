@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_name, refusing
+from lerobot_memobench.io import LONGEST_NAME, check_fetched, file_name, refusing
 from lerobot_memobench.io import read_json as read_json_file
 from lerobot_memobench.protocol import CLOCK
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 ADAPTER_FILE = "adapter_model.safetensors"
+CHECKPOINTS, LAST = "checkpoints", "last"
+"""LeRobot's folder of a training run's checkpoints, and its link to the last one."""
 PREPROCESSOR_FILE = "policy_preprocessor.json"
 POSTPROCESSOR_FILE = "policy_postprocessor.json"
 GO_ON_WITHOUT = ("pi0", "pi05", "pi0_fast")
@@ -77,10 +79,29 @@ def checkpoint_folder(text: str) -> Path | None:
 def folder_with_checkpoint(text: str) -> Path | None:
     """Return the checkpoint in a folder: itself, or the last one of a training run; None when there is none."""
     base = Path(text).expanduser()
-    for folder in (base, base / "pretrained_model", base / "checkpoints" / "last" / "pretrained_model"):
+    for folder in (base, *(checkpoint / "pretrained_model" for checkpoint in (base, *checkpoints_of(base)))):
         if (folder / CONFIG_FILE).is_file():
             return folder
     return None
+
+
+def checkpoints_of(run: Path) -> list[Path]:
+    """Return a training run's checkpoint folders, whole or not: the one that ``last`` names, then the newest first.
+
+    ``last`` is a link. Where files are copied without links it is missing, a folder, or a file with the link's text.
+    """
+    last = run / CHECKPOINTS / LAST
+    numbered = [path for path in last.parent.iterdir() if path.name.isdecimal()] if last.parent.is_dir() else []
+    numbered.sort(key=lambda path: int(path.name), reverse=True)
+    named = [last] if last.is_dir() else [path for path in numbered if path.name == text_of_link(last)]
+    return [*named, *numbered]
+
+
+def text_of_link(path: Path) -> str | None:
+    """Return the text of a small file that stands for a link, None where there is no such file."""
+    if not path.is_file() or path.stat().st_size > LONGEST_NAME:
+        return None
+    return path.read_text(errors="replace").strip()
 
 
 def portable_path(path: str) -> str:
@@ -143,6 +164,8 @@ def check_checkpoint(path: str) -> None:
     checkpoint_type(path)
     if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
         raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
+    for weights in folder.glob("*.safetensors"):
+        check_fetched(weights)
     _check_form(folder)
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         for step in read_json(folder / name, Processor).get("steps", []):
@@ -315,7 +338,7 @@ def _shapes(file: Path) -> dict[str, tuple[int, ...]]:
 
 def undamaged(file: Path) -> AbstractContextManager[None]:
     """As `refusing`, for reading the tensors of a checkpoint's file."""
-    return refusing(lambda why: MemobenchError(f"{file} cannot be read ({why}); {ADVICE}"))
+    return refusing(lambda why: MemobenchError(f"{file} cannot be read ({why}); {ADVICE}"), file)
 
 
 def _built_empty(policy: PreTrainedConfig) -> Any | None:

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from draccus.utils import DecodingError
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, obs_type_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, statistics_shapes
+from lerobot_memobench.policies.checkpoint import (
+    check_as_trained,
+    check_checkpoint,
+    check_weights,
+    shipped_policies,
+    statistics_shapes,
+)
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
@@ -50,6 +58,25 @@ def cure(missing: str, observed: Collection[str]) -> str:
     if not cameras and OBS_ENV_STATE in observed:
         return f"set env.obs_type={PIXELS}, or {BOTH}."
     return f"it has {cameras or 'none'}. Map its names with --rename_map."
+
+
+def refuse_short_name(path: str) -> None:
+    """Refuse the name of a policy of this package where LeRobot's own command would look for it on the hub.
+
+    Raises:
+        DecodingError: LeRobot prints it as one sentence.
+    """
+    folder = shipped_policies().get(path)
+    if folder is None or Path(path).is_dir():
+        return
+    from lerobot.configs.policies import PreTrainedConfig
+
+    shown = obs_type_of(PreTrainedConfig.from_pretrained(folder))
+    raise DecodingError(
+        (),
+        f"--policy.path={path} is a policy of this package, which LeRobot finds by its folder: use "
+        f"--policy.path={folder} --env.obs_type={shown}, or `lerobot eval env=memobench policy={path}`",
+    )
 
 
 def check_policy(

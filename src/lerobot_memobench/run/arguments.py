@@ -19,6 +19,7 @@ from typing import Any
 
 import draccus
 import yaml
+from draccus.parsers.config_parsers import JSONParser, YAMLParser
 from draccus.utils import DecodingError, is_choice_type, is_enum, is_literal, is_union
 
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -176,7 +177,7 @@ class LerobotArguments:
     """The arguments of one of LeRobot's commands. They never change: others are another object.
 
     Attributes:
-        flags: LeRobot's, as its parser reads them: ``--key=value``, or ``--key`` alone.
+        flags: LeRobot's, as they are typed: ``--key=value``, or ``--key`` alone.
         config: the command's configuration class; None for a command that has none (plain argparse).
         chosen: fields such as ``policy`` and ``env`` -> the class chosen for them, on the line or in a file.
     """
@@ -184,6 +185,12 @@ class LerobotArguments:
     flags: tuple[str, ...]
     config: type | None = None
     chosen: Mapping[str, type] = field(default_factory=dict)
+
+    @property
+    def for_parser(self) -> tuple[str, ...]:
+        """The flags for LeRobot's parser: texts that it would read as YAML or JSON values are quoted."""
+        known = {} if self.config is None else dict(settings(self.config, self.chosen))
+        return tuple(_for_parser(flag, known) for flag in self.flags)
 
     def get(self, key: str) -> str | None:
         """Return the value of ``--key``, None without one."""
@@ -213,6 +220,24 @@ class LerobotArguments:
         assert self.config is not None
         chosen = {**self.chosen, key: registries(self.config)[key][name]}
         return replace(self.changed(f"{key}.type", name), chosen=chosen)
+
+
+def _for_parser(flag: str, known: Mapping[str, Any]) -> str:
+    key, _, text = flag.removeprefix("--").partition("=")
+    kind = without_none(known.get(key))
+    if kind not in (str, Path) or key.rpartition(".")[2] in CHOICE_KEYS or text in NO_VALUE:
+        return flag
+    if text.startswith(INCLUDE):
+        if kind is not Path and not key.endswith(("root", "_dir")):
+            raise MemobenchError(
+                f"found {key}={text}; LeRobot's parser takes text that begins with {INCLUDE} for a file"
+            )
+        text = f"./{text}"
+    try:
+        is_plain = all(parser.parse_string(text) == text for parser in (YAMLParser, JSONParser))
+    except yaml.YAMLError:
+        is_plain = False
+    return f"--{key}={text if is_plain else json.dumps(text, ensure_ascii=False)}"
 
 
 def read_arguments(command: str, given: Arguments) -> LerobotArguments:
@@ -491,6 +516,10 @@ def read_config_file(given: str | None) -> dict[str, Any]:
 
 CHOICE_KEYS = ("type", "path", "discover_packages_path")
 """What LeRobot's parser understands beside the fields of a choice: ``--policy.type``."""
+NO_VALUE = ("", "null", "~")
+"""Texts that LeRobot's parser reads as an empty text or as None."""
+INCLUDE = "include"
+"""Beginning of a text that draccus replaces by the content of a file."""
 PLAIN = {bool: "true or false", int: "a whole number", float: "a number"}
 
 

@@ -24,10 +24,12 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from lerobot_memobench.envs.acting import ELSEWHERE, checkpoint_files, encoded, tree_hash
-from lerobot_memobench.envs.episode_log import EXTENT, INPUTS, SETTINGS
+from lerobot_memobench.envs.episode_log import EXTENT, INPUTS, SETTINGS, key_of
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.evaluation.records import CARD_FILE
+from lerobot_memobench.evaluation.tables import markdown_text
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
 from lerobot_memobench.run.arguments import without_flags
@@ -36,11 +38,6 @@ from lerobot_memobench.run.plan import EvaluationPlan
 
 FORMAT = 1
 CARD_MARKDOWN = "card.md"
-OUTCOME = (
-    *("success", "steps", "prompt_steps", "variant", "choice", "checkpoints", "failure", "fault", "not_run"),
-    "scene_hash",
-)
-"""What two runs of the same episode must agree in."""
 
 
 # --- the card of a plan, before anything has been found ---
@@ -211,7 +208,7 @@ def new_card(
 
 
 def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool = True) -> dict[str, Any]:
-    """Return a card for both of two runs of one evaluation: extent, runs and tasks' hashes of both.
+    """Return a card for both of two runs of one evaluation: extent, episodes, runs and tasks' hashes of both.
 
     Args:
         again: whether an equal run is one more start, or the same start told twice.
@@ -228,6 +225,7 @@ def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool =
         "flags": _widened_flags(card, extent),
         "shard": card["shard"] if card["shard"] == other["shard"] else None,
         "runs": joined_runs([*card["runs"], *other["runs"]], again),
+        "episodes": _joined_episodes(card["episodes"], other["episodes"]),
     }
 
 
@@ -255,8 +253,16 @@ def joined_runs(runs: Iterable[Mapping[str, Any]], again: bool = True) -> list[d
 
 
 def with_episodes(card: Mapping[str, Any], records: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a card that holds what was found."""
-    return {**card, "episodes": [outcome(record) for record in records]}
+    """Return a card that holds what was found; an episode that is on it stays as it is, whatever a log says later."""
+    return {**card, "episodes": _joined_episodes(card["episodes"], map(outcome, records))}
+
+
+def _joined_episodes(mine: Iterable[Mapping[str, Any]], others: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the episodes of both, sorted, each once, with the outcome that ``mine`` names."""
+    found = {key_of(episode): dict(episode) for episode in others}
+    for episode in mine:
+        found[key_of(episode)] = {**found.get(key_of(episode), {}), **episode}
+    return [found[key] for key in sorted(found)]
 
 
 def write_card(folder: Path, card: Mapping[str, Any]) -> None:
@@ -290,6 +296,11 @@ def markdown(card: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _row(name: str, value: object) -> str:
+    """Return a row of a table; what it holds may be a stranger's."""
+    return f"| {markdown_text(name)} | {markdown_text(str(value))} |"
+
+
 def _protocol_lines(card: Mapping[str, Any]) -> list[str]:
     protocol = card["protocol"]
     tasks = protocol.get("tasks", [])
@@ -297,96 +308,48 @@ def _protocol_lines(card: Mapping[str, Any]) -> list[str]:
     others = {key: value for key, value in protocol.items() if key not in (*SETTINGS, *EXTENT)}
     return [
         *("| protocol | |", "|---|---|"),
-        f"| tasks | {len(tasks)}: {', '.join(tasks)} |",
-        f"| episodes of each | {protocol.get('episodes')} |",
-        *(f"| {name.replace('_', ' ')} | {value} |" for name, value in {**settings, **others}.items()),
-        *_sealed_line(card.get("sealed")),
-        f"| episodes in the log | {len(card['episodes'])} |",
+        _row("tasks", f"{len(tasks)}: {', '.join(tasks)}"),
+        _row("episodes of each", protocol.get("episodes")),
+        *(_row(name.replace("_", " "), value) for name, value in {**settings, **others}.items()),
+        *_sealed_lines(card.get("sealed")),
+        _row("episodes in the log", len(card["episodes"])),
     ]
 
 
-def _sealed_line(sealed: Mapping[str, Any] | None) -> list[str]:
+def _sealed_lines(sealed: Mapping[str, Any] | None) -> list[str]:
     if sealed is None:
         return []
     before = "; ".join(f"{start['started'][:10]} {start['suite']} {start['referent']}" for start in sealed["earlier"])
-    return [f"| sealed test | run {sealed['run']} with release {sealed['release']}; before it: {before or 'none'} |"]
+    number = f"run {sealed['run']} with release {sealed['release']}; before it: {before or 'none'}"
+    told = {f"{name} of that run": sealed[name] for name in ("started", "policy", "scenes") if name in sealed}
+    return [_row("sealed test", number), *(_row(name, value) for name, value in told.items())]
 
 
 def _policy_lines(card: Mapping[str, Any]) -> list[str]:
     policy = card["policy"]
-    lines = ["| policy | |", "|---|---|"]
-    lines += [f"| type | {policy.get('type', 'not known')} |", f"| seed | {policy.get('seed')} |"]
+    lines = [
+        "| policy | |",
+        "|---|---|",
+        _row("type", policy.get("type", "not known")),
+        _row("seed", policy.get("seed")),
+    ]
     if card["checkpoint"]:
-        lines += [f"| checkpoint | {card['checkpoint']['path']} |"]
-        lines += [f"| its sha256 | {policy.get('sha256', 'not known')} |"]
+        lines += [_row("checkpoint", card["checkpoint"]["path"]), _row("its sha256", policy.get("sha256", "not known"))]
     if "detector_sha256" in policy:
-        lines += [f"| sha256 of its detector | {policy['detector_sha256']} |"]
-    return lines + [f"| trained on: {key} | {value} |" for key, value in (card["trained_on"] or {}).items()]
+        lines += [_row("sha256 of its detector", policy["detector_sha256"])]
+    return lines + [_row(f"trained on: {key}", value) for key, value in (card["trained_on"] or {}).items()]
 
 
 def _run_lines(number: int, run: Mapping[str, Any]) -> list[str]:
     times = run.get("times", 1)
+    command = " ".join(" ".join(run["command"]).split())
     lines = [f"## Run {number}" + (f" (started {times} times)" if times > 1 else ""), ""]
-    lines += ["```", " ".join(run["command"]), "```", "", "| | |", "|---|---|"]
-    lines += [f"| {name} | {version} |" for name, version in run["versions"].items()]
-    lines += [f"| commit | {run['git_commit']} |", f"| batch size | {run['batch_size']} |"]
-    lines += [f"| {name} | {value} |" for name, value in run["machine"].items()]
-    return lines + [f"| {name} | {value} |" for name, value in run["gl"].items()]
+    lines += [f"    {command}", "", "| | |", "|---|---|"]  # indented: no text ends such a block
+    facts = {"commit": run["git_commit"], "batch size": run["batch_size"]}
+    return lines + [_row(*fact) for fact in ({**run["versions"], **facts, **run["machine"], **run["gl"]}).items()]
 
 
-# --- whether two runs of an episode agree ---
-
-
-def outcome(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a card keeps of a line of the log: its identity and what does not depend on the clock."""
-    return {
-        key: record[key] for key in ("task", "memory_type", "episode", "seed", "referent", *OUTCOME) if key in record
-    }
-
-
-def key_of(record: Mapping[str, Any]) -> tuple[str, int, str]:
-    """Return what identifies an episode: task, number, referent."""
-    return record["task"], record["episode"], record.get("referent", "fixed")
-
-
-def disagreement(a: Mapping[str, Any], b: Mapping[str, Any], here: str = "here", there: str = "there") -> str | None:
-    """Return in one phrase the first thing in which two records of the same episode differ, None when in nothing.
-
-    The time it took is no difference, nor what one of them leaves out.
-    """
-    for name in ("seed", "replan_steps", "scene_hash", *OUTCOME):
-        if name not in a or name not in b or a[name] == b[name]:
-            continue
-        if name == "checkpoints" and len(a[name]) == len(b[name]):
-            found = _first_checkpoint(a[name], b[name])
-        else:
-            found = (name, a[name], b[name])
-        if found is not None:
-            what, mine, other = found
-            return f"{a['task']}, episode {a['episode']}: {what} is {mine} {here} and {other} {there}"
-    return None
-
-
-def _first_checkpoint(a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, Any]]) -> tuple[str, Any, Any] | None:
-    """Return the first thing in which checkpoints differ: what, and its two values."""
-    for number, (mine, other) in enumerate(zip(a, b, strict=True), start=1):
-        for key in ("operation", "first_step", "ordered_step"):
-            if mine.get(key) != other.get(key):
-                return f"{key} of checkpoint {number}", mine.get(key), other.get(key)
-    return None
-
-
-def first_disagreement(card: Sequence[Mapping[str, Any]], records: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return where a log departs from a card's episodes, None when nowhere."""
-    found = {key_of(record): record for record in records}
-    for episode in card:
-        other = found.get(key_of(episode))
-        if other is None:
-            return f"{episode['task']}, episode {episode['episode']} is on the card and was not run here"
-        problem = disagreement(episode, other, "on the card", "here")
-        if problem is not None:
-            return problem
-    return None
+# --- whether an episode was drawn as it is drawn here ---
 
 
 def drawn_otherwise(records: Iterable[Mapping[str, Any]]) -> str | None:

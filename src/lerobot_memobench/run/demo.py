@@ -32,6 +32,7 @@ from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.run.card import CARD_MARKDOWN
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line
 from lerobot_memobench.run.run import VIDEOS
+from lerobot_memobench.run.run import made as made_folder
 from lerobot_memobench.tasks.catalogue import BOWL
 from lerobot_memobench.tasks.failures import REFERENCE_DRIFT
 
@@ -88,10 +89,10 @@ def make_demo(out: Path, evaluate: Callable[[Path], int], compare: Callable[[Pat
         compare: works in one folder and writes into another what `compare_memories` does; None where the package
             brings no trained policies.
     """
-    if out.exists() and not out.is_dir():
-        raise MemobenchError(f"{out} is a file; name a folder")
-    out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".demo-", dir=out) as scratch:
+    there = [name for name in PRODUCTS if (out / name).exists()]
+    if there and CONTACT_SHEET not in there:
+        raise MemobenchError(f"{out} holds {there[0]}, and no earlier demo; name a new or an empty folder")
+    with made_folder(out), tempfile.TemporaryDirectory(prefix=".demo-", dir=out) as scratch:
         work = Path(scratch) / "eval"
         status = evaluate(work)
         if status:

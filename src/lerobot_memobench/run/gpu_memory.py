@@ -204,7 +204,7 @@ def _policy_of_file(arguments: LerobotArguments, file: dict[str, Any]) -> Any:
     with tempfile.TemporaryDirectory() as folder, quiet():
         path = Path(folder) / "policy.json"
         path.write_text(json.dumps({key: value for key, value in section.items() if key != "type"}))
-        given = [flag for flag in overrides("policy", arguments.flags) if not flag.startswith("--type=")]
+        given = [flag for flag in overrides("policy", arguments.for_parser) if not flag.startswith("--type=")]
         return draccus.parse(MemobenchMemConfig, path, args=given)
 
 

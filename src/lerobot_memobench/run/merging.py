@@ -15,33 +15,43 @@ from lerobot_memobench.envs.episode_log import (
     POLICY,
     differences,
     has_log,
+    key_of,
     read_log,
     read_protocol_file,
     write_episodes,
     write_protocol,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import disagreement
 from lerobot_memobench.evaluation.memory_reads import MEMORY_READS
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, is_there
 from lerobot_memobench.run.card import (
-    disagreement,
     drawn_otherwise,
     extended,
-    key_of,
     remove_card,
     with_episodes,
     write_card,
 )
-from lerobot_memobench.run.run import VIDEOS, EvaluationReport
+from lerobot_memobench.run.run import VIDEOS, EvaluationReport, made
 
 SHARDS = "shard-*-of-*"
 """Folders of the parts of an evaluation, in its own."""
 
 
 def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
-    """Merge parts into the folder ``out`` and report the whole; see `merge`."""
+    """Merge parts into the folder ``out`` and report the whole; see `merge`.
+
+    Raises:
+        MemobenchError: see `merge`; or another run is writing to ``out``.
+    """
+    with made(out):
+        return merge_held(out, folders)
+
+
+def merge_held(out: Path, folders: Sequence[Path]) -> EvaluationReport:
+    """Do as `merge_and_report` where the caller holds ``out``."""
     absent = merge(out, folders)
     report = EvaluationReport(write_report(out), absent)
     if _tells_whose(read_protocol(out), read_log(out)):
@@ -86,7 +96,8 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     if card is None:
         remove_card(out)
     else:
-        write_card(out, with_episodes(card, [record for record in joined if "not_run" not in record]))
+        asked = set(wanted)
+        write_card(out, with_episodes(card, [each for each in joined if (each["task"], each["episode"]) in asked]))
     present = {(record["task"], record["episode"]) for record in joined}
     return [cell for cell in wanted if cell not in present]
 

@@ -136,7 +136,7 @@ class EvaluationPlan:
     @property
     def lerobot_flags(self) -> list[str]:
         """What ``lerobot-eval`` is called with."""
-        return [*self.arguments.flags, f"--{OUTPUT}={self.output}", f"--{LOG}={self.log}"]
+        return list(self.arguments.default(OUTPUT, self.output).default(LOG, self.log).for_parser)
 
     @property
     def portable_flags(self) -> list[str]:
@@ -389,7 +389,7 @@ def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
     from lerobot.configs.policies import PreTrainedConfig
 
     with quiet():
-        return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides("policy", arguments.flags))
+        return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides("policy", arguments.for_parser))
 
 
 def env_config(arguments: LerobotArguments) -> EnvConfig | None:
@@ -409,7 +409,7 @@ def _parsed(arguments: LerobotArguments, key: str) -> Any:
         return None
     try:
         with quiet():
-            return draccus.parse(arguments.chosen[key], args=overrides(key, arguments.flags))
+            return draccus.parse(arguments.chosen[key], args=overrides(key, arguments.for_parser))
     except yaml.YAMLError as error:  # LeRobot reads every value as YAML
         problem = " ".join(str(error).split())
         raise MemobenchError(f"a value of {key}. cannot be read ({problem}); put it in quotes within quotes") from None

@@ -17,7 +17,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_PREFIX
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
+from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED, without_pattern
 from lerobot_memobench.envs.observations import BOTH, policy_names
 from lerobot_memobench.protocol import CLOCK
 
@@ -111,7 +111,7 @@ class Recorder:
 
 def _begun_or_gone_on_with(root: Path, repository: str, columns: dict[str, Any], fps: int) -> LeRobotDataset:
     if (root / "meta" / "info.json").is_file():
-        return LeRobotDataset.resume(repository, root)
+        return LeRobotDataset.resume(repository, without_pattern(root))
     return LeRobotDataset.create(repository, fps, columns, root=root, use_videos=True)
 
 

@@ -3,7 +3,7 @@
 A card is data, and anybody may have written it. Its flags go to LeRobot, which would import packages, run code from the
 hub and read and write files by them. So only those are taken that a card of ours can hold and that name no code, no
 place to write to, no machine but this one, and of places to read from only folders that are here. Anything else is
-refused by name.
+refused by name. So is more than `MOST` of something, and a card that does not name the outcome of every episode.
 """
 
 from __future__ import annotations
@@ -19,15 +19,24 @@ from typing import Any
 
 from draccus.utils import is_enum, is_literal, is_union
 
-from lerobot_memobench.envs.episode_log import IDLE, idling, read_episodes
+from lerobot_memobench.envs.episode_log import (
+    IDLE,
+    MOST_EPISODES,
+    differences,
+    idling,
+    read_log,
+    read_protocol_file,
+)
+from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.protocol import IDLE_STEPS, SEALED
+from lerobot_memobench.protocol import HORIZON, IDLE_STEPS, SEALED
 from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type, without_none
 from lerobot_memobench.run.arguments import settings as settings_of
-from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_otherwise, first_disagreement, tree_hash
+from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_otherwise, tree_hash
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
 from lerobot_memobench.run.machine import PACKAGES, gl_facts, versions
 from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
@@ -55,9 +64,18 @@ NOTES = ("policy.label", "policy.keys")
 """Text that stands on a card, or in a message to the policy's server."""
 SERVERS = ("policy.host", "policy.servers")
 
+RECORDING = "eval.recording"
+"""Writes a dataset of the rollouts: no outcome depends on it, and a repetition leaves it out."""
+MOST = {"env.horizon": 10 * HORIZON, "eval.n_episodes": MOST_EPISODES, "env.videos": MOST_EPISODES}
+MOST |= {"eval.batch_size": 512, "env.max_parallel_tasks": 512}
+MOST_STEPS = 100 * HORIZON
+"""What a card may ask for: setting -> its largest number, and control steps of an episode with its pauses."""
+NAMED = {"success", "steps", "checkpoints"}
+"""What a card must name of an episode, since a repetition could contradict nothing else."""
+
 FLAG = re.compile(r"--([\w.]+)=(.*)", re.DOTALL)
 WORD = re.compile(r"[\w.,+' ()-]*")
-DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d+)?")
+DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d{1,3})?")
 SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
 OBSERVATION = re.compile(r"[\w./-]+")
 NOTHING = ("null", "none", "None", "~")
@@ -98,13 +116,15 @@ def repeat(
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_card(card, out)
+    check_extent(card, plan)
     if status := evaluate(plan):
         return status
-    problem = first_disagreement(card["episodes"], read_episodes(plan.log))
-    if problem is None:
+    problems = differences(told, read_protocol_file(plan.log) or told)
+    problems += disagreements(card["episodes"], read_log(plan.log), "here")
+    if not problems:
         say(f"repeated: {count_of(len(card['episodes']), 'episode')}, as on the card")
         return 0
-    say(f"not repeated: {problem}")
+    say(f"not repeated: {problems[0]}")
     return 1
 
 
@@ -136,6 +156,36 @@ def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> Evaluation
     shard = [] if card["shard"] is None else [f"shard={card['shard']}"]
     split = [f"split={SEALED}"] if "sealed" in card else []
     return plan_line([*card["flags"], f"output_dir={out}", *shard, *split])
+
+
+def check_extent(card: Mapping[str, Any], plan: EvaluationPlan) -> None:
+    """Refuse a card whose flags run something else than its episodes, or whose episodes may take too long.
+
+    Raises:
+        MemobenchError: success, steps or checkpoints of an episode of its protocol are not on the card, an episode of
+            another protocol is, or an episode may take more than `MOST_STEPS`.
+    """
+    asked, grid, environment = card["protocol"], plan.grid, plan.environment
+    tasks = sorted(task.name for task in grid.tasks)
+    if (tasks, grid.runs) != (sorted(asked["tasks"]), asked["episodes"]):
+        raise MemobenchError(
+            f"the card's flags run other tasks or episodes ({grid.runs} of {len(tasks)} tasks) than its protocol names "
+            f"({asked['episodes']} of {len(asked['tasks'])}); expected a card.json that we wrote"
+        )
+    most = longest(environment.horizon, environment.pause_steps, environment.speed, environment.replan_steps)
+    if most > MOST_STEPS:
+        raise MemobenchError(
+            f"an episode of the card may take {most:,} control steps; expected at most {MOST_STEPS:,}, so run its "
+            "command yourself if you trust it"
+        )
+    wanted = {episode for cell in grid.cells(plan.options.shard) for episode in grid.episodes(cell)}
+    named = {(e["task"], e["episode"]) for e in card["episodes"] if "not_run" in e or {*e} >= NAMED}
+    for task, episode in sorted(wanted ^ named)[:1]:
+        lacks = "does not name success, steps and checkpoints of" if (task, episode) in wanted else "does not ask for"
+        raise MemobenchError(
+            f"the card {lacks} {task}, episode {episode}, so it cannot be repeated; expected the outcome of each of "
+            f"the {count_of(len(wanted), 'episode')} of its protocol, as on the card of a finished evaluation"
+        )
 
 
 def check_policy(card: Mapping[str, Any]) -> None:
@@ -195,7 +245,7 @@ def allowed_flags(flags: Any, server: str | None = None) -> list[str]:
     """
     if not isinstance(flags, list) or not all(isinstance(flag, str) for flag in flags):
         raise MemobenchError("the card's flags are no list of --key=value; expected a card.json that we wrote")
-    settings = {key: _folder(key, value) for key, value in map(_taken_apart, flags)}
+    settings = {key: _folder(key, value) for key, value in map(_taken_apart, flags) if key != RECORDING}
     if ENV not in settings:
         raise MemobenchError(f"the card does not say {ENV}={ENVIRONMENT}; only evaluations of ours are repeated")
     named = []
@@ -274,7 +324,10 @@ def _checked(known: Mapping[str, Any], key: str, value: str) -> str:
         raise _refused(key, value, "which may name a file or a repository")
     if not (kind in PLAIN or is_enum(kind) or is_literal(kind) or _holds_numbers(value)):
         raise _refused(key, value, "expected numbers")
-    return checked_value(key, kind, value)
+    found = checked_value(key, kind, value)
+    if key in MOST and float(found) > MOST[key]:
+        raise _refused(key, value, f"expected at most {MOST[key]:,}")
+    return found
 
 
 def _parsed(text: str) -> Any:
@@ -303,11 +356,18 @@ def _all_here(text: str) -> bool:
     return all(SERVER.fullmatch(part.strip()) for part in text.split(","))
 
 
+def _is_device_here(text: str) -> bool:
+    import torch
+
+    found = DEVICE.fullmatch(text)
+    return found is not None and int((found[2] or ":0")[1:]) < max(1, torch.cuda.device_count())
+
+
 EXPECTED: dict[tuple[str, ...], tuple[Callable[[str], Any], str]] = {
     WORDS: (WORD.fullmatch, "words"),
     NOTES: (str.isprintable, "a line of text"),
     SERVERS: (_all_here, "this machine (127.0.0.1); name the server that you trust by --server host:port"),
-    ("policy.device",): (DEVICE.fullmatch, "cpu, mps, cuda or cuda:<number>"),
+    ("policy.device",): (_is_device_here, "cpu, mps, cuda or cuda:<number of a GPU that is here>"),
     ("rename_map",): (_renames_observations, "names of observations"),
 }
 

@@ -103,7 +103,10 @@ def calm_output() -> Iterator[None]:
 
 @contextmanager
 def steered(
-    seed: int | None, ranges: Mapping[tuple[str, int], list[Range]] | None = None, reads: ReadLog | None = None
+    seed: int | None,
+    ranges: Mapping[tuple[str, int], list[Range]] | None = None,
+    reads: ReadLog | None = None,
+    begin: Callable[[], None] = lambda: None,
 ) -> Iterator[None]:
     """While this lasts, LeRobot's loop seeds batches, draws what is observed, records nothing and runs only ``ranges``.
 
@@ -111,6 +114,7 @@ def steered(
         seed: of the run; batches are not seeded when None.
         ranges: by LeRobot's name of a task the runs of it; everything when None.
         reads: where it is noted how much the policy's chunks read of what it remembers; not when None.
+        begin: called once, before the first scene, when LeRobot has loaded the policy.
 
     Raises:
         MemobenchError: the installed LeRobot is another than those whose loop is known here.
@@ -119,7 +123,8 @@ def steered(
     from lerobot.scripts import lerobot_eval
 
     def one(run_one: Callable[..., Any]) -> Callable[..., Any]:
-        return _unrecorded(run_one) if ranges is None else _only(_unrecorded(run_one), ranges)
+        run = _begun(_unrecorded(run_one), begin)
+        return run if ranges is None else _only(run, ranges)
 
     def rolled(rollout: Callable[..., Any]) -> Callable[..., Any]:
         spared = sparing(rollout, lambda: lerobot_eval.inside_slurm(), reads)
@@ -127,6 +132,20 @@ def steered(
 
     with hooked(RUN_ONE, one), hooked(ROLLOUT, rolled):
         yield
+
+
+def _begun(run_one: Callable[..., Any], begin: Callable[[], None]) -> Callable[..., Any]:
+    """Wrap LeRobot's evaluation of one task: something is called before the first, tasks may run in threads."""
+    lock, pending = threading.Lock(), [begin]
+
+    @functools.wraps(run_one)
+    def run(*args: Any, **settings: Any) -> Any:
+        with lock:
+            if pending:
+                pending.pop()()
+        return run_one(*args, **settings)
+
+    return run
 
 
 def _unrecorded(run_one: Callable[..., Any]) -> Callable[..., Any]:

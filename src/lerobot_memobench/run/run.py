@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_episodes, read_log, read_protocol_file
+from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_log, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.memory_reads import MEMORY_READS
 from lerobot_memobench.evaluation.records import CARD_FILE, Run, read_card, read_protocol
@@ -19,10 +19,10 @@ from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.run.card import (
+    CARD_MARKDOWN,
     card_of,
     drawn_otherwise,
     extended,
-    remove_card,
     with_checkpoint,
     with_episodes,
     write_card,
@@ -87,17 +87,18 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: 
     """
     if plan.policy is not None and plan.policy_path is not None:
         check_weights(plan.policy_path, plan.policy)
-    if not plan.options.resume:
-        check_new(plan.output)
-        check_new(plan.log)
-    card = card_of(plan)
-    if plan.options.resume:
-        card = resumed_card(plan.log, card, tell)
-    ranges = missing(plan)
-    if ranges != {}:
-        begin(_what_is_run(plan))
-        return _run_lerobot(plan, card, ranges, tell)
-    return Ended(0, _finish(plan, card) if has_log(plan.log) else None)
+    with held(plan):
+        if not plan.options.resume:
+            check_new(plan.output)
+            check_new(plan.log)
+        card = card_of(plan)
+        if plan.options.resume:
+            card = resumed_card(plan.log, card, tell)
+        ranges = missing(plan)
+        if ranges != {}:
+            begin(_what_is_run(plan))
+            return _run_lerobot(plan, card, ranges, tell)
+        return Ended(0, _finish(plan, card) if has_log(plan.log) else None)
 
 
 def _what_is_run(plan: EvaluationPlan) -> str:
@@ -109,19 +110,23 @@ def _what_is_run(plan: EvaluationPlan) -> str:
 
 
 def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
-    """Run LeRobot's evaluation on what is left, in the folder that is held meanwhile."""
+    """Run LeRobot's evaluation on what is left."""
     status, trained = 1, not isinstance(plan.policy, UntrainedConfig)
+
+    def begin() -> None:
+        nonlocal card
+        card = counted(plan, with_checkpoint(card, plan.policy_path), tell)
+        write_card(plan.log, card)
+
     try:
         with (
             nullcontext() if plan.options.verbose else without_chatter(trained),
-            held(plan),
             calm_output(),
-            steered(plan.seed, ranges, ReadLog.of(plan)),
+            steered(plan.seed, ranges, ReadLog.of(plan), begin),
         ):
-            card = counted(plan, card, tell)
             write_card(plan.log, card)
             left = remainder(plan, ranges)
-            with made(left.output):  # LeRobot makes it for videos of its own only
+            with made(left.output, hold=False):  # LeRobot makes it for videos of its own only
                 status = call_lerobot("eval", left.lerobot_flags)
             return Ended(status, None if status else _finish(plan, card))
     finally:
@@ -138,11 +143,10 @@ def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     protocol.pop(POLICY, None)  # a card says more of it; the file has what `auto` came to in LeRobot's process
     # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
     limit = plan.grid.first + max(plan.grid.runs, protocol["episodes"])
-    report = EvaluationReport(write_report(plan.log, limit))
-    records = [record for record in read_episodes(plan.log) if record["episode"] < limit]
+    records = [record for record in read_log(plan.log) if record["episode"] < limit]
     card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
     write_card(plan.log, with_episodes(card, records))
-    return report
+    return EvaluationReport(write_report(plan.log, limit))
 
 
 # --- going on: whether it is the same evaluation, which episodes are left, what is then run ---
@@ -248,37 +252,40 @@ def logged(folder: Path, referent: str) -> set[tuple[str, int]]:
 
 @contextmanager
 def held(plan: EvaluationPlan) -> Iterator[None]:
-    """Hold the folder of an evaluation's log; a run that ends before its first episode leaves nothing in it.
+    """Hold the folders of an evaluation and of its log, see `made`.
 
-    Raises:
-        MemobenchError: another run holds it.
+    Drafts of a killed run are removed, and of a run that ends before its first episode the files that it made.
     """
-    new = [folder for folder in (plan.output, plan.log) if not folder.exists()]
-    plan.log.mkdir(parents=True, exist_ok=True)
-    try:
-        with locked(plan.log, plan.log):
-            for folder in (plan.log, plan.log / VIDEOS, plan.log / MEMORY_READS):  # what a killed run was writing
-                remove_drafts(folder)
+    with ExitStack() as stack:
+        for folder in {folder.absolute(): folder for folder in (plan.output, plan.log)}.values():
+            stack.enter_context(made(folder))
+        for folder in (plan.log, plan.log / VIDEOS, plan.log / MEMORY_READS):
+            remove_drafts(folder)
+        files = [*(plan.log / name for name in (CARD_FILE, CARD_MARKDOWN)), plan.output / RUN_FILE]
+        mine = [file for file in files if not file.exists()]
+        try:
             yield
-    finally:
-        if not has_log(plan.log):
-            remove_card(plan.log)
-            if plan.options.shard is None:
-                (plan.output / RUN_FILE).unlink(missing_ok=True)
-            for folder in new:
-                _remove_empty(folder)
+        finally:
+            for file in [] if has_log(plan.log) else mine:
+                file.unlink(missing_ok=True)
 
 
 @contextmanager
-def made(folder: Path) -> Iterator[None]:
-    """Make a folder for as long as it is written to; of a new one nothing that is empty stays behind."""
-    new = not folder.exists()
+def made(folder: Path, hold: bool = True) -> Iterator[None]:
+    """Make a folder, and hold it, for as long as it is written to; of new ones nothing that is empty stays behind.
+
+    Raises:
+        MemobenchError: another run holds it, or it is a file.
+    """
+    check_folder(folder)
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    finally:
-        if new:
-            _remove_empty(folder)
+    with locked(folder, folder) if hold else nullcontext():
+        try:
+            yield
+        finally:
+            for path in new:
+                _remove_empty(path)
 
 
 def _remove_empty(folder: Path) -> None:

@@ -1,8 +1,11 @@
 """The sealed test: seeds that nobody chose anything by, run once per release; how often they were is counted.
 
-Nothing is refused: a second look is allowed, and told. Each start of a sealed evaluation is a line in the user's ledger
-and, where its folder can be written to, in one beside the checkpoint, with which it travels. An evaluation that goes on
-and the parts of one are one start: ``sealed.json`` in its folder says which, and its card repeats it.
+Nothing is refused: a second look is allowed, and counted. A start is counted before its first scene is shown, when the
+policy has been loaded. Its line goes to the user's ledger and, where its folder can be written to, to one beside the
+checkpoint, with which it travels. An evaluation that goes on with its log, and the parts of one, are one start.
+
+The card repeats the line: which policy, by the hash of the files that it loads, on which scenes, when, and the number.
+That is a commitment, which a board of results can check against the card, and no lock: a user owns the machine.
 """
 
 from __future__ import annotations
@@ -11,20 +14,34 @@ import datetime as dt
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
 
-from lerobot_memobench.envs.acting import SEALED_LEDGER
-from lerobot_memobench.evaluation.records import SealedRun, SealedStart
-from lerobot_memobench.io import Malformed, checked, count_of, is_there, parsed, read_json, write_file
+from lerobot_memobench.envs.acting import SEALED_LEDGER, SEALED_RUN, tree_hash
+from lerobot_memobench.evaluation.records import SealedStart
+from lerobot_memobench.io import Malformed, checked, count_of, file_hash, parsed, telling_of_the_disk, write_file
 from lerobot_memobench.jobs.processes import taking_turns
-from lerobot_memobench.policies.checkpoint import local_folder, portable_path
+from lerobot_memobench.policies.checkpoint import (
+    ADAPTER_FILE,
+    CONFIG_FILE,
+    POSTPROCESSOR_FILE,
+    PREPROCESSOR_FILE,
+    WEIGHTS_FILE,
+    local_folder,
+    portable_path,
+)
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.machine import PACKAGES, versions
 from lerobot_memobench.run.plan import EvaluationPlan
 
-RUN_FILE = "sealed.json"
+RUN_FILE = SEALED_RUN
+"""Marks the folder of a counted evaluation; what counts is in the ledger."""
+LOADED = (
+    *(CONFIG_FILE, WEIGHTS_FILE, "adapter_config.json", ADAPTER_FILE),
+    *(PREPROCESSOR_FILE, POSTPROCESSOR_FILE),
+)
+"""Files of a checkpoint that LeRobot opens by their name; they name the others."""
 REPEATED = ("suite", "referent", "replan_steps")
 """Settings of the protocol that a ledger's line repeats."""
 
@@ -33,55 +50,106 @@ class LedgerLine(SealedStart):
     """A start of a sealed evaluation.
 
     Attributes:
-        policy: hash of its checkpoint; of a policy without one, of its type and settings.
+        policy: hash of what it loads; of a policy without a checkpoint, of its type and settings.
         release: version of this package.
         folder: where the evaluation was written.
+        scenes: see `scenes_hash`. shard: the part of the evaluation, or None.
     """
 
     policy: str
     release: str
     folder: str
+    scenes: NotRequired[str]
+    shard: NotRequired[str | None]
 
 
 def counted(plan: EvaluationPlan, card: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
-    """Return the card of a sealed evaluation with the number of its start; others' as they are.
+    """Return a card with the number of the start, where the first scene of a sealed evaluation is next.
 
     Args:
-        tell: told the number, and when the earlier starts were.
+        tell: called with the number, and the date of the earlier start.
+
+    Raises:
+        MemobenchError: the ledger cannot be written.
     """
     if plan.split != SEALED:
         return card
     folder = (plan.output if plan.options.shard is None else plan.output.parent).absolute()
     ledger = user_ledger()
-    ledger.parent.mkdir(parents=True, exist_ok=True)
-    with taking_turns(ledger.with_suffix(".lock")):
-        if not is_there(folder / RUN_FILE):
-            folder.mkdir(parents=True, exist_ok=True)
-            write_file(folder / RUN_FILE, json.dumps(_new_start(plan, card, folder), indent=1) + "\n")
-        told = read_json(folder / RUN_FILE, SealedRun, "remove the folder and begin anew")
-    tell(in_words(told))
+    with telling_of_the_disk(ledger.parent, "the ledger of sealed tests lies there, or in $XDG_STATE_HOME/memobench"):
+        ledger.parent.mkdir(parents=True, exist_ok=True)
+        with taking_turns(ledger.with_suffix(".lock")):
+            found = _start(plan, card, str(folder))
+    folder.mkdir(parents=True, exist_ok=True)
+    write_file(folder / RUN_FILE, json.dumps(found, indent=1) + "\n")
+    tell(in_words(found))
     episodes = card.pop("episodes")  # they stay the last of a card
-    return {**card, "sealed": told, "episodes": episodes}
+    return {**card, "sealed": found, "episodes": episodes}
 
 
-def _new_start(plan: EvaluationPlan, card: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Write a start into the ledgers; return its number and the starts before it."""
-    policy, release = _identity(card["policy"]), versions()[PACKAGES[0]]
-    places = [user_ledger(), *_beside_the_checkpoint(plan.policy_path)]
-    lines = {line["started"] + line["folder"]: line for place in places for line in _lines(place)}
-    earlier = [line for line in lines.values() if (line["policy"], line["release"]) == (policy, release)]
+def _start(plan: EvaluationPlan, card: Mapping[str, Any], folder: str) -> dict[str, Any]:
+    """Return the start that a run belongs to, with its number; a new one gets a line in the ledgers."""
     start = {
-        "started": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
+        "started": dt.datetime.now(dt.UTC).isoformat(timespec="microseconds"),
         **{name: card["protocol"].get(name) for name in REPEATED},
         "tasks": len(card["protocol"]["tasks"]),
         "episodes": card["protocol"]["episodes"],
     }
-    line = json.dumps({**start, "policy": policy, "release": release, "folder": str(folder)}) + "\n"
+    whose = {"policy": _identity(card["policy"], plan.policy_path), "release": versions()[PACKAGES[0]]}
+    line = {**start, **whose, "scenes": scenes_hash(card), "folder": folder, "shard": card["shard"]}
+    places = [user_ledger(), *_beside_the_checkpoint(plan.policy_path)]
+    lines = [line for place in places for line in _lines(place) if whose.items() <= line.items()]
+    if _goes_on(card.get("sealed", {}), line, lines):
+        return dict(card["sealed"])
+    starts = {(line["started"], line["folder"]): line for line in lines}
+    if (joined := _joined(line, lines)) is not None:
+        line["started"] = joined
+        starts = {key: found for key, found in starts.items() if key < (joined, folder)}
     for place in places:
-        with place.open("a") as file:
-            file.write(line)
-    before = [{key: line[key] for key in start} for line in sorted(earlier, key=lambda line: line["started"])]
-    return {"release": release, "run": len(earlier) + 1, "earlier": before}
+        _append(place, line)
+    earlier = [{key: starts[which][key] for key in start} for which in sorted(starts)]
+    kept = {key: line[key] for key in ("started", "policy", "scenes", "release")}
+    return {**kept, "run": len(earlier) + 1, "earlier": earlier}
+
+
+def _goes_on(card: Mapping[str, Any], line: Mapping[str, Any], lines: Iterable[Mapping[str, Any]]) -> bool:
+    """Return whether a run is of the start on its card: same policy, same scenes, and the folder is not a copy."""
+    alike = all(card.get(key) == line[key] for key in ("policy", "scenes", "release"))
+    same = [other["folder"] for other in lines if other["started"] == card.get("started")]
+    return alike and all(folder == line["folder"] for folder in same)
+
+
+def _joined(line: Mapping[str, Any], lines: Iterable[Mapping[str, Any]]) -> str | None:
+    """Return the time of the start that a part belongs to, the last of its folder; None for a new one."""
+    there = [other for other in lines if other["folder"] == line["folder"]]
+    last: str | None = max((other["started"] for other in there), default=None)
+    if line["shard"] is None or last is None:
+        return None
+    parts = [other for other in there if other["started"] == last]
+    new = all(
+        other.get("scenes") == line["scenes"] and other.get("shard") not in (None, line["shard"]) for other in parts
+    )
+    return last if new else None
+
+
+def scenes_hash(card: Mapping[str, Any]) -> str:
+    """Return one hash for the scenes of an evaluation, of what its card says: task files, referent, seed, episodes."""
+    protocol = card["protocol"]
+    told = [
+        *(card["task_files"], card["policy"].get("seed"), protocol["episodes"]),
+        *(protocol.get("referent"), protocol.get("evidence", False)),
+    ]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+def _append(ledger: Path, line: Mapping[str, Any]) -> None:
+    """Write a line to the disk, after the end of one that was cut off."""
+    with ledger.open("ab+") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - 1))
+        torn = file.read(1) not in (b"", b"\n")
+        file.write(b"\n" * torn + json.dumps(line).encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def user_ledger() -> Path:
@@ -99,16 +167,23 @@ def _beside_the_checkpoint(path: str | None) -> Iterator[Path]:
         yield folder / SEALED_LEDGER
 
 
-def _identity(policy: Mapping[str, Any]) -> str:
-    """Return what tells a policy from another: the hash of its checkpoint, else of its type and settings."""
-    told = {key: policy.get(key) for key in ("type", "settings", "detector_sha256")}
-    found: str = policy.get("sha256") or hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
-    return found
+def _identity(policy: Mapping[str, Any], path: str | None) -> str:
+    """Return the hash of what a policy loads, and of nothing else in its folder; without one, of type and settings."""
+    folder = None if path is None else local_folder(path)
+    if folder is None:
+        told = {key: policy.get(key) for key in ("type", "settings", "detector_sha256")}
+        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    loaded = {name: folder / name for name in LOADED if (folder / name).is_file()}
+    texts = [file.read_text(errors="replace") for file in loaded.values() if file.suffix == ".json"]
+    files = [file for file in folder.iterdir() if file.is_file()]
+    named = {file.name: file for file in files if any(f'"{file.name}"' in text for text in texts)}
+    detector = {key: policy[key] for key in ("detector_sha256",) if policy.get(key)}
+    return tree_hash({name: file_hash(file) for name, file in {**loaded, **named}.items()} | detector)
 
 
 def _lines(ledger: Path) -> Iterator[dict[str, Any]]:
     """Yield the lines of a ledger that can be read."""
-    if not is_there(ledger):
+    if not ledger.is_file():
         return
     for line in ledger.read_bytes().splitlines():
         try:

@@ -22,9 +22,9 @@ from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import LARGE, sharing
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.card import card_of
-from lerobot_memobench.run.merging import SHARDS, merge_and_report
+from lerobot_memobench.run.merging import SHARDS, merge_held
 from lerobot_memobench.run.plan import EvaluationPlan, Shard
-from lerobot_memobench.run.run import EvaluationReport, Tell, check_folder, check_new, logged, resumed_card
+from lerobot_memobench.run.run import EvaluationReport, Tell, check_folder, check_new, logged, made, resumed_card
 
 LOGS = "logs"
 
@@ -194,14 +194,15 @@ def run_shards(
         finish: what Slurm's last job calls with the evaluation's folder and those of its parts. It is pickled.
     """
     options, out, folders = plan.options, plan.output.absolute(), [job.folder for job in jobs]
-    complete = run_jobs(
-        jobs,
-        workers=options.workers or len(jobs),
-        progress=progress,
-        executor=options.executor,
-        options=executor_options(plan),
-        logs=out / LOGS,
-        finish=partial(finish, out, folders),
-        jobs_per_rank=1,
-    )
-    return merge_and_report(out, [folder for folder in folders if has_log(folder)]) if complete else None
+    with made(out):
+        complete = run_jobs(
+            jobs,
+            workers=options.workers or len(jobs),
+            progress=progress,
+            executor=options.executor,
+            options=executor_options(plan),
+            logs=out / LOGS,
+            finish=partial(finish, out, folders),
+            jobs_per_rank=1,
+        )
+        return merge_held(out, [folder for folder in folders if has_log(folder)]) if complete else None

@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 import json
 import logging
+import os
 import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -28,27 +30,31 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     PRIVILEGED,
     check_clock,
     naming_damage,
+    read_info,
+    without_pattern,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
+from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, chooses_inputs, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import count_of
-from lerobot_memobench.jobs.processes import saying_how_to_go_on
+from lerobot_memobench.io import check_fetched, count_of
+from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.lerobot_hooks import OPEN_DATASETS, check_version, install
-from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_FILE
 from lerobot_memobench.policies.checkpoint import (
+    LAST,
     as_trained,
     check_as_begun,
     check_processors,
     check_weights,
     checkpoint_folder,
     checkpoint_type,
+    checkpoints_of,
     differing,
-    local_folder,
     read_json,
+    text_of_link,
 )
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import (
@@ -68,6 +74,9 @@ from lerobot_memobench.run.arguments import (
 from lerobot_memobench.run.gpu_memory import refuse_too_large
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_configuration
 from lerobot_memobench.run.plan import check_observations, env_config, policy_config
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
 
 logger = logging.getLogger(__name__)
 
@@ -98,7 +107,7 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
     check_task_names(given)
     arguments = read_arguments("train", given)
     if given.wants_help:
-        return call_lerobot("train", arguments.flags)
+        return call_lerobot("train", arguments.for_parser)
     arguments = complete_training(arguments)
     refuse_too_large(arguments)
     note, left = note_on_resume(arguments)
@@ -107,14 +116,41 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
             tell(noted)
     if not left:
         return 0
+    make_room_for_link(arguments)
     root = arguments.get("dataset.root")
     with (
-        saying_how_to_go_on(lambda: f"lerobot: {how_to_go_on(arguments, line, begun)}"),
+        saying_how_to_go_on("lerobot", lambda: how_to_go_on(arguments, line, begun)),
+        held_run(arguments),
         trained_on(prompt_frames, obs_type),
         naming_damage(Path(root) if root else None),
         without_configuration(),
     ):
-        return call_lerobot("train", arguments.flags)
+        return call_lerobot("train", arguments.for_parser)
+
+
+@contextmanager
+def held_run(arguments: LerobotArguments) -> Iterator[None]:
+    """Hold the folder of a training that is named, in its first process, by a lock file beside it.
+
+    LeRobot refuses a folder that is there before its first checkpoint, so there is none to hold until then.
+
+    Raises:
+        MemobenchError: another training holds it.
+    """
+    named = arguments.get("output_dir") or read_config_file(arguments.get(CONFIG_FILE)).get("output_dir")
+    if not isinstance(named, str) or os.environ.get("RANK", "0") != "0":
+        yield
+        return
+    run = Path(named).expanduser().absolute()
+    run.parent.mkdir(parents=True, exist_ok=True)
+    lock = run.with_name(f".{run.name}.lock")
+    lock.touch()
+    with locked(lock, run):
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows keeps a file that is open
+                lock.unlink()
 
 
 def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Arguments]:
@@ -186,27 +222,14 @@ def check_numbers(arguments: LerobotArguments) -> None:
 
 
 def with_own_memory(arguments: LerobotArguments) -> LerobotArguments:
-    """Return arguments in which a memory that is another one than that of the checkpoint it begins with has its own
-    defaults: LeRobot would take the checkpoint's, which were those of the other memory.
+    """Return arguments in which a memory that is another one than that of the checkpoint or recipe it begins with has
+    its own defaults.
     """
-    path, memory = arguments.get("policy.path"), arguments.get("policy.memory")
-    folder = None if path is None else local_folder(path)
-    if folder is None or memory is None or checkpoint_type(str(folder)) != "memobench_mem":
-        return arguments
-    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MEMORY_FRAMES
+    from lerobot_memobench.policies.memobench_mem.inherited import of_another_memory
 
-    held = read_json(folder / POLICY_FILE)
-    fusion = held.get("memory_fusion")  # alone in files from before there were several memories
-    if memory == (held.get("memory") or ("none" if fusion == "none" else "frames")):
-        return arguments
-    own = {
-        "memory_stride": "null",
-        "memory_fusion": "null",
-        "memory_frames": MEMORY_FRAMES,
-        "memory_phase": False,
-    }
-    for name, value in own.items():
-        arguments = arguments.default(f"policy.{name}", value)
+    for name, value in of_another_memory(arguments.flags).items():
+        if name != "memory_settings":  # LeRobot would merge these; the configuration leaves out those of another
+            arguments = arguments.default(f"policy.{name}", "null" if value is None else value)
     return arguments
 
 
@@ -254,6 +277,8 @@ def check_dataset(arguments: LerobotArguments) -> None:
             f"the folder {root} is not a LeRobot dataset ({INFO_FILE} is missing); make one with "
             "`memobench generate --out <folder>`"
         )
+    read_info(folder)
+    check_fetched(folder)
 
 
 def note_on_start(arguments: LerobotArguments) -> str | None:
@@ -312,20 +337,42 @@ def last_checkpoint(run: Path) -> Path:
     Raises:
         MemobenchError: there is none.
     """
-    checkpoints = run / "checkpoints"
-    numbered = sorted(
-        (path for path in checkpoints.glob("*") if path.name.isdecimal()), key=lambda path: int(path.name)
-    )
-    # The link is set once a checkpoint is whole; a copy of the run may lack it, and so does one killed at that moment.
-    for folder in (checkpoints / "last", *reversed(numbered)):
-        told = (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file()
-        if told and (folder.name == "last" or any(folder.glob("training_state/**/" + OPTIMIZER_GROUPS))):
-            return folder / "pretrained_model"
+    found = next(whole_checkpoints(run), None)
+    if found is not None:
+        return found / "pretrained_model"
     what = "holds no whole checkpoint" if run.is_dir() else "does not exist"
     raise MemobenchError(
         f"output_dir={run} {what}, so there is nothing to go on with; a first one is saved after save_freq steps: "
         "leave resume=true out and name a new folder"
     )
+
+
+def whole_checkpoints(run: Path) -> Iterator[Path]:
+    """Yield the checkpoints of a training run that can be gone on with, the last one first."""
+    for folder in checkpoints_of(run):
+        told = (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file()
+        # The link is set once a checkpoint is whole.
+        if told and (folder.name == LAST or any(folder.glob("training_state/**/" + OPTIMIZER_GROUPS))):
+            yield folder
+
+
+def make_room_for_link(arguments: LerobotArguments) -> None:
+    """Remove a file that stands for the link ``last`` of a training that goes on: LeRobot makes the link itself.
+
+    Raises:
+        MemobenchError: it is a folder, or another file.
+    """
+    checkpoint = _gone_on_with(arguments)
+    last = None if checkpoint is None else checkpoint.parents[1] / LAST
+    if last is None or last.is_symlink() or not last.exists():
+        return
+    named = text_of_link(last)
+    if not (named and named.isdecimal()):
+        raise MemobenchError(
+            f"{last} is no link, and LeRobot makes a link of that name when it saves a checkpoint; give it another "
+            "name, such as the number of its step"
+        )
+    last.unlink(missing_ok=True)  # another process of this training may have
 
 
 def _check_same_policy(given: Arguments, checkpoint: Path, folder: str) -> None:
@@ -349,7 +396,7 @@ def check_same_training(arguments: LerobotArguments) -> None:
         return
     check_processors(checkpoint)
     _check_same_dataset(arguments, checkpoint)
-    given = overrides("policy", arguments.flags)
+    given = overrides("policy", arguments.for_parser)
     if not given:
         return
     from lerobot.configs.policies import PreTrainedConfig
@@ -463,16 +510,16 @@ def how_to_go_on(arguments: LerobotArguments, line: Sequence[str], begun: float)
     """
     given = arguments.get("output_dir")
     runs = [Path(given)] if given is not None else list(Path("outputs/train").glob("*/*"))
-    links = [run / "checkpoints" / "last" for run in runs]
-    saved = [link for link in links if link.exists() and (given is not None or link.lstat().st_mtime >= begun)]
+    saved = [checkpoint for run in runs for checkpoint in itertools.islice(whole_checkpoints(run), 1)]
+    saved = [one for one in saved if given is not None or one.lstat().st_mtime >= begun]
     if not saved:
         again = shlex.join(["lerobot", "train", *line])
-        return f"ended by SIGTERM before a checkpoint was saved; begin anew with: {again}"
-    run = max(saved, key=lambda link: link.lstat().st_mtime).parents[1]
+        return f"no checkpoint was saved; begin anew with: {again}"
+    run = max(saved, key=lambda one: one.lstat().st_mtime).parents[1]
     # LeRobot's configuration has no place for these.
     kept = [word for word in line if word.partition("=")[0] in TRAINING_OPTIONS]
     again = shlex.join(["lerobot", "train", f"output_dir={run}", "resume=true", *kept])
-    return f"ended by SIGTERM; go on with: {again}"
+    return f"go on with: {again}"
 
 
 # --- what is added to LeRobot's training: which frames are trained on, and what a policy's inputs are ---
@@ -512,12 +559,19 @@ def _steered(make: Callable[..., Any], prompt_frames: bool | None, obs_type: str
         from lerobot_memobench.datasets.samples import keep_in_memory
         from lerobot_memobench.policies.memobench_mem.sampler import check_transforms
 
-        if prompt_frames is not False:
-            _check_streaming(config)
+        _check_streaming(config, prompt_frames)
+        _check_adapters(config)
         check_transforms(config.policy, config.dataset.image_transforms.enable)
         _check_distribution(config)
-        _check_episodes(config.dataset)
-        train, held_out = make(config)
+        opened = copy.copy(config)
+        if config.dataset.root is not None:
+            opened.dataset = replace(config.dataset, root=str(without_pattern(Path(config.dataset.root))))
+        meta = _metadata(opened.dataset)
+        _check_episodes(opened.dataset, meta.total_episodes)
+        if config.policy is not None and not config.dataset.streaming:
+            _complete_statistics(opened, meta)
+        train, held_out = make(opened)
+        _check_streamed(train, config.policy)
         check_clock(train.meta.features, train.root)
         if EPISODE_INFO in train.meta.features and not config.dataset.streaming:
             check_idling(Path(train.root))
@@ -557,12 +611,60 @@ def _reads_no_pictures(config: Any) -> bool:
     return chosen and not pictures and not config.dataset.streaming
 
 
-def _check_streaming(config: Any) -> None:
+def _check_streaming(config: Any, prompt_frames: bool | None) -> None:
     """Refuse to stream to a policy that draws its own execution frames: it would get prompts, which do not count."""
-    if config.dataset.streaming and getattr(config.policy, "execution_only", False):
+    if not config.dataset.streaming:
+        return
+    if config.num_workers == 0:
+        raise MemobenchError(
+            "dataset.streaming=true and num_workers=0 were asked for, and LeRobot's stream gives its frames to loaders "
+            "alone; use num_workers=1 or more"
+        )
+    root = None if config.dataset.root is None else Path(config.dataset.root)
+    if root is not None and without_pattern(root) != root:
+        raise MemobenchError(
+            f"dataset.streaming=true cannot read {root}: LeRobot takes the folder's name for a pattern; rename the "
+            "folder, or use dataset.streaming=false"
+        )
+    if prompt_frames is not False and getattr(config.policy, "execution_only", False):
         raise MemobenchError(
             f"policy={config.policy.type} draws execution frames alone, and dataset.streaming=true leaves no choice of "
             "frames; use dataset.streaming=false, or prompt_frames=false to take execution frames as they come"
+        )
+
+
+def _check_streamed(dataset: Any, policy: Any) -> None:
+    """Refuse to stream several frames of a single number, such as the clock's: LeRobot cannot stack them."""
+    if hasattr(dataset.hf_dataset, "data"):
+        return
+    single = [key for key in dataset.delta_indices or {} if tuple(dataset.meta.features[key]["shape"]) == (1,)]
+    if single:
+        raise MemobenchError(
+            f"policy={policy.type} asks for several frames of {single[0]}, a single number, which LeRobot's stream "
+            "cannot give; use dataset.streaming=false"
+        )
+
+
+def _check_adapters(config: Any) -> None:
+    """Refuse adapters (LeRobot's ``peft``) that LeRobot would refuse once it has built the policy."""
+    policy = config.policy
+    if config.peft is None or policy is None:
+        return
+    from lerobot.policies.factory import get_policy_class
+    from lerobot.policies.pretrained import PreTrainedPolicy
+
+    kind = get_policy_class(policy.type)
+    # MolmoAct2 names its weights by `checkpoint_path`.
+    if not policy.pretrained_path and not getattr(policy, "checkpoint_path", None):
+        raise MemobenchError(
+            f"--peft trains adapters beside trained weights, and policy={policy.type} begins without any; name a "
+            "checkpoint by policy=, or weights by policy.pretrained_path="
+        )
+    has_targets = kind._get_default_peft_targets is not PreTrainedPolicy._get_default_peft_targets
+    if not has_targets and not config.peft.target_modules:
+        raise MemobenchError(
+            f"--peft trains adapters of some modules, and policy={policy.type} does not say of which; name them by "
+            "--peft.target_modules"
         )
 
 
@@ -589,19 +691,36 @@ def _check_distribution(config: Any) -> None:
         )
 
 
-def _check_episodes(dataset: Any) -> None:
+def _metadata(dataset: Any) -> LeRobotDatasetMetadata:
+    """Return the metadata of a dataset, of LeRobot's configuration of it; fetched, where it is on the hub."""
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    return LeRobotDatasetMetadata(
+        dataset.repo_id, root=dataset.root, revision=dataset.revision, repo_type=dataset.repo_type
+    )
+
+
+def _complete_statistics(config: Any, meta: LeRobotDatasetMetadata) -> None:
+    """Add the statistics that a policy normalises by and its dataset lacks, before anything is encoded or trained."""
+    from lerobot.datasets import LeRobotDataset
+
+    given, root = config.dataset, Path(meta.root)
+    missing = lacking(root, needed_by(config.policy, meta.features, given.use_imagenet_stats))
+    if not missing:
+        return
+    if not (root / "data").is_dir():
+        root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
+    complete(root, missing, logger.warning)
+
+
+def _check_episodes(dataset: Any, total: int) -> None:
     """Refuse to train on episodes that a dataset does not have: LeRobot leaves them out, and fails where none is left.
 
     Args:
-        dataset: LeRobot's configuration of it.
+        dataset: LeRobot's configuration of it. total: the episodes that it has.
     """
-    from lerobot.datasets import LeRobotDatasetMetadata
-
     if dataset.episodes is None:
         return
-    total = LeRobotDatasetMetadata(
-        dataset.repo_id, root=dataset.root, revision=dataset.revision, repo_type=dataset.repo_type
-    ).total_episodes
     absent = [episode for episode in dataset.episodes if episode >= total]
     if absent or not dataset.episodes:
         raise MemobenchError(

@@ -11,7 +11,6 @@ import contextlib
 import hashlib
 import importlib.metadata
 import logging
-import os
 import re
 import warnings
 from functools import cache
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import draft_of
+from lerobot_memobench.io import cache_folder, draft_of
 
 ROBOSUITE = "1.4.1"
 INSTALL_ROBOSUITE = f"pip install --no-deps robosuite=={ROBOSUITE}"
@@ -134,8 +133,7 @@ def _cache_file() -> Path:
     source = Path(__file__).read_bytes()
     versions = robosuite_version() + importlib.metadata.version("fast-simplification")
     key = hashlib.sha256(source + versions.encode()).hexdigest()[:16]
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return root / "lerobot_memobench" / f"panda-{key}.npz"
+    return cache_folder() / f"panda-{key}.npz"
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import json
 import logging
 import os
@@ -33,6 +34,7 @@ from lerobot_memobench.datasets.feature_cache.layout import (
     DONE_FILE,
     FOLDER,
     FORMAT,
+    HASHES_FILE,
     META_FILE,
     TEXTS_FILE,
     TOKENS_FILE,
@@ -43,7 +45,7 @@ from lerobot_memobench.datasets.feature_cache.layout import (
     texts_file,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import FULL, draft_of, free_bytes, in_words, read_json, remove_drafts, write_file
+from lerobot_memobench.io import FULL, draft_of, file_hash, free_bytes, in_words, read_json, remove_drafts, write_file
 from lerobot_memobench.jobs.processes import taking_turns
 from lerobot_memobench.jobs.threads import cores
 
@@ -157,6 +159,7 @@ def build_feature_cache(
                 reserve(folder / TOKENS_FILE, wanted.bytes)
                 _add_embeddings(folder, begun, texts)
             _encode(folder, begun, table, frames, read, batch_size, workers or min(cores(), MOST_THREADS), progress)
+            _write_hashes(folder, replace(begun, complete=True), kept=begun.complete)
             _write_meta(folder, replace(begun, complete=True))
     return folder
 
@@ -320,7 +323,22 @@ def _write_done(folder: Path, done: np.ndarray) -> None:
 
 
 def _write_meta(folder: Path, meta: CacheMeta) -> None:
-    _write_json(folder / META_FILE, asdict(meta))
+    write_file(folder / META_FILE, _meta_text(meta))
+
+
+def _meta_text(meta: CacheMeta) -> str:
+    return json.dumps(asdict(meta), indent=1)
+
+
+def _write_hashes(folder: Path, meta: CacheMeta, *, kept: bool) -> None:
+    """Write the hash of every file of a complete cache; those there are ``kept`` where only texts came since."""
+    path = folder / HASHES_FILE
+    earlier: dict[str, str] = {}
+    with contextlib.suppress(FileNotFoundError):
+        earlier = read_json(path, dict[str, str], f"delete {folder}, and it is made again") if kept else {}
+    names = {file.name for file in folder.iterdir() if file.name not in (META_FILE, HASHES_FILE)}
+    hashes = {name: earlier.get(name) or file_hash(folder / name) for name in sorted(names)}
+    _write_json(path, hashes | {META_FILE: hashlib.sha256(_meta_text(meta).encode()).hexdigest()})
 
 
 def _save_embeddings(path: Path, unique: list[str], texts: TextEncoder) -> None:

@@ -15,7 +15,12 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.lerobot_format.layout import check_clock, naming_damage, undamaged
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    check_clock,
+    naming_damage,
+    undamaged,
+    without_pattern,
+)
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import OBS_PHASE
 
@@ -180,7 +185,7 @@ def frame_reader(root: Path, camera: str) -> FrameReader:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     with naming_damage(root):
-        meta = LeRobotDatasetMetadata(root.name, root=root)
+        meta = LeRobotDatasetMetadata(root.name, root=without_pattern(root))
     if not meta.camera_keys:
         raise MemobenchError(
             f"{root} holds no pictures, which a detector and perception=pixels need; name a dataset with pictures, or "
@@ -233,7 +238,7 @@ def _image_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> Fram
     """Reader of datasets that keep images in their tables."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    dataset = LeRobotDataset(root.name, root=root)
+    dataset = LeRobotDataset(root.name, root=without_pattern(root))
     starts = meta.episodes["dataset_from_index"]
     lock = threading.Lock()
 

@@ -12,11 +12,13 @@ Layout of ``<dataset>/feature_cache/<name>/``, or of ``<name>/`` in a folder tha
     subgoal-<level>.npy  int32 (frames,): row of texts.json for the frame's subgoal, -1 for none
     texts.json, texts.npy    the unique subgoals and their embeddings, float32 (texts, d_t)
     texts-<hash>.npy         their embeddings by a text encoder that was used later
+    hashes.json     sha256 of each of these files, written when they are complete
     memory.npy, memory.json    int32 (frames,): row of the frame's oracle memory text; the unique texts
 """
 
 from __future__ import annotations
 
+import glob
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,11 +27,12 @@ from typing import Any, TypedDict, get_type_hints
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import read_json, short
+from lerobot_memobench.io import file_hash, file_name, read_json, short
 
 FOLDER = "feature_cache"
 FORMAT = 2
 META_FILE, TOKENS_FILE, DONE_FILE, TEXTS_FILE = "meta.json", "tokens.bin", "done.npy", "texts.json"
+HASHES_FILE = "hashes.json"
 _SAMPLE = 1 << 16
 """Bytes of a video read for its fingerprint, at its start, middle and end."""
 
@@ -115,6 +118,24 @@ def readable_meta(root: Path, name: str, place: Path | None = None) -> CacheMeta
         return None
 
 
+def check_cache(folder: Path) -> str | None:
+    """Compare the files of a complete cache with their hashes; return a note where it has none.
+
+    Raises:
+        MemobenchError: one of them is missing or damaged.
+    """
+    advice = f"delete {folder}, and it is made again"
+    try:
+        hashes = read_json(folder / HASHES_FILE, dict[str, str], advice)
+    except FileNotFoundError:
+        return "it is not complete, or an earlier version made it, without hashes: it was not checked"
+    for name, wanted in hashes.items():
+        path = folder / file_name(name, f"a file in {folder / HASHES_FILE}")
+        if not path.is_file() or file_hash(path) != wanted:
+            raise MemobenchError(f"{name} is missing, or not as it was written; {advice}")
+    return None
+
+
 def find_cache(
     root: Path, prefix: str, *, frames_key: str, camera: str, stride: int, place: Path | None = None
 ) -> Path:
@@ -126,8 +147,9 @@ def find_cache(
         place: folder that holds caches, of several datasets perhaps; the one beside the dataset when None.
     """
     if place is not None:
-        parts = [dataset_fingerprint(root, camera), frames_key, camera, str(stride)]
-        return place / f"{root.resolve().name}-{prefix}-{_short(*parts)}"
+        ends = f"{prefix}-{_short(dataset_fingerprint(root, camera), frames_key, camera, str(stride))}"
+        same = sorted(place.glob(f"*-{glob.escape(ends)}"))  # of a dataset that had another name, or of a copy of it
+        return same[0] if same else place / f"{root.resolve().name}-{ends}"
     folder = root / FOLDER / f"{prefix}-{_short(frames_key, camera, str(stride))}"
     earlier = None if folder.exists() else readable_meta(root, prefix)  # versions before the hash
     if earlier is not None and earlier.mismatch({"frames_key": frames_key, "camera": camera, "stride": stride}) is None:

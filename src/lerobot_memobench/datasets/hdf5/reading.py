@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -16,7 +17,7 @@ from annotated_types import Len
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Number, Whole, checked, parsed, refusing
+from lerobot_memobench.io import Count, Malformed, Number, Whole, check_fetched, checked, parsed, refusing
 from lerobot_memobench.protocol import ACTION_DIM
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ class PublishedFile:
         except FileNotFoundError:
             raise Unusable("there is no such file") from None
         except OSError as error:
-            raise Unusable(f"it is no HDF5 file, or was cut off ({first_line(error)})") from None
+            raise Unusable(_not_opened(path, error)) from None
         try:
             data = self._file.get("data")
             if not isinstance(data, h5py.Group):
@@ -180,13 +181,15 @@ class PublishedFile:
     def _read(self, name: str) -> PublishedDemo:
         import h5py
 
-        group = self._data[name]
+        group = self._data.get(name)
+        if group is None:
+            raise Unusable(f"the group {_missing(self._data, name)}")
         if demo_number(name) is None or not isinstance(group, h5py.Group):
             raise Unusable("it is no group demo_<number>")
         states = array(group, "states", (None, None), np.float64)
         actions = array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
         if not isinstance(group.get("obs"), h5py.Group):
-            raise Unusable("the group 'obs' is missing")
+            raise Unusable(f"the group {_missing(group, 'obs')}")
         images = {
             image: array(group, f"obs/{image}", (None, None, None, 3), np.uint8) for image in IMAGE_NAMES.values()
         }
@@ -231,11 +234,34 @@ class PublishedFile:
 # --- parts of a file, each checked ---
 
 
+def _not_opened(path: Path, error: OSError) -> str:
+    """Return why a file is not opened: HDF5 answers a lock and a pointer as it answers damage."""
+    try:
+        check_fetched(path)
+    except (MemobenchError, OSError) as reason:
+        return str(reason)
+    if error.errno in (errno.EAGAIN, errno.EACCES) or "unable to lock" in str(error):
+        return f"it is locked or may not be read ({first_line(error)}); end the program that writes it, then go on"
+    return f"it is no HDF5 file, or was cut off ({first_line(error)})"
+
+
+def _missing(group: h5py.Group, name: str) -> str:
+    """Return what stands in the place of an array or a group that is not there."""
+    import h5py
+
+    link = group.get(name, getlink=True)
+    if isinstance(link, h5py.ExternalLink):
+        return (
+            f"{name!r} is a link into the file {link.filename!r}, which cannot be opened; put that file beside this one"
+        )
+    return f"{name!r} is missing"
+
+
 def _check_layout(data: h5py.Group) -> None:
     """Say of a file of LIBERO or robomimic, whose layouts are near to the published one, what it lacks."""
     import h5py
 
-    first = next((data[name] for name in data if demo_number(name) is not None), None)
+    first = next((data.get(name) for name in data if demo_number(name) is not None), None)
     obs = first.get("obs") if isinstance(first, h5py.Group) else None
     if first is None or not isinstance(obs, h5py.Group) or "meta_data" in first.attrs:
         return
@@ -309,7 +335,7 @@ def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: 
 
     found = group.get(name)
     if not isinstance(found, h5py.Dataset):
-        raise Unusable(f"the array {name!r} is missing")
+        raise Unusable(f"the array {_missing(group, name)}")
     if found.dtype not in [np.dtype(dtype) for dtype in dtypes]:
         expected = " or ".join(str(np.dtype(dtype)) for dtype in dtypes)
         raise Unusable(f"{name} has type {found.dtype}, expected {expected}")

@@ -20,6 +20,7 @@ from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.reading import SUFFIX
 from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format.card import write_card
+from lerobot_memobench.datasets.lerobot_format.files import written_files
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
     EPISODE_INFO,
@@ -47,6 +48,7 @@ from lerobot_memobench.datasets.staging import (
 from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name, write_file
+from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.protocol import CAMERAS, CLOCK, CONTROL_HZ
 
 if TYPE_CHECKING:
@@ -75,17 +77,19 @@ def write_dataset(
     out = Path(out)
     check_destination(out)
     staging = out / STAGING
-    shutil.rmtree(staging, ignore_errors=True)
-    try:
-        staged = [
-            stage_demonstration(demo, staging / "episodes" / f"{number:06d}")
-            for number, demo in enumerate(demonstrations)
-        ]
-        return assemble(staged, out, repo_id=repo_id, made_by=made_by)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        if out.is_dir() and not any(out.iterdir()):
-            out.rmdir()
+    episodes = staging / "episodes"
+    staging.mkdir(parents=True, exist_ok=True)
+    with locked(staging, out):
+        try:
+            shutil.rmtree(episodes, ignore_errors=True)
+            staged = [
+                stage_demonstration(demo, episodes / f"{number:06d}") for number, demo in enumerate(demonstrations)
+            ]
+            return assemble(staged, out, repo_id=repo_id, made_by=made_by)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+            if out.is_dir() and not any(out.iterdir()):
+                out.rmdir()
 
 
 def assemble(
@@ -176,7 +180,7 @@ def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
 
 
 def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], build: Path) -> None:
-    """Write the hashes of all episodes asked for; failed ones have a reason in place of an index."""
+    """Write the hashes of all files and episodes asked for; failed ones have a reason in place of an index."""
     keys = ("task_name", "seed", "referent", "variant", "success", "frames", "scene_hash", "digest")
     rows, index = [], 0
     for episode in episodes:
@@ -184,7 +188,8 @@ def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], bu
         row |= {"episode_index": None if episode.failure else index, "failure": episode.failure}
         index += episode.failure is None
         rows.append(row)
-    write_file(build / MANIFEST_FILE, json.dumps(extra | {"episodes": rows}, indent=1), durable=True)
+    content = extra | {"episodes": rows, "files": written_files(build)}
+    write_file(build / MANIFEST_FILE, json.dumps(content, indent=1), durable=True)
 
 
 def _move(build: Path, out: Path) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import json
 import math
+import os
+import shlex
 import traceback
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
@@ -17,7 +21,18 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
 from lerobot_memobench.datasets.staging import STAGING
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Whole, count_of, first_fault, parsed, read_json, refusing
+from lerobot_memobench.io import (
+    Count,
+    Malformed,
+    Whole,
+    cache_folder,
+    check_fetched,
+    count_of,
+    first_fault,
+    parsed,
+    read_json,
+    refusing,
+)
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
 
 DEFAULT_REPO_ID = "memobench/memobench"
@@ -43,6 +58,7 @@ PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", 
 ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
 ADVICE = "the dataset is damaged; generate it or take it from its source again"
 NO_MANIFEST = "it is no manifest that this package wrote; take the dataset from its source again"
+EARLIER_FORMATS = ("v1.6", "v2.0", "v2.1")
 MOST_NUMBERS = 50_000_000
 """Of a feature in one frame: a picture of 4096 x 4096. LeRobot takes memory for as many as a dataset tells."""
 
@@ -56,6 +72,8 @@ def check_destination(out: Path) -> None:
     """Raise unless ``out`` is absent, empty, or holds nothing but an unfinished run."""
     if is_dataset(out):
         raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
+    if ":" in str(out) and not out.is_absolute():
+        raise MemobenchError(f"{out} holds a colon, which Arrow reads as an address; name it by its whole path")
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
     # What an interrupted move left beside the staging folder will be replaced.
@@ -152,6 +170,12 @@ def read_info(folder: Path) -> dict[str, Any]:
         found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
     except FileNotFoundError:
         raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
+    if found["codebase_version"] in EARLIER_FORMATS:
+        raise MemobenchError(
+            f"{folder} is in LeRobot's format {found['codebase_version']}, and v3.0 is read; convert it in place, from "
+            f"v2.1: python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/converted "
+            f"--root={shlex.quote(str(folder))} --push-to-hub=false"
+        )
     for name, feature in found["features"].items():
         shape = feature.get("shape")
         sizes = [size for size in shape if isinstance(size, int)] if isinstance(shape, list) else []
@@ -289,13 +313,21 @@ class LeftOut(TypedDict):
     reason: str
 
 
+class Written(TypedDict):
+    """A file as it was written."""
+
+    bytes: Count
+    sha256: str
+
+
 class Manifest(TypedDict):
-    """``manifest.json``: the request of a run, and the hash of every episode."""
+    """``manifest.json``: the request of a run, and the hash of every episode and file."""
 
     episodes: list[Made | Failed]
     request: NotRequired[dict[str, Any]]
     left_out: NotRequired[list[LeftOut]]
     notes: NotRequired[list[LeftOut]]
+    files: NotRequired[dict[str, Written]]
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -309,12 +341,28 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return found
 
 
+def without_pattern(folder: Path) -> Path:
+    """Return a path of a dataset's folder for LeRobot, which takes names such as ``obj [v2]`` for patterns of `glob`.
+
+    It is the folder itself, or a link to it in the cache: the same at every call, since LeRobot keeps a copy of the
+    tables for each path.
+    """
+    place = str(folder.absolute())
+    if glob.escape(place) == place or not folder.is_dir():
+        return folder
+    link = cache_folder() / "datasets" / hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
+    link.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        link.symlink_to(place)
+    return link
+
+
 # --- is it whole? ---
 
 
 def undamaged(folder: Path) -> AbstractContextManager[None]:
     """As `refusing`, for reading the dataset in ``folder``."""
-    return refusing(lambda why: MemobenchError(f"{folder} cannot be read ({why}); {ADVICE}"))
+    return refusing(lambda why: MemobenchError(f"{folder} cannot be read ({why}); {ADVICE}"), folder)
 
 
 def check_whole(folder: Path) -> None:
@@ -359,6 +407,7 @@ def _check_video(path: Path, frames: int) -> None:
     """Raise unless a video's boxes fill its file, and it tells of at least so many frames."""
     import av
 
+    check_fetched(path)
     size, place = path.stat().st_size, 0
     with path.open("rb") as file:
         while path.suffix == ".mp4" and place < size:
@@ -377,9 +426,6 @@ def _check_video(path: Path, frames: int) -> None:
 
 def damaged_file(folder: Path) -> str | None:
     """Read all of a dataset; return a sentence that names the first file that cannot be, None where all can."""
-    import av
-    import pyarrow.parquet as pq
-
     for name in (STATS_FILE, TASKS_FILE):
         if not (folder / name).is_file():
             return f"{folder / name} is missing; {ADVICE}"
@@ -390,18 +436,32 @@ def damaged_file(folder: Path) -> str | None:
     tables = sorted([*folder.glob("data/**/*.parquet"), *folder.glob("meta/**/*.parquet")])
     for path in [*tables, *sorted(folder.glob("videos/**/*.mp4"))]:
         try:
-            with undamaged(path):
-                if path.suffix == ".parquet":
-                    pq.read_table(path)
-                    continue
-                _check_video(path, 0)
-                with av.open(str(path)) as container:
-                    container.streams.video[0].codec_context.options = {"err_detect": "explode"}
-                    for _ in container.decode(video=0):
-                        pass
+            read_to_end(path)
         except MemobenchError as error:
             return str(error)
     return None
+
+
+def read_to_end(path: Path) -> None:
+    """Read all values of a table, or decode all pictures of a video.
+
+    Raises:
+        MemobenchError: one of them cannot be read.
+    """
+    import av
+    import pyarrow.parquet as pq
+
+    with undamaged(path):
+        if path.suffix == ".parquet":
+            pq.read_table(path)
+            return
+        _check_video(path, 0)
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            stream.codec_context.options = {"err_detect": "explode"}
+            decoded = sum(1 for _ in container.decode(stream))
+            if stream.frames and decoded != stream.frames:
+                raise MemobenchError(f"{path} has {stream.frames} frames, and {decoded} can be decoded; {ADVICE}")
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from importlib import resources
@@ -27,11 +27,14 @@ from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_s
 from lerobot_memobench.evaluation.memory_reads import Chunk, find_reads
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.evaluation.records import Run, read_runs
-from lerobot_memobench.io import draft_of, file_name, parsed, write_file
+from lerobot_memobench.io import draft_of, file_name, parsed, read_json, short, write_file
+from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.tasks.catalogue import task_names
 
 PAGE = "index.html"
-VIDEOS = "videos"
+VIDEOS, VIDEO = "videos", ".mp4"
+PLACED = "placed.json"
+"""Addresses of the videos that a report has placed, beside its page: a later report removes these, and no others."""
 LEROBOT_INFO = "eval_info.json"
 SCRIPTS = (
     "dom",
@@ -88,7 +91,7 @@ def write_html(
     evaluations = read_runs(folders)
     for run, slug in zip(evaluations, _slugs([run.name for run in evaluations]), strict=True):
         found, notes = find_videos(run.folder, run.records)
-        names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}.mp4" for k in found}
+        names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}{VIDEO}" for k in found}
         chosen |= {out / name: found[k] for k, name in names.items()}
         addresses.append(names)
         read, misfits = find_reads(run.folder, run.records, run.protocol)
@@ -96,11 +99,15 @@ def write_html(
         runs.append(replace(run, notes=(*run.notes, *notes, *misfits)))
     text = page(page_data(runs, addresses, task_source(task_dir), reads), title=", ".join(run.name for run in runs))
     out.mkdir(parents=True, exist_ok=True)
-    if not (out / PAGE).exists():
-        write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on
-    place_videos(chosen, link)
-    write_file(out / PAGE, text)
-    _remove_others(out / VIDEOS, chosen)
+    with locked(out, out):
+        if not (out / PAGE).exists():
+            write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on
+        placed, earlier = {name for each in addresses for name in each.values()}, _placed(out)
+        _note_placed(out, earlier | placed)
+        place_videos(chosen, link)
+        write_file(out / PAGE, text)
+        _remove_videos(out, earlier - placed)
+        _note_placed(out, placed)
     return Written(
         page=out / PAGE,
         rollouts=sum(len(run.records) for run in runs),
@@ -123,9 +130,15 @@ def _slugs(names: Sequence[str]) -> list[str]:
 
 
 def _check_target(out: Path) -> None:
-    """Refuse to write among files that are not a report's."""
+    """Refuse to write among files that are not a report's, or through a link that leads out of it."""
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"--out {out} is a file; name a folder")
+    for folder in (out / VIDEOS, *(out / VIDEOS).glob("*")):
+        if folder.is_symlink():
+            raise MemobenchError(
+                f"{folder} is a link, and a report writes and removes videos there; remove the link, or name another "
+                "folder by --out"
+            )
     if not out.is_dir() or not any(out.iterdir()):
         return
     head = ""
@@ -136,16 +149,39 @@ def _check_target(out: Path) -> None:
         raise MemobenchError(f"--out {out} holds files that are no earlier report; name a new or an empty folder")
 
 
-def _remove_others(folder: Path, kept: Collection[Path]) -> None:
-    """Remove videos of an earlier report in this place, and folders that this leaves empty."""
-    for path in sorted(folder.rglob("*"), reverse=True):
-        if path.is_dir() and not path.is_symlink():
-            if not any(path.iterdir()):
-                path.rmdir()
-        elif path not in kept:
+def _placed(out: Path) -> set[str]:
+    """Return the addresses of videos that an earlier report placed; none of a report that did not list them.
+
+    Raises:
+        MemobenchError: the list leads elsewhere.
+    """
+    advice = f"remove {out / PLACED}"
+    try:
+        names: list[str] = read_json(out / PLACED, list[str], advice)
+    except FileNotFoundError:
+        return set()
+    for name in names:
+        folder, *parts = name.split("/")
+        if folder != VIDEOS or len(parts) != 2 or not all(map(_names_a_file, parts)) or not name.endswith(VIDEO):
+            raise MemobenchError(f"{out / PLACED} lists {short(name)}, which is no video of a report; {advice}")
+    return set(names)
+
+
+def _note_placed(out: Path, names: Iterable[str]) -> None:
+    if found := sorted(names):
+        write_file(out / PLACED, json.dumps(found, indent=0) + "\n")
+    else:
+        (out / PLACED).unlink(missing_ok=True)
+
+
+def _remove_videos(out: Path, names: Iterable[str]) -> None:
+    """Remove videos of an earlier report, and folders that this leaves empty."""
+    for path in (out / name for name in names):
+        if path.is_file() or path.is_symlink():
             path.unlink()
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+        for folder in (path.parent, out / VIDEOS):
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
 
 
 # --- videos ---

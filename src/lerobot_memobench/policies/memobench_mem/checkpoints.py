@@ -28,11 +28,11 @@ from lerobot_memobench.policies.checkpoint import (
     statistics_shapes,
     undamaged,
 )
+from lerobot_memobench.policies.memobench_mem.average import WeightAverage, states_of
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.fusion import plain_name
 from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
-from lerobot_memobench.policies.memobench_mem.training import WeightAverage
 
 logger = logging.getLogger(__name__)
 
@@ -68,33 +68,53 @@ def remembers_otherwise(config: MemobenchMemConfig, trained: MemobenchMemConfig)
     return any(getattr(config, name) != getattr(trained, name) for name in makes)
 
 
+def restarted(policy: nn.Module, trained: MemobenchMemConfig) -> set[str]:
+    """Return the names of the policy's tensors that a checkpoint does not decide, because they have another meaning.
+
+    These are the memory with its fusion where the memory is another one, and the alignment head where the memory, the
+    objective or the text encoder is.
+
+    Args:
+        trained: the checkpoint's configuration.
+    """
+    config, model = cast(MemobenchMemConfig, policy.config), cast(MemoryPI05, policy.model)
+    if remembers_otherwise(config, trained):
+        return _head(policy) | {f"model.{name}" for name in model.memory_names()}
+    return set() if (config.align, config.text_encoder) == (trained.align, trained.text_encoder) else _head(policy)
+
+
+def _head(policy: nn.Module) -> set[str]:
+    return {name for name in policy.state_dict() if name.startswith("alignment.")}
+
+
+def name_here(policy: nn.Module, name: str, trained: MemobenchMemConfig) -> str:
+    """Return the name in a policy of a tensor of a checkpoint: another fusion nests pi0.5's modules differently."""
+    begins = ("model.memory.position.", "model.memory.project.")
+    if trained.memory == "frames" and name.startswith(begins):  # without a pool, its encoder was the memory itself
+        name = name.replace("model.memory.", "model.memory.encoder.")
+    if name.startswith("model.") and remembers_otherwise(cast(MemobenchMemConfig, policy.config), trained):
+        name = f"model.{cast(MemoryPI05, policy.model).place_of(plain_name(name.removeprefix('model.')))}"
+    return name
+
+
 def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: MemobenchMemConfig) -> None:
     """Load the weights of checkpoint ``source`` into a policy of this kind; its alignment heads may be missing.
 
     Args:
-        trained: the checkpoint's configuration. A memory that is another one than there begins anew, and is named.
+        trained: the checkpoint's configuration. `restarted` parts keep their initial weights, and a warning names them.
 
     Raises:
         MemobenchError: they cannot be read, do not fit, or bring no memory to a policy of the same.
     """
-    weights = read_tensors(path)
-    if trained.memory == "frames":  # all that there was; a package's memory may have layers of the old names
-        weights = _today(weights)
-    config, model = cast(MemobenchMemConfig, policy.config), cast(MemoryPI05, policy.model)
+    config, new = cast(MemobenchMemConfig, policy.config), restarted(policy, trained)
     begins = ["base_weights"] if remembers_otherwise(config, trained) else ["base_weights", "open_gate"]
     for name, asked, held in differing(config, trained, begins):
         raise MemobenchError(
             f"--policy.{name}={asked} would do nothing: it decides how weights begin, and those of '{source}' "
             f"({name}={held}) go on; leave {name} out, or train from scratch."
         )
-    # A run may change the objective of the one it goes on from; its heads then start anew.
-    new = {name for name in policy.state_dict() if name.startswith("alignment.")}
+    weights = {name_here(policy, name, trained): tensor for name, tensor in read_tensors(path).items()}
     if remembers_otherwise(config, trained):
-        own = model.memory_names()
-        new |= {f"model.{name}" for name in own}
-        plain = {plain_name(name.removeprefix("model.")): tensor for name, tensor in weights.items()}
-        weights = {f"model.{model.place_of(name)}": tensor for name, tensor in plain.items()}
-        weights = {name: tensor for name, tensor in weights.items() if name not in new}
         logger.warning(
             "'%s' was trained with memory=%s, and this is memory=%s%s: of the latter and of how actions read it, %d "
             "tensors begin anew; all others go on. A frame is written every %d control steps.",
@@ -102,7 +122,7 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             trained.memory,
             config.memory,
             "" if config.memory != trained.memory else " with other settings",
-            len(own),
+            len(new - _head(policy)),
             config.memory_stride,
         )
     elif config.memory != NONE and not any(name.startswith("model.memory.") for name in weights):
@@ -112,16 +132,8 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
         )
     else:
         require_phase(weights, policy.state_dict(), source)
-    load_exactly(policy, weights, source, optional=new)
-
-
-def _today(weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the weights of `Frames` by today's names: without a pool, its encoder was the memory itself."""
-    begins = ("model.memory.position.", "model.memory.project.")
-    return {
-        name.replace("model.memory.", "model.memory.encoder.") if name.startswith(begins) else name: tensor
-        for name, tensor in weights.items()
-    }
+    weights = {name: tensor for name, tensor in weights.items() if name not in new}
+    load_exactly(policy, weights, source, optional=new | _head(policy))
 
 
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
@@ -130,17 +142,27 @@ def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
 
 
-def restore_average(average: WeightAverage, source: str | Path, revision: str | None) -> WeightAverage | None:
-    """Go on with a checkpoint's trained weights and their average; None where it has none.
+def restore_average(
+    policy: nn.Module, average: WeightAverage, source: str | Path, trained: MemobenchMemConfig, revision: str | None
+) -> WeightAverage | None:
+    """Load a checkpoint's trained weights and their average into a policy that holds the average; None without them.
 
-    What the checkpoint did not train (another objective's head, a part that was frozen) begins its average anew.
+    The average of `restarted` parts, and of parts that the checkpoint did not train, begins with their present weights.
+
+    Raises:
+        MemobenchError: they cannot be read, or do not fit.
     """
     path = checkpoint_file(source, TRAINING_FILE, revision)
     if path is None:
         return None
     with undamaged(path), safe_open(path, framework="pt") as file:
         metadata = file.metadata()
-    new = average.restore(read_tensors(path), metadata)
+    held = {name_here(policy, name, trained): one for name, one in states_of(read_tensors(path), metadata).items()}
+    states = {name: held[name] for name in held.keys() & average.parameters.keys() - restarted(policy, trained)}
+    wrong = sorted(name for name, one in states.items() if one.weights.shape != average.parameters[name].shape)
+    if wrong:
+        raise MemobenchError(f"{path} holds another shape of '{wrong[0]}' than this policy; copy the checkpoint again.")
+    new = average.restore(states)
     if new:
         logger.info("The average goes on from '%s'; that of %s begins anew.", source, ", ".join(new))
     return average

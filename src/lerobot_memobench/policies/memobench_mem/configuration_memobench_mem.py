@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import math
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from huggingface_hub.constants import CONFIG_NAME
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig, parser
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
@@ -25,6 +26,7 @@ from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
+from lerobot_memobench.policies.memobench_mem.inherited import MEMORY_FRAMES, of_another_memory
 from lerobot_memobench.policies.memobench_mem.memory import (
     NONE,
     OURS,
@@ -52,7 +54,6 @@ PROMPTED = "prompted"
 TOKENS_PER_FRAME = {"pixels": MEMORY_GRID**2, "objects": 2}
 MEMORY_STRIDE, FRAMES_PER_EPISODE = 8, 6
 """Where training decodes no video; 1 elsewhere."""
-MEMORY_FRAMES = 32
 ORACLE_TOKENS = 128
 """Room that oracle memory text needs in a prompt of the word tokenizer: six memory checkpoints of some ten words."""
 
@@ -491,6 +492,9 @@ class MemobenchMemConfig(PI05Config):
 
     def _complete_memory(self) -> None:
         """Set and check what makes the memory."""
+        if parser.parse_arg("policy.memory") == (self.memory or "null"):
+            for name, default in of_another_memory().items():
+                setattr(self, name, copy.copy(default))
         if self.memory in (None, "frames"):  # the default, as a recipe or checkpoint may name it
             self.memory = NONE if self.memory_fusion == NONE else "frames"
         if self.memory == NONE:

@@ -58,6 +58,10 @@ class ObservationEncoder(ABC):
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
         """Return the stored tokens (n, P, D') of some rows of an observation; nothing in them learns."""
 
+    def observed(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return a batch as a policy observes it while it learns, with the errors of its sensors."""
+        return batch
+
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts | None:
         """Return the parts of a batch of present observations; None where they are LeRobot's images."""
         return None

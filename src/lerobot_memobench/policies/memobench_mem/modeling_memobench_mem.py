@@ -7,6 +7,7 @@ The policy from its construction to an update (``forward``) and to an action (``
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,6 +22,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
@@ -28,6 +30,7 @@ from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_resumed, check_weights
 from lerobot_memobench.policies.compatibility import PICTURE_STEP, cure, require_fresh
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
+from lerobot_memobench.policies.memobench_mem.average import WeightAverage
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     TRAINING_FILE,
@@ -51,6 +54,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     AHEAD,
     CHOICES,
+    EXACT,
     FRAMES,
     PHASE,
     PLACES,
@@ -71,7 +75,6 @@ from lerobot_memobench.policies.memobench_mem.sharding import check_adapters, pr
 from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
 from lerobot_memobench.policies.memobench_mem.training import (
     TrainingCurve,
-    WeightAverage,
     counted_actions,
     is_first_rank,
     losses_of,
@@ -159,6 +162,7 @@ class MemobenchMemPolicy(PI05Policy):
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
         self.average: WeightAverage | None = None
+        self.register_load_state_dict_post_hook(_restart_average)
         self.run: TrainingRun | None = None
         self.curve = TrainingCurve()
         self.rollout = Rollout(self._remembers, config.memory_stride)
@@ -249,7 +253,8 @@ class MemobenchMemPolicy(PI05Policy):
         """Return the loss of the actions plus the weighted alignment on a preprocessed training batch.
 
         A loss that is only measured (lerobot-train's ``eval_loss``: not training, no gradients) is that of the averaged
-        weights, which a checkpoint holds and rollouts act by.
+        weights, which a checkpoint holds and rollouts act by. There actions follow the subgoal that a privileged memory
+        chooses, and its own losses compare with the true one.
 
         Args:
             batch: what LeRobot's pi0.5 needs, and ``memory.*`` and ``phase`` as the preprocessor adds them.
@@ -264,6 +269,7 @@ class MemobenchMemPolicy(PI05Policy):
             MemobenchError: the batch has no memory, or pictures where it should have their tokens.
         """
         self._require_memory(batch)
+        batch = self.perception.observed(batch)
         if self.averages and self.average is None and self.training:
             self.average = WeightAverage(self.trained_parameters(), self.config.ema_decay)
         measures = not self.training and not torch.is_grad_enabled()
@@ -271,6 +277,8 @@ class MemobenchMemPolicy(PI05Policy):
         computing = self._acting() if measures else self.precision.computing(self._device)
         with computing, quick_products() if quick else contextlib.nullcontext():
             memory = self.read_memory(batch)
+            if measures and self.config.privileged_memory:  # whose losses are of the labels, and actions of its choice
+                memory = self.read_memory(_without_labels(batch))
             per_sample, total, logged = self._action_loss(batch)
             for name, loss in self._memory_losses(batch).items():
                 per_sample, total = per_sample + loss, total + loss.mean()
@@ -311,7 +319,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Read what the samples of a batch remember, and hand it to the model; None without a memory."""
         if self.model.memory is None:
             return None
-        parts = batch[FRAMES], batch[STEPS], batch[PLACES], batch.get(SUBGOALS), batch.get(AHEAD)
+        parts = batch[FRAMES], batch[STEPS], batch[PLACES], batch.get(SUBGOALS), batch.get(AHEAD), batch.get(EXACT)
         histories = Histories(*parts).to(self._device)
         memory = self.model.memory.replay(histories, self._query(batch))
         self.model.set_memory(memory)
@@ -471,7 +479,7 @@ class MemobenchMemPolicy(PI05Policy):
         words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
         with self._acting():
             if training:
-                self.read_memory({name: value for name, value in batch.items() if name not in (SUBGOAL, SUBGOALS)})
+                self.read_memory(_without_labels(batch))
             elif self._remembers:
                 self._require_history(rows)
                 memory = self.remembered(batch, rows)
@@ -624,7 +632,7 @@ class MemobenchMemPolicy(PI05Policy):
             return policy
         if policy.averages:
             average = WeightAverage(policy.trained_parameters(), policy.config.ema_decay)
-            policy.average = restore_average(average, source, revision)
+            policy.average = restore_average(policy, average, source, trained, revision)
         policy.curve = TrainingCurve.read(Path(source))
         policy._begin_training(dataset_meta)
         return policy
@@ -648,6 +656,19 @@ class MemobenchMemPolicy(PI05Policy):
         if writes:
             tensors, metadata = self.average.state()
             save_file(tensors, save_directory / TRAINING_FILE, metadata=metadata)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> MemobenchMemPolicy:
+        """Return a copy with weights, average and rollout of its own; it shares the run that it is trained in.
+
+        The copy has no graph of the last pass: `backward` goes through the original.
+        """
+        made = self.__new__(type(self))
+        memo[id(self)] = made
+        with _WithoutGraph():
+            made.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        if made.run is not None and made.attends_fused:
+            attend_fused(made.model)
+        return made
 
     # -- adapters --------------------------------------------------------------------------------------------------
 
@@ -678,6 +699,27 @@ class MemobenchMemPolicy(PI05Policy):
         names = [name for name, _ in self.named_modules()]
         own = [end for end in OWN_MODULES if any(name == end or name.endswith(f".{end}") for name in names)]
         return [*asked, *(end for end in own if end not in set(asked))]
+
+
+def _restart_average(policy: Any, keys: Any) -> None:
+    """Begin the average of loaded weights at these, so that the policy acts by them."""
+    if policy.average is not None:
+        missing = set(keys.missing_keys)
+        policy.average.begin({name: one for name, one in policy.trained_parameters().items() if name not in missing})
+
+
+class _WithoutGraph(TorchFunctionMode):
+    """Copy tensors that autograd made as plain tensors, where torch refuses to copy them."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is Tensor.__deepcopy__ and not args[0].is_leaf:
+            return args[0].detach().clone()
+        return func(*args, **(kwargs or {}))
+
+
+def _without_labels(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return a batch without the true subgoals, by which a privileged memory chooses as in a rollout."""
+    return {name: value for name, value in batch.items() if name not in (SUBGOAL, SUBGOALS)}
 
 
 def _column(batch: dict[str, Tensor], key: str) -> list[int] | None:

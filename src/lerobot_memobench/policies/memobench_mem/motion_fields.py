@@ -18,7 +18,6 @@ import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.detection_noise import with_detection_noise
 from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL, ObservationEncoder
 from lerobot_memobench.policies.memobench_mem.objects import CLASS_DIM, HAND_DIM, MIDDLE, PER_METRE, ObjectEncoder
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
@@ -35,10 +34,6 @@ class MotionField(nn.Module, ABC):
     cells: int
     numbers: int
     moved: int
-
-    def observed(self, frames: Tensor) -> Tensor:
-        """Return stored frames (N, 1, D') as a training sees them in its past."""
-        return frames
 
     @abstractmethod
     def between(self, before: Tensor, now: Tensor) -> Tensor:
@@ -60,7 +55,7 @@ class MotionField(nn.Module, ABC):
 def motion_field(observations: ObservationEncoder, width: int, pairs: int = 8) -> MotionField:
     """Return the motion field of what an encoder stores of a frame; ``pairs`` is h, ``width`` W."""
     if isinstance(observations, ObjectEncoder):
-        return ObjectMotion(observations.order, observations.kinds, width, pairs, observations.noise)
+        return ObjectMotion(observations.order, observations.kinds, width, pairs)
     return PictureMotion(width, pairs)
 
 
@@ -157,26 +152,18 @@ class ObjectMotion(MotionField):
     A cell's numbers are its motion, whether it is known, its class, and its place. Hand: class ``kinds``.
 
     Args:
-        order, kinds: of classes, as of `objects.SlotEncoder`. noise: size of the detection noise while it learns.
+        order, kinds: of classes, as of `objects.SlotEncoder`.
     """
 
     size, cells, numbers, moved = SIZE + HAND_DIM + 1, SLOTS + 1, MOVED + 5, MOVED
 
-    def __init__(self, order: Sequence[int], kinds: int, width: int, pairs: int, noise: float) -> None:
+    def __init__(self, order: Sequence[int], kinds: int, width: int, pairs: int) -> None:
         super().__init__()
-        self.order, self.noise = [*order, kinds], noise
+        self.order = [*order, kinds]
         self.kind = nn.Embedding(kinds + 1, CLASS_DIM)
         self.mlp = nn.Sequential(nn.Linear(MOVED + 3 + CLASS_DIM, width), nn.GELU(), nn.Linear(width, width))
         self.score = nn.Linear(width, 1)
         self.times = nn.Parameter(torch.randn(pairs, width) * 0.02)
-
-    def observed(self, frames: Tensor) -> Tensor:
-        """Add detection noise while it learns."""
-        if not (self.training and self.noise):
-            return frames
-        slots, hand, phase = frames.flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
-        noisy = with_detection_noise(slots.unflatten(1, (SLOTS, WIDTH)), hand, self.noise)
-        return torch.cat([noisy.flatten(1), hand, phase], dim=1).unsqueeze(1)
 
     def between(self, before: Tensor, now: Tensor) -> Tensor:
         """Return for each slot of the earlier frame, and for the hand, where its thing has gone."""

@@ -29,6 +29,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     PrefixParts,
     fingerprint,
 )
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES
 from lerobot_memobench.protocol import CAMERAS, OBS_PHASE
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
@@ -123,11 +124,8 @@ class ObjectPool(nn.Module):
     size, 400 updates chose the right one of three bowls at 85 % of frames, instead of at 58 %.
     """
 
-    def __init__(
-        self, order: Sequence[int], kinds: int, tokens: int, width: int, noise: float = 0.0, phase: bool = False
-    ) -> None:
+    def __init__(self, order: Sequence[int], kinds: int, tokens: int, width: int, phase: bool = False) -> None:
         super().__init__()
-        self.noise = noise
         self.slot = SlotEncoder(order, kinds, width, width)
         self.score = nn.Linear(width, tokens)
         self.phase = nn.Linear(1, width) if phase else None
@@ -136,10 +134,7 @@ class ObjectPool(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         """Return tokens (N, tokens, width) of frames (N, 1, SIZE + 6 + 1)."""
         slots, hand, phase = frames.flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
-        slots = slots.unflatten(1, (SLOTS, WIDTH))
-        if self.training and self.noise:
-            slots = with_detection_noise(slots, hand, self.noise)
-        made, there = self.slot(slots, hand)
+        made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
         score = self.score(made)
         # A finite score keeps a frame without objects finite: it becomes zeros.
         scores, values = in_slots(score, there, -1e4), in_slots(made, there)
@@ -179,6 +174,20 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         self.kinds = len(trained) + 1
         self.slot = SlotEncoder(self.order, self.kinds, 2 * width, width)
 
+    def observed(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return a training batch with detection noise: one draw for each frame, wherever it stands in the batch."""
+        if not (self.training and self.noise):
+            return batch
+        present = self.remember(batch, range(len(batch[OBS_ENV_STATE])))
+        stored = batch.get(FRAMES, present[:0]).to(present)
+        rows = torch.cat([stored, present]).flatten(1)
+        frames, where = rows[:, : SIZE + HAND_DIM].unique(dim=0, return_inverse=True)
+        slots, hand = frames.split([SIZE, HAND_DIM], dim=1)
+        noisy = with_detection_noise(slots.unflatten(1, (SLOTS, WIDTH)), hand, self.noise).flatten(1)[where]
+        seen = torch.cat([noisy, rows[:, SIZE:]], dim=1).unsqueeze(1)
+        remembered = {FRAMES: seen[: len(stored)], EXACT: stored} if FRAMES in batch else {}
+        return {**batch, **remembered, OBS_ENV_STATE: noisy[len(stored) :]}
+
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
         """Return slots and hand (B, n WIDTH + 6), and which of the n slots hold an object (B, n).
 
@@ -188,8 +197,6 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         slots = batch[OBS_ENV_STATE].to(torch.float32).unflatten(1, (SLOTS, WIDTH))
         hand = batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)
         if self.training:
-            if self.noise:
-                slots = with_detection_noise(slots, hand, self.noise)
             slots = slots[:, : max(1, int((slots[..., 0] > 0).sum(dim=1).max()))]
         return [torch.cat([slots.flatten(1), hand], dim=1)], [slots[..., 0] > 0]
 
@@ -208,7 +215,7 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
 
     def pool(self) -> nn.Module:
         """Return a pool of each frame's objects."""
-        return ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.noise, self.phase)
+        return ObjectPool(self.order, self.kinds, self.tokens_per_frame, self.dim, self.phase)
 
 
 # -- detections -------------------------------------------------------------------------------------------------------

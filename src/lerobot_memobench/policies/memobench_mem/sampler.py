@@ -47,6 +47,36 @@ class TrainingRun:
     cache: FrameLookup
     meta: Any
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> TrainingRun:
+        """Return itself: the dataset in main memory is not copied with a policy."""
+        return self
+
+    @functools.cached_property
+    def statistics(self) -> dict[str, dict[str, Any]]:
+        """Return the statistics of states and actions by which samples are normalised; none where LeRobot's are.
+
+        They are those of execution frames. Relative actions depend on the chunk, so theirs are the dataset's.
+
+        Raises:
+            MemobenchError: actions are relative, and the dataset's statistics are of absolute ones.
+        """
+        if not isinstance(self.cache, RecordedFrames):
+            return {}
+        columns = {name: self.cache.columns[name].numpy() for name in (OBS_STATE, ACTION)}
+        executed = self.cache.phase != PROMPT
+        found = {name: get_feature_stats(one[executed], axis=0, keepdims=False) for name, one in columns.items()}
+        if self.config.use_relative_actions:
+            found[ACTION] = dict(self.meta.stats[ACTION])
+            if np.allclose(found[ACTION]["mean"], columns[ACTION].mean(axis=0), atol=1e-4):
+                raise MemobenchError(
+                    f"The dataset {self.meta.root} has statistics of absolute actions, and "
+                    "--policy.use_relative_actions=true normalises relative ones; recompute them "
+                    "(`lerobot-edit-dataset --operation.type=recompute_stats --operation.relative_action=true "
+                    f"--operation.chunk_size={self.config.chunk_size}`) or leave use_relative_actions out."
+                )
+        found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + STILL
+        return found
+
     def follow(self, steps: Iterable[Any]) -> None:
         """Hand this to those steps of a preprocessor that ask for it by a method ``follow``."""
         for step in steps:
@@ -72,7 +102,6 @@ def begin_training(run: TrainingRun) -> None:
     hooked_for(run, MAKE_PROCESSORS, _follows)
     if isinstance(run.cache, RecordedFrames):
         hooked_for(run, READ_SAMPLE, _reads)
-        _use_execution_statistics(run.meta.stats, run.cache)
     run.config.drop_n_last_frames = SamplerSpec.of_run(run)  # type: ignore[assignment]  # a number to nobody but LeRobot's sampler
 
 
@@ -87,17 +116,35 @@ def training_run(config: Any) -> TrainingRun | None:
 
 
 def _follows(make: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap what makes a policy's processors: the steps of a policy that is trained follow its run."""
+    """Wrap what makes a policy's processors: those of a policy that is trained follow its run.
+
+    Their normalisers get the run's statistics in the place of the dataset's, which LeRobot hands over as such and among
+    what replaces settings of saved steps.
+    """
 
     @functools.wraps(make)
     def made(policy_cfg: Any, *args: Any, **named: Any) -> Any:
-        before, after = make(policy_cfg, *args, **named)
         run = training_run(policy_cfg)
+        if run is not None:
+            named = _with_statistics(named, run)
+        before, after = make(policy_cfg, *args, **named)
         if run is not None:
             run.follow(before.steps)
         return before, after
 
     return made
+
+
+def _with_statistics(given: Any, run: TrainingRun) -> Any:
+    """Return arguments in which the statistics of the run stand for those of its dataset."""
+    if not isinstance(given, dict):
+        return given
+    return {
+        key: run.statistics[key]
+        if key in run.statistics and value is run.meta.stats.get(key)
+        else _with_statistics(value, run)
+        for key, value in given.items()
+    }
 
 
 def prompt_texts(config: MemobenchMemConfig, meta: Any | None, cache: FrameLookup | None) -> list[str]:
@@ -279,16 +326,6 @@ def weighted_order(
 
 STILL = 0.01
 """Added to the standard deviations of actions, so that a number that hardly varies is not blown up to noise."""
-
-
-def _use_execution_statistics(stats: dict[str, dict[str, Any]], frames: RecordedFrames) -> None:
-    """Replace LeRobot's statistics of states and actions by those of execution frames, in place.
-
-    They are what LeRobot then hands to every normaliser: a new policy's, and one that goes on from a checkpoint.
-    """
-    for key in (OBS_STATE, ACTION):
-        stats[key] = get_feature_stats(frames.columns[key].numpy()[frames.phase != PROMPT], axis=0, keepdims=False)
-    stats[ACTION]["std"] = stats[ACTION]["std"] + STILL
 
 
 # -- samples ---------------------------------------------------------------------------------------------------------

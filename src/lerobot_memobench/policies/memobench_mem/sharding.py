@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.lerobot_hooks import GATHER_SHARDS, PREPARE, hooked_for
-from lerobot_memobench.policies.memobench_mem.training import WeightAverage
+from lerobot_memobench.policies.memobench_mem.average import WeightAverage
 
 UNIT = "GemmaMLP"
 """Name of the class of modules that are sharded each by itself."""
@@ -131,7 +131,7 @@ class ShardedAverage(WeightAverage):
         """
         from torch.distributed.fsdp import FullyShardedDataParallel
 
-        self.updates = begun.updates
+        self.counts = dict(begun.counts)
         trained = {name: parameter.detach().clone() for name, parameter in self.parameters.items()}
         with FullyShardedDataParallel.summon_full_params(sharded, writeback=True):
             self._fill(begun.average)
@@ -142,7 +142,7 @@ class ShardedAverage(WeightAverage):
         """Return what `WeightAverage.state` does, of the weights that were gathered; they are let go."""
         tensors = {f"weights.{name}": self.gathered[name].contiguous() for name in self.parameters}
         self.gathered = {}
-        return tensors, {"updates": str(self.updates)}
+        return tensors, self._metadata()
 
 
 def _preparing(found: weakref.ref[Any], theirs: Callable[..., Any]) -> Callable[..., Any]:

@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import short
 from lerobot_memobench.policies.compatibility import PICTURE_STEP, require_fresh
 from lerobot_memobench.policies.remote.configuration_remote import (
     IMAGE,
@@ -39,6 +40,8 @@ TRANSPORTS: dict[str, type[Transport]] = {
     "process_frame": ProcessFrame,
 }
 
+MOST_ACTIONS = 4096
+"""Of an answer: more than three episodes of the paper's horizon."""
 PAUSE = 0.5
 """Between two attempts to reach a server, s."""
 FIRST_FRAME = "episode_first_frame"
@@ -98,7 +101,7 @@ class Session:
             on_wait=lambda reason: logger.warning("waiting for the policy server at %s (%s)", self.address, reason),
         )
         self._connected = self._fresh = True
-        logger.info("connected with the policy server at %s, which says: %s", self.address, metadata or "nothing")
+        logger.info("connected with the policy server at %s, which says: %s", self.address, short(metadata))
 
     def begin(self, row: Row) -> None:
         """Start an episode: a memory in the server, of the connection or of its own, forgets the last one."""
@@ -272,20 +275,20 @@ def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) 
 
 def _numbers(answer: Mapping[str, Any], address: str) -> NDArray[np.float32]:
     if "actions" not in answer:
-        raise _wrong(address, f"an answer without 'actions' (it holds {', '.join(map(str, answer)) or 'nothing'})")
+        raise _wrong(address, f"an answer without 'actions' (it holds {short(list(answer))})")
     try:
         actions = np.array(answer["actions"], dtype=np.float32, ndmin=2)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise _wrong(address, "actions that are no numbers") from error
-    if actions.ndim != 2 or actions.shape[1] != ACTION_DIM:
+    if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not 0 < len(actions) <= MOST_ACTIONS:
         raise _wrong(address, f"actions of shape {actions.shape}")
     return actions
 
 
 def _wrong(address: str, what: str) -> MemobenchError:
     return MemobenchError(
-        f"the policy server at {address} gave {what}; expected finite numbers of shape "
-        f"(steps, {ACTION_DIM}): six of the end effector's displacement and one of the gripper"
+        f"the policy server at {address} gave {what}; expected finite numbers of shape (steps, {ACTION_DIM}), at most "
+        f"{MOST_ACTIONS:,} steps: six of the end effector's displacement and one of the gripper"
     )
 
 

@@ -8,10 +8,13 @@ the server failed. Arrays go as msgpack to openpi's servers and as JSON to OpenV
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import threading
-from contextlib import ExitStack
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import ExitStack, closing, suppress
+from functools import partial
+from socket import SHUT_RDWR
 from typing import Any
 
 import httpx
@@ -22,6 +25,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMes
 from websockets.sync.client import ClientConnection, connect
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import LONGEST_REASON, Malformed, cut, in_words, refusing
 
 JPEG_QUALITY = 95
 AWAY = (502, 503, 504)
@@ -30,16 +34,40 @@ TURNS: dict[str, threading.Lock] = {}
 """Address -> whose turn it is: web frameworks answer in threads, models do not."""
 REFUSED = "VOc"
 """Kinds of arrays that openpi's format leaves out: structures, Python objects and complex numbers."""
+LARGEST_ANSWER = 8 << 20
+"""Bytes of an answer, on the wire. A thousand actions take 200 kB as JSON."""
+LONGEST_LIST = 1 << 16
+"""Entries of a list or map in msgpack: the unpacker reserves memory for the number that a header names."""
 
 
 class ServerAway(Exception):
     """The server cannot be reached, or went away; it may come back."""
 
 
+def within[Result](seconds: float, call: Callable[[], Result]) -> Result:
+    """Return the result of a call that may wait on a server.
+
+    Libraries bound each read or write and not their sum: a server that sends a byte per second would be read for hours.
+
+    Raises:
+        TimeoutError: the call lasts longer. Its thread ends with the process at the latest.
+    """
+    done: Future[Result] = Future()
+
+    def work() -> None:
+        try:
+            done.set_result(call())
+        except BaseException as error:
+            done.set_exception(error)
+
+    threading.Thread(target=work, daemon=True).start()
+    return done.result(seconds)
+
+
 def last_line(text: str) -> str:
-    """Return the line of a traceback that says what was wrong."""
+    """Return the line of a traceback that says what was wrong, printable and short."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else "it does not say why"
+    return reason(lines[-1]) if lines else "it does not say why"
 
 
 def too_slow(address: str, timeout: float) -> MemobenchError:
@@ -49,9 +77,10 @@ def too_slow(address: str, timeout: float) -> MemobenchError:
     )
 
 
-def reason(error: BaseException) -> str:
-    """Return what an error says, in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+def reason(error: BaseException | str) -> str:
+    """Return the message of an error in one short line of printable characters."""
+    words = " ".join("".join(c if c.isprintable() else " " for c in str(error)).split())
+    return cut(words, LONGEST_REASON) or type(error).__name__
 
 
 class Websocket:
@@ -77,25 +106,35 @@ class Websocket:
         """
         self.close()
         try:
-            return self._connect(max(patience, 1.0))
+            return self._bounded(patience := max(patience, 1.0), partial(self._connect, patience))
         except InvalidStatus as error:
             code = error.response.status_code
             if code >= 500:
                 raise ServerAway(f"HTTP state {code}") from error
             raise self.foreign(f"it answered with HTTP state {code}") from error
         except InvalidMessage as error:
-            raise ServerAway(str(error)) from error
+            raise ServerAway(reason(error)) from error
         except InvalidHandshake as error:
-            raise self.foreign(str(error)) from error
+            raise self.foreign(reason(error)) from error
         except (OSError, TimeoutError, WebSocketException) as error:
             raise ServerAway(reason(error)) from error
+
+    def _bounded[Result](self, seconds: float, call: Callable[[], Result]) -> Result:
+        """Return the result of a call; hang up where it lasts longer than that many seconds."""
+        try:
+            return within(seconds, call)
+        except TimeoutError:
+            if self._connection is not None:
+                with suppress(OSError):
+                    self._connection.socket.shutdown(SHUT_RDWR)  # close() would wait for a write that never ends
+            raise
 
     def _connect(self, patience: float) -> dict[str, Any]:
         # No pings: openpi's servers answer none while they think, and the first thought can take minutes.
         connection = connect(
             self.address,
             compression=None,
-            max_size=None,
+            max_size=LARGEST_ANSWER,
             open_timeout=patience,
             ping_interval=None,
             close_timeout=1.0,
@@ -125,7 +164,12 @@ class Websocket:
     def receive(self, patience: float) -> Any:
         """Return the next frame's message, within ``patience`` seconds."""
         assert self._connection is not None
-        frame = self._connection.recv(timeout=patience)
+        try:
+            frame = self._connection.recv(timeout=patience)
+        except ConnectionClosed as error:
+            if error.sent is not None and not error.rcvd_then_sent:  # this side refused the frame
+                raise self.foreign(reason(error)) from error
+            raise
         if isinstance(frame, str):
             raise MemobenchError(f"the policy server at {self.address} failed: {last_line(frame)}")
         try:
@@ -141,7 +185,7 @@ class Websocket:
             MemobenchError: the server failed, took too long, or is none of this kind.
         """
         try:
-            answer = self.exchange(question)
+            answer = self._bounded(self.timeout, partial(self.exchange, question))
         except TimeoutError as error:
             raise too_slow(self.address, self.timeout) from error
         except (ConnectionClosed, OSError) as error:
@@ -177,42 +221,60 @@ class Rest:
         self._client = httpx.Client(
             base_url=self.address,
             timeout=httpx.Timeout(self.timeout, connect=max(patience, 1.0)),
+            headers={"Accept-Encoding": "identity"},
             trust_env=False,
         )
         try:
-            self._client.get("/")  # any answer, 404 mostly, says that somebody is there
-        except httpx.TransportError as error:
+            request = self._client.build_request("GET", "/")
+            # Any answer, 404 mostly, shows that a server listens; it is left unread.
+            within(max(patience, 1.0), partial(self._client.send, request, stream=True)).close()
+        except (httpx.TransportError, TimeoutError) as error:
             raise ServerAway(reason(error)) from error
         return {}
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
         """Post a question and return the actions of its answer."""
-        response = self._post(question)
-        if response.status_code in AWAY:
-            raise ServerAway(f"HTTP state {response.status_code}")
-        if response.status_code != httpx.codes.OK:
+        state, body = self._post(question)
+        if state in AWAY:
+            raise ServerAway(f"HTTP state {state}")
+        text = body.decode(errors="replace")
+        if state != httpx.codes.OK:
             raise MemobenchError(
-                f"the policy server at {self.address} answered {self.path} with HTTP state {response.status_code}: "
-                f"{last_line(response.text)[:200]}"
+                f"the policy server at {self.address} answered {self.path} with HTTP state {state}: {last_line(text)}"
             )
         try:
-            return {"actions": self.decode(response.text)}
+            return {"actions": self.decode(text)}
         except ValueError as error:
-            raise MemobenchError(
-                f"the policy server at {self.address} answered {last_line(response.text)[:80]!r}, which is no list of "
-                "actions; its own log tells why"
-            ) from error
+            raise self._no_actions(repr(cut(last_line(text))) if text.strip() else "an empty body") from error
 
-    def _post(self, question: dict[str, Any]) -> httpx.Response:
+    def _post(self, question: dict[str, Any]) -> tuple[int, bytes]:
         if self._client is None:
             raise ServerAway("not connected")
+        request = self._client.build_request("POST", self.path, **self.encode(question))
         try:
             with self._turn:
-                return self._client.post(self.path, **self.encode(question))
-        except httpx.ReadTimeout as error:
+                return within(self.timeout, partial(self._answer, self._client, request))
+        except (TimeoutError, httpx.ReadTimeout, httpx.WriteTimeout) as error:
             raise too_slow(self.address, self.timeout) from error
         except httpx.TransportError as error:
             raise ServerAway(reason(error)) from error
+
+    def _answer(self, client: httpx.Client, request: httpx.Request) -> tuple[int, bytes]:
+        """Return state and body of an answer, read as it is sent: a small compressed one may become a large text."""
+        with closing(client.send(request, stream=True)) as response:
+            if (encoding := response.headers.get("Content-Encoding", "identity")) != "identity":
+                raise self._no_actions(f"a body compressed by {reason(encoding)}, which was not asked for")
+            body = bytearray()
+            for part in response.iter_raw():
+                body += part
+                if len(body) > LARGEST_ANSWER:
+                    raise self._no_actions(f"more than {in_words(LARGEST_ANSWER)}")
+            return response.status_code, bytes(body)
+
+    def _no_actions(self, found: str) -> MemobenchError:
+        return MemobenchError(
+            f"the policy server at {self.address} answered {found}, which is no list of actions; its own log tells why"
+        )
 
     def encode(self, question: dict[str, Any]) -> dict[str, Any]:
         """Return httpx's arguments for the question."""
@@ -280,7 +342,7 @@ def numbers(found: Any) -> NDArray[np.floating]:
     """Return nested lists, or a list of arrays, as an array of floats; `ValueError` where they are none."""
     try:
         array = np.asarray(found, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError("no numbers") from error
     if array.ndim == 0:
         raise ValueError("no numbers")
@@ -303,7 +365,7 @@ def _unpack(found: dict[Any, Any]) -> Any:
     if b"__ndarray__" in found:
         return _array(found[b"data"], found[b"dtype"], found[b"shape"])
     if b"__npgeneric__" in found:
-        return _array(np.array(found[b"data"], _dtype(found[b"dtype"])).tobytes(), found[b"dtype"], ())[()]
+        return _dtype(found[b"dtype"]).type(found[b"data"])  # of the data's length, not of the one that dtype names
     return found
 
 
@@ -330,10 +392,8 @@ def unpack(data: bytes) -> Any:
     Raises:
         ValueError: it is none.
     """
-    try:
-        return msgpack.unpackb(data, object_hook=_unpack)
-    except (msgpack.UnpackException, TypeError, KeyError) as error:
-        raise ValueError(f"it is not msgpack with arrays ({error})") from error
+    with refusing(lambda why: Malformed(f"it is not msgpack with arrays ({why})")):
+        return msgpack.unpackb(data, object_hook=_unpack, max_array_len=LONGEST_LIST, max_map_len=LONGEST_LIST)
 
 
 def _encode(value: Any) -> Any:
@@ -360,7 +420,5 @@ def from_json(text: str) -> Any:
     Raises:
         ValueError: it is none.
     """
-    try:
+    with refusing(lambda why: Malformed(f"it is not JSON with arrays ({why})")):
         return json.loads(text, object_hook=_decode)
-    except (TypeError, KeyError, binascii.Error) as error:
-        raise ValueError(f"it is not JSON with arrays ({error})") from error

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from websockets.exceptions import ConnectionClosed
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.remote.transports import ServerAway, Websocket, last_line
+from lerobot_memobench.io import short
+from lerobot_memobench.policies.remote.transports import ServerAway, Websocket, last_line, reason
 
 logger = logging.getLogger(__name__)
 
@@ -54,10 +55,10 @@ class VlaEval(Websocket):
         self._say(HELLO, said)
         kind, found = self._hear(patience)
         if kind != HELLO:
-            raise self.foreign(f"it answered a hello with {kind!r}")
-        if (version := found.get("protocol_version")) != PROTOCOL:
+            raise self.foreign(f"it answered a hello with {short(kind)}")
+        if (version := short(found.get("protocol_version"))) != str(PROTOCOL):
             raise MemobenchError(
-                f"the policy server at {self.address} speaks version {version!r} of {self.protocol}, and version "
+                f"the policy server at {self.address} speaks version {version} of {self.protocol}, and version "
                 f"{PROTOCOL} is spoken here; serve the policy with vla-eval {VERSION}"
             )
         if not self._warned and (others := other_formats(found)):
@@ -73,7 +74,7 @@ class VlaEval(Websocket):
             return {}
         kind, found = self._hear(self.timeout)
         if kind != ACTION:
-            raise self.foreign(f"it answered an observation with {kind!r}")
+            raise self.foreign(f"it answered an observation with {short(kind)}")
         return {"actions": found["action"], **found} if "action" in found else found
 
     def _say(self, kind: str, payload: dict[str, Any]) -> None:
@@ -135,11 +136,11 @@ def png_map(image: NDArray[np.uint8]) -> dict[str, Any]:
 def other_formats(hello: Mapping[str, Any]) -> list[str]:
     """Return a sentence for each convention in which a server, by its hello, differs from this environment."""
     return [
-        f"{name} as {spec.get('format')}, and this environment with {FORMATS[name]}"
+        f"{name} as {reason(str(spec.get('format')))}, and this environment with {FORMATS[name]}"
         for specs in (hello.get("action_spec"), hello.get("observation_spec"))
         for name, spec in (specs.items() if isinstance(specs, dict) else ())
         if name in FORMATS and isinstance(spec, dict)
-        if spec.get("format") not in (FORMATS[name], ANY_FORMAT) and FORMATS[name] not in str(spec.get("accepts"))
+        if str(spec.get("format")) not in (FORMATS[name], ANY_FORMAT) and FORMATS[name] not in str(spec.get("accepts"))
     ]
 
 

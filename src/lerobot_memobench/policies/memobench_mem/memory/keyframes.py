@@ -167,7 +167,6 @@ class Keyframes(MemoryMechanism):
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
         """Ask the high level once for each sample, by true keyframes; as a rollout would be, where nothing is true."""
-        self._losses = {}
         if histories.subgoals is None or query is None or query.subgoal is None:
             return super().replay(histories, query)
         assert query.choices is not None
@@ -217,5 +216,6 @@ class Keyframes(MemoryMechanism):
         return slots, ends.gather(1, recent.clamp(min=0)) & (recent >= 0)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return how far the high level was from the true checkpoint and from the true keyframes."""
-        return self._losses
+        """Return the losses of the last replay with labels: to the true checkpoint, and to the true keyframes."""
+        found, self._losses = self._losses, {}
+        return found

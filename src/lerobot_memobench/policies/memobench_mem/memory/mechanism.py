@@ -28,6 +28,8 @@ MEMORY_GRID = 4
 
 FRAMES, STEPS, PLACES = "memory.frames", "memory.steps", "memory.places"
 """Histories of a training batch: see `Histories`."""
+EXACT = "memory.exact"
+"""Frames without detection noise, where the others have some."""
 AHEAD = "memory.ahead"
 """Frames that follow the histories, for mechanisms that learn to foresee them (`MemoryMechanism.ahead`)."""
 SUBGOAL, SUBGOALS, CHOICES = "memory.subgoal", "memory.subgoals", "memory.choices"
@@ -45,6 +47,7 @@ class Histories(NamedTuple):
         places: (B, F) which of them each sample remembers, oldest first; -1 behind the last.
         subgoals: (U,) number of the text that is a frame's subgoal, -1: none; with `MemoryMechanism.privileged`.
         ahead: (B, n) which frames follow those, -1 behind the episode's last; with `MemoryMechanism.ahead`.
+        exact: (U, P, D') the frames without detection noise, for labels; None: ``frames`` have none.
     """
 
     frames: Tensor
@@ -52,6 +55,7 @@ class Histories(NamedTuple):
     places: Tensor
     subgoals: Tensor | None = None
     ahead: Tensor | None = None
+    exact: Tensor | None = None
 
     def to(self, device: torch.device) -> Histories:
         """Move them to a device."""
@@ -329,6 +333,9 @@ class MemoryMechanism(nn.Module, ABC):
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return losses of its own by their names, (B,) each and weighted; called after `replay` and the actions'.
+
+        Where a loss is only measured, a privileged memory replays the histories with labels, and then without them: the
+        actions follow its own choice.
 
         Args:
             batch: the training batch, and what its fusion made beside actions (`MemoryFusion.outputs`).

@@ -163,15 +163,16 @@ class Motion(MemoryMechanism):
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
         """Find the motions of all samples at once, and those that follow, which are to be foreseen."""
         frames, places, field = histories.frames, histories.places, self.field
+        exact = frames if histories.exact is None else histories.exact
         self._followed = None
         if histories.ahead is not None:
             last = places.gather(1, (places >= 0).sum(dim=1, keepdim=True) - 1)
             following = torch.cat([last, histories.ahead], dim=1)
             with torch.no_grad():
-                moved, known = field.following(frames[following.clamp(min=0)])
+                moved, known = field.following(exact[following.clamp(min=0)])
             self._followed = moved, known & (following[:, 1:, None] >= 0)
-        seen, pairs = field.observed(frames), places[:, 1:] >= 0
-        moved = field.between(seen[places[:, :-1][pairs]], seen[places[:, 1:][pairs]])
+        pairs = places[:, 1:] >= 0
+        moved = field.between(frames[places[:, :-1][pairs]], frames[places[:, 1:][pairs]])
         motions = self.summary.new_zeros(len(places), HINDSIGHT, field.cells, field.numbers)
         count = pairs.sum(dim=1, keepdim=True)
         # Row b's motions lie from first[b] on in `moved`, oldest first; the last stand last, the earliest repeats.

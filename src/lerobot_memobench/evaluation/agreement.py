@@ -1,0 +1,70 @@
+"""Whether two accounts of an episode agree: of two logs, or of a log and a result card."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lerobot_memobench.envs.episode_log import key_of
+
+OUTCOME = (
+    *("success", "steps", "prompt_steps", "variant", "choice", "checkpoints", "failure", "fault", "not_run"),
+    "scene_hash",
+)
+"""What two runs of the same episode must agree in."""
+
+
+def outcome(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a card keeps of a line of the log: its identity and what does not depend on the clock."""
+    return {
+        key: record[key] for key in ("task", "memory_type", "episode", "seed", "referent", *OUTCOME) if key in record
+    }
+
+
+def disagreement(a: Mapping[str, Any], b: Mapping[str, Any], here: str = "here", there: str = "there") -> str | None:
+    """Return in one phrase the first thing in which two records of the same episode differ, None when in nothing.
+
+    The time it took is no difference, nor what one of them leaves out.
+    """
+    if ("not_run" in a) != ("not_run" in b):
+        return f"{_name(a)} was not run {here if 'not_run' in a else there}"
+    for name in ("seed", "replan_steps", "scene_hash", *OUTCOME):
+        if name not in a or name not in b or a[name] == b[name]:
+            continue
+        if name == "checkpoints" and len(a[name]) == len(b[name]):
+            found = _first_checkpoint(a[name], b[name])
+        else:
+            found = (name, a[name], b[name])
+        if found is not None:
+            what, mine, other = found
+            return f"{_name(a)}: {what} is {mine} {here} and {other} {there}"
+    return None
+
+
+def _first_checkpoint(a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, Any]]) -> tuple[str, Any, Any] | None:
+    """Return the first thing in which checkpoints differ: what, and its two values."""
+    for number, (mine, other) in enumerate(zip(a, b, strict=True), start=1):
+        for key in ("operation", "first_step", "ordered_step"):
+            if mine.get(key) != other.get(key):
+                return f"{key} of checkpoint {number}", mine.get(key), other.get(key)
+    return None
+
+
+def disagreements(
+    card: Sequence[Mapping[str, Any]], records: Sequence[Mapping[str, Any]], there: str = "in the log"
+) -> list[str]:
+    """Return a phrase for each episode that a card and a log do not agree about, or that one of them lacks."""
+    logged, named = ({key_of(each): each for each in some} for some in (records, card))
+    found = []
+    for key in sorted({*logged, *named}):
+        if key not in logged:
+            found.append(f"{_name(named[key])} is on the card and not {there}")
+        elif key not in named:
+            found.append(f"{_name(logged[key])} is {there} and not on the card")
+        elif (problem := disagreement(named[key], logged[key], "on the card", there)) is not None:
+            found.append(problem)
+    return found
+
+
+def _name(record: Mapping[str, Any]) -> str:
+    return f"{record['task']}, episode {record['episode']}"
