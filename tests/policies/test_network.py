@@ -18,8 +18,8 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryToke
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
-from tests.support.small_policy import small_config
 from tests.support.memory import histories
+from tests.support.small_policy import small_config
 
 CHUNK, BATCH, FRAMES = 6, 2, 5
 
