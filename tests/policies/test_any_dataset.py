@@ -83,13 +83,15 @@ class Foreign:
 def train(root: Path, out: Path, *flags: str, size: str | None = "tiny") -> Path:
     """Two updates by LeRobot's command; return the checkpoint."""
     own = [] if size is None else ["--policy.type=memobench_mem", f"--policy.size={size}"]
+    own += ["--policy.num_inference_steps=2"] if size == "tiny" else []
+    own += [] if "--policy.memory_fusion=none" in flags else ["--policy.memory_frames=4"]
     status = call_lerobot(
         "train",
         [
             *own,
             *("--dataset.repo_id=somebody/robot", f"--dataset.root={root}", f"--output_dir={out}"),
             *("--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", "--policy.device=cpu"),
-            *("--policy.push_to_hub=false", "--policy.memory_frames=4", "--policy.num_inference_steps=2"),
+            "--policy.push_to_hub=false",
             *flags,
         ],
     )

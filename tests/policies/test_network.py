@@ -19,14 +19,14 @@ from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, SizedPa
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
 from tests.support.memory import histories
+from tests.support.small_policy import small_config
 
 CHUNK, BATCH, FRAMES = 6, 2, 5
 
 
 def _config(**fields: object) -> MemobenchMemConfig:
-    return MemobenchMemConfig(
-        device="cpu", chunk_size=CHUNK, n_action_steps=CHUNK, num_inference_steps=3, memory_frames=FRAMES, **fields
-    )
+    frames = {} if fields.get("memory_fusion") == "none" else {"memory_frames": FRAMES}
+    return small_config(**frames, **fields)
 
 
 def _inputs(config: MemobenchMemConfig, device: str = "cpu", batch: int = BATCH) -> dict[str, object]:
