@@ -10,6 +10,7 @@ from collections.abc import Iterator
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+os.environ["MEMOBENCH_PROMPT_CACHE"] = "off"  # tests simulate what they check, and leave nothing in the user's cache
 
 import functools
 import gc

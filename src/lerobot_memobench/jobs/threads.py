@@ -12,6 +12,7 @@ its process has, shared with those of ours that run beside it.
 from __future__ import annotations
 
 import os
+import platform
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -115,6 +116,16 @@ def physical_cores() -> int:
         except OSError:
             found.add(str(number))
     return len(found)
+
+
+def cpu_model() -> str:
+    """Return the processor's name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def _quota() -> int | None:

@@ -1,0 +1,208 @@
+"""Play a demonstration prompt: simulate it, or restore it from the user's cache folder, equal to the bit.
+
+A prompt depends on task, variant and seed, not on the policy. Its file holds the snapshot after each control step.
+``MEMOBENCH_PROMPT_CACHE=off`` neither reads nor writes files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import logging
+import os
+import sys
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
+from lerobot_memobench.io import cache_folder, draft_of
+from lerobot_memobench.jobs.threads import cpu_model
+from lerobot_memobench.protocol import ACTION_DIM
+from lerobot_memobench.sim.gl.rasterizer import Highlight
+from lerobot_memobench.sim.simulation import Simulation, Snapshot
+from lerobot_memobench.tasks.task import Task
+
+logger = logging.getLogger(__name__)
+
+VARIABLE = "MEMOBENCH_PROMPT_CACHE"
+LARGEST = 2 << 30
+"""Bytes of all files together: several thousand prompts of 0.2 to 0.7 MB. Those used least recently are removed."""
+PACKAGES = ("mujoco", "numpy", "scipy", "robosuite")
+SOURCES = ("tasks", "sim", "experts", "envs")
+
+
+class Frames(NamedTuple):
+    """A prompt of ``n`` control steps; the arrays of its file.
+
+    Attributes:
+        actions: (n, 7) float32, that moved the arm.
+        physics: (n, `Simulation.physics_dim`) float64, `Snapshot.physics` after each step.
+        controller: (n, 14) float64, goal position (3), goal rotation (9) and gripper (2) of the snapshot.
+        goes_on: (n,) bool, of the snapshot.
+        highlights: (n, 4) float64, position and radius; NaN where nothing is highlighted.
+        shown: () bool, whether the prompt showed what it had to.
+    """
+
+    actions: NDArray[np.float32]
+    physics: NDArray[np.float64]
+    controller: NDArray[np.float64]
+    goes_on: NDArray[np.bool_]
+    highlights: NDArray[np.float64]
+    shown: NDArray[np.bool_]
+
+
+class Prompt:
+    """Simulate a prompt, a control step at a time.
+
+    Args:
+        sim: the running scene, at the episode's initial state.
+        longest: control steps after which the prompt ends.
+        file: where it is kept once it is over; None: nowhere.
+
+    Attributes:
+        over: no step is left.
+        shown: whether it showed what it had to, once it is over.
+        observed: whether anything reads its frames before its end; a restored prompt leaves out the others.
+    """
+
+    over = False
+    shown = False
+    observed = True
+
+    def __init__(self, demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> None:
+        self._demonstrator, self._sim, self._longest, self._file = demonstrator, sim, longest, file
+        self._actions = demonstrator.actions()
+        self._next = next(self._actions, None)
+        self._steps = 0
+        self._frames: list[tuple[NDArray[np.float32], Snapshot, tuple[Highlight, ...]]] = []
+
+    def step(self) -> NDArray[np.float32]:
+        """Advance by one control step and return the action that moved the arm, (7,)."""
+        file, self._file = self._file, None  # a prompt in which an error was raised is not kept
+        action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
+        if self._next is not None:
+            action = np.array(self._next, dtype=np.float32)
+            self._sim.step(action)
+        self._steps += 1
+        self._next = next(self._actions, None)
+        self.over = self._next is None or self._steps >= self._longest
+        self.shown = self._demonstrator.shown
+        self._file = file
+        if file is not None:
+            self._frames.append((action, self._sim.snapshot(), self._sim.highlights))
+            if self.over:
+                _write(file, self._as_arrays())
+        return action
+
+    def _as_arrays(self) -> Frames:
+        actions, snapshots, lit = zip(*self._frames, strict=True)
+        nothing = (np.nan,) * 4
+        return Frames(
+            np.array(actions),
+            np.array([one.physics for one in snapshots]),
+            np.array([[*one.goal_position, *one.goal_rotation.flat, *one.gripper] for one in snapshots]),
+            np.array([one.goes_on for one in snapshots]),
+            np.array([(*found[0].position, found[0].radius) if found else nothing for found in lit]),
+            np.array(self.shown),
+        )
+
+
+class RestoredPrompt(Prompt):
+    """Restore what `Prompt` has kept, a control step at a time."""
+
+    def __init__(self, sim: Simulation, frames: Frames) -> None:
+        self._sim, self._kept, self._steps = sim, frames, 0
+
+    def step(self) -> NDArray[np.float32]:
+        """Go on to the next control step and return the action that moved the arm, (7,)."""
+        kept, k = self._kept, self._steps
+        self._steps += 1
+        self.over, self.shown = self._steps == len(kept.actions), bool(kept.shown)
+        if self.observed or self.over:
+            position, rotation, gripper = np.split(kept.controller[k], [3, 12])
+            snapshot = Snapshot(kept.physics[k], position, rotation.reshape(3, 3), gripper, bool(kept.goes_on[k]))
+            self._sim.restore(snapshot, replayed=True)
+            x, y, z, radius = map(float, kept.highlights[k])
+            self._sim.highlights = () if np.isnan(radius) else (Highlight((x, y, z), radius),)
+        return kept.actions[k].copy()
+
+
+def prompt_of(demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> Prompt:
+    """Return a prompt that is restored if ``file`` holds it, and simulated otherwise. Arguments are `Prompt`'s."""
+    frames = None if file is None else _read(file, sim.physics_dim)
+    return Prompt(demonstrator, sim, longest, file) if frames is None else RestoredPrompt(sim, frames)
+
+
+def prompt_file(task: Task, seed: int, scene_hash: str) -> Path | None:
+    """Return where the prompt of a task's variant and a seed is kept; None where the cache is off.
+
+    The name is a hash of all that the prompt depends on. The hash of the initial scene, bit for bit the result of 250
+    physics steps, also sets apart machines that compute otherwise.
+    """
+    if os.environ.get(VARIABLE, "").lower() in ("off", "0", "false", "no"):
+        return None
+    content = dataclasses.replace(task, folder=Path()), task.bddl_text, seed, scene_hash, _code()
+    return cache_folder() / "prompts" / f"{hashlib.sha256(repr(content).encode()).hexdigest()[:32]}.npz"
+
+
+@cache
+def _code() -> tuple[str, ...]:
+    """Return what computes a prompt: sources, versions of libraries, Python, processor."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256((package / "protocol.py").read_bytes())
+    for source in sorted(file for part in SOURCES for file in (package / part).rglob("*.py")):
+        digest.update(source.relative_to(package).as_posix().encode() + source.read_bytes())
+    return digest.hexdigest(), *(metadata.version(name) for name in PACKAGES), sys.version, cpu_model()
+
+
+def _read(file: Path, physics_dim: int) -> Frames | None:
+    """Return the prompt that a file holds, None where it is missing, damaged or another one."""
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            name, frames = str(stored["name"]), Frames(*(stored[field] for field in Frames._fields))
+    except Exception:  # damaged files raise errors of every type: zipfile's, zlib's, NumPy's, the system's
+        return None
+    n = frames.actions.size // ACTION_DIM
+    shapes = (n, ACTION_DIM), (n, physics_dim), (n, 14), (n,), (n, 4), ()
+    found = [(array.shape, array.dtype.char) for array in frames]
+    if n == 0 or found != [*zip(shapes, "fdd?d?", strict=True)] or name != file.name:
+        return None
+    with contextlib.suppress(OSError):  # a folder that cannot be written
+        os.utime(file)
+    return frames
+
+
+def _write(file: Path, frames: Frames) -> None:
+    """Write a prompt, and remove the files that were used least recently beyond `LARGEST` bytes."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with draft_of(file) as draft:
+            np.savez_compressed(draft, name=np.array(file.name), **frames._asdict())
+        _make_room(file.parent)
+    except OSError as error:
+        _warn(f"prompts cannot be kept in {file.parent} ({error.strerror or error}); {VARIABLE}=off turns this off")
+
+
+def _make_room(folder: Path) -> None:
+    found = []
+    for file in folder.glob("*.npz"):  # drafts of killed processes too
+        with contextlib.suppress(FileNotFoundError):  # another process makes room
+            found.append((file.stat().st_mtime_ns, file.stat().st_size, file))
+    excess = sum(size for _, size, _ in found) - LARGEST
+    for _, size, file in sorted(found):
+        if excess <= 0:
+            return
+        file.unlink(missing_ok=True)
+        excess -= size
+
+
+@cache
+def _warn(text: str) -> None:
+    """Log a warning once per process."""
+    logger.warning(text)
