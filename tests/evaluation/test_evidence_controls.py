@@ -19,6 +19,7 @@ from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import mixtures
 from lerobot_memobench.evaluation.records import protocol_of_log, read_runs
 from lerobot_memobench.evaluation.report import write_report
+from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.logs import SETTINGS, rollout
 
 Policy = Callable[[int, int], int | None]
@@ -56,12 +57,46 @@ def test_who_ignores_the_past_is_exactly_at_chance() -> None:
     rate = found["tasks"]["bowl"]
     assert (rate.scenes, rate.variants, rate.chance) == (10, 3, pytest.approx(1 / 3))
     assert rate.rates["follows"].value == pytest.approx(1 / 3)
-    assert notes == []
+    assert len(notes) == 1
+    assert "10 effective scenes" in notes[0]
+    assert rate.p > 0.5
     low, high = rate.rates["follows"].low, rate.rates["follows"].high
     assert low is not None
     assert high is not None
     assert low < 0.15
     assert high > 0.6, "ten scenes are few, even where each says the same"
+
+
+def test_answers_are_right_wrong_or_missing_and_pairs_are_reliable() -> None:
+    records = rollouts("bowl", "object", remembers, scenes=12)
+    for record in records[:3]:  # a scene: none given, one of no variant, one right
+        record["choice"] = record["variant"] if record["variant"] == 2 else None
+        record["answered"] = record["variant"] != 0
+    found = evidence_of(records)[0]["tasks"]["bowl"]
+    rates = {name: rate.value for name, rate in found.rates.items()}
+    assert rates["undecided"] == rates["wrong"] == pytest.approx(1 / 36)
+    assert rates["follows"] == pytest.approx(34 / 36)
+    assert rates["right"] == pytest.approx(34 / 35)
+    assert rates["reliable"] == pytest.approx(11 / 12)
+    assert found.p < 0.001
+
+
+def test_answers_are_exchanged_among_variants_of_one_instruction() -> None:
+    """Of two hidden things a policy that opens the top drawer is right at chance, and no better by permutation."""
+    name = "find_the_tomato_or_the_biscuit_hidden_in_two_of_the_drawers"
+    task = get_task(name)
+    variants = [task.variant(k) for k in task.random_variants]
+
+    def top(scene: int, variant: int) -> int:
+        asked = variants[variant]
+        same = [
+            one.variant_index for one in variants if one.language == asked.language and "top" in str(one.checkpoints[0])
+        ]
+        return variant if variant in same else same[0]
+
+    found = evidence_of(rollouts(name, "spatial", top, scenes=6, variants=12))[0]["tasks"][name]
+    assert found.rates["follows"].value == pytest.approx(1 / 3)
+    assert found.p == 1.0
 
 
 def test_an_average_is_of_memory_types_and_without_tasks_whose_instruction_tells() -> None:
@@ -87,10 +122,10 @@ def test_an_average_is_of_memory_types_and_without_tasks_whose_instruction_tells
 def test_scenes_that_were_not_run_with_every_variant_are_left_out() -> None:
     found, notes = evidence_of(rollouts("bowl", "object", remembers)[:-1])
     assert found["tasks"]["bowl"].scenes == 9
-    assert notes == ["2 rollouts of scenes that were not run with every variant left out"]
+    assert notes[0] == "2 rollouts of scenes that were not run with every variant left out"
     found, notes = evidence_of(rollouts("bowl", "object", remembers) + rollouts("milk", "object", remembers, 1)[:-1])
     assert set(found["tasks"]) == {"bowl"}
-    assert notes == ["2 rollouts of scenes that were not run with every variant left out; no rate tells of milk"]
+    assert notes[0] == "2 rollouts of scenes that were not run with every variant left out; no rate tells of milk"
 
 
 def test_scenes_repeat_and_are_no_mixture_of_seeds() -> None:

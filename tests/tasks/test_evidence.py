@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evidence import Choice, chance, scene_and_variant
+from lerobot_memobench.tasks.evidence import Choice, chance, handled, scene_and_variant
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import SUITES
 
@@ -14,6 +14,7 @@ PUBLISHED_MILK = "find_the_specific_milk_pointed_out_in_the_prompt_video_and_put
 TOMATO = "find_the_tomato_hidden_in_one_of_the_drawers"
 TWO = "find_the_tomato_or_the_biscuit_hidden_in_two_of_the_drawers"
 STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
+STACK = "stack_the_bowls_strictly_in_the_sequence_shown_in_the_prompt_video"
 ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
 
 
@@ -22,7 +23,11 @@ def on(thing: str, place: str) -> Atom:
 
 
 def drawer(name: str) -> Atom:
-    return Atom("open", (f"wooden_cabinet_1_{name}_region",))
+    return Atom("ajar", (f"wooden_cabinet_1_{name}_region",))
+
+
+def lifted(thing: str) -> Atom:
+    return Atom("lifted", (thing,))
 
 
 def chosen(name: str, variant: int, *steps: set[Atom]) -> int | None:
@@ -63,7 +68,21 @@ def test_a_second_answer_does_not_mend_the_first() -> None:
 def test_a_drawer_that_was_opened_is_a_choice_though_nothing_came_of_it() -> None:
     assert chosen(TOMATO, 0, {drawer("middle")}) == 1
     assert chosen(TOMATO, 1, {drawer("middle")}) == 1, "the right one, and the hand failed"
-    assert chosen(TOMATO, 0, {drawer("middle")}, {drawer("top")}) is None, "none of the answers is possible any more"
+    assert chosen(TOMATO, 0, {drawer("middle")}, {drawer("top")}) == 1, "a second one does not mend the first"
+
+
+@pytest.mark.parametrize("variant", [0, 1])
+def test_an_object_that_was_lifted_is_a_choice(variant: int) -> None:
+    assert chosen(PUBLISHED_MILK, variant, {lifted("fake_milk_1")}, {lifted("target_milk")}) == 1
+
+
+def test_an_answer_may_be_none_of_the_variants() -> None:
+    order = [lifted(atom.args[0]) for atom in handled(get_task(STACK).variant(0))]
+    choice = Choice(get_task(STACK).variant(0))
+    assert not choice.answered
+    for atom in (order[1], order[1], order[0]):
+        choice.step(lambda asked, atom=atom: asked == atom)
+    assert choice.answered
 
 
 def test_of_variants_with_the_same_goal_the_one_that_is_run_was_chosen() -> None:

@@ -1,7 +1,8 @@
 """How often does the choice follow the evidence? Each scene was run with each variant: only the past differs.
 
-A policy that knows nothing of the past chooses the same in all variants of a scene, and is right at a rate that is
-known exactly (`tasks.evidence.chance`), whatever the scenes are: there is no luck of the draw.
+A policy without the past that cannot look before it chooses gives the same answer in all variants of a scene. Its rate
+of right answers is the chance (`tasks.evidence.chance`), whatever the scenes are. The terms *warranted choice* and
+*reliable pair* are those of the Counterfactual Memory Audit (arXiv 2609.27247).
 """
 
 from __future__ import annotations
@@ -9,26 +10,35 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, by_task, percent, wilson
 from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, percentiles
 from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, figure
 from lerobot_memobench.io import count_of
+from lerobot_memobench.tasks.catalogue import get_task
 
 AVERAGE = "average"
-RATES = ("follows", "success", "undecided")
-"""The choice is the evidence's; the goal held at the end; nothing was chosen that could be told."""
-RIGHT = "right"
-"""Of the choices that could be told, the share that is the evidence's."""
+RATES = ("follows", "wrong", "undecided", "success")
+"""A warranted choice: the answer is the evidence's; another answer was given; none was; the goal held at the end."""
+RIGHT, RELIABLE = "right", "reliable"
+"""Share of the evidence's among the answers given; share of pairs of variants of a scene that were both followed."""
+SHOWN = {name: name for name in RATES[:3]} | {RIGHT: "right, of the decided", RELIABLE: "reliable pairs"}
+"""Columns of the tables: rate -> title."""
+ENOUGH = 35
+"""Effective number of scenes from which on the interval of a perfect policy begins at 90 %."""
 SENTENCE = (
-    "Each scene was run with each variant of its task, so only the past differs. Follows: the first answer that was "
-    "acted on is the one that the evidence asks for; right, of the decided: among rollouts with an answer. Chance: the "
-    "best that a policy without the past can reach. Per cent, with the 95 % interval of a bootstrap over scenes, at "
-    "least Wilson's of so many. No chance is told where the instruction tells the answer and only what was done so far "
-    "is evidence; such tasks are in no average."
+    "Each scene was run with each variant of its task, so only the past differs. Follows: the answer, by the first "
+    "object lifted or joint moved, is the one that the evidence asks for; right, of the decided: among rollouts with "
+    "an answer; reliable pairs: pairs of variants of a scene in which both answers are right. Chance: the best rate of "
+    "a policy without the past that cannot look before it chooses. Per cent, with the 95 % interval of a bootstrap "
+    "over scenes, at least Wilson's of their effective number. p: of a permutation of the answers within scenes. Tasks "
+    "whose instruction names the answer have no chance and are in no average."
 )
 
 
@@ -39,13 +49,17 @@ class Evidence:
     Attributes:
         scenes, variants: how many; of several tasks the sum of scenes, and no number of variants.
         chance: of following without the past; None where the instruction tells.
-        rates: of `RATES` and `RIGHT`, with intervals; no `RIGHT` where nothing was decided.
+        rates: of `RATES`, `RIGHT` and `RELIABLE`, with intervals; no `RIGHT` where nothing was decided.
+        p: one-sided, of as many right answers when they are permuted within scenes.
+        effective: number of scenes of equal weight with the same variance.
     """
 
     scenes: int
     variants: int | None
     chance: float | None
     rates: Mapping[str, Estimate]
+    p: float
+    effective: float
 
 
 class FoundEvidence(NamedTuple):
@@ -62,12 +76,13 @@ class FoundEvidence(NamedTuple):
 
 @dataclass(frozen=True)
 class _Task:
-    """Rates per scene (S, 3), and the scenes that are drawn (D, S)."""
+    """Rates of `RATES` and `RELIABLE` per scene (S, 5), the scenes that are drawn (D, S), and permuted rates (D,)."""
 
     variants: int
     chance: float | None
     values: Array
     drawn: Any
+    permuted: Array
 
 
 def ran_evidence(records: Sequence[Record]) -> bool:
@@ -99,9 +114,10 @@ def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:
         if not whole:
             nowhere.append(name)
             continue
-        values = np.array([np.mean([_outcome(record) for record in scene], axis=0) for scene in whole])
+        values = np.array([_rates_of_scene(scene) for scene in whole])
         drawn = rng.integers(len(whole), size=(draws, len(whole)))
-        tasks[name] = _Task(variants, group[0].get("chance"), values, drawn)
+        permuted = np.mean([_permuted(scene, rng, draws) for scene in whole], axis=0)
+        tasks[name] = _Task(variants, group[0].get("chance"), values, drawn, permuted)
         kinds.setdefault(str(group[0]["memory_type"]), []).append(tasks[name])
     absent = f"; no rate tells of {' and '.join(nowhere)}" if nowhere else ""
     notes = [f"{count_of(left_out, 'rollout')} of scenes that were not run with every variant left out{absent}"]
@@ -111,11 +127,51 @@ def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:
         "memory_types": {name: _rates([group]) for name, group in asked.items()},
         AVERAGE: {AVERAGE: _rates(list(asked.values()))} if asked else {},
     }
-    return FoundEvidence(found, notes if left_out else [])
+    whole_notes = notes if left_out else []
+    if asked and (average := found[AVERAGE][AVERAGE]).effective < ENOUGH:
+        whole_notes.append(
+            f"the average has {average.effective:.0f} effective scenes; with fewer than {ENOUGH} the interval of a "
+            "perfect policy begins below 90 %: run more episodes, 36 of each task by default"
+        )
+    return FoundEvidence(found, whole_notes)
 
 
-def _outcome(record: Record) -> tuple[bool, bool, bool]:
-    return record["choice"] == record.get("variant"), bool(record["success"]), record["choice"] is None
+def _rates_of_scene(scene: Sequence[Record]) -> list[float]:
+    right = np.array([record["choice"] == record.get("variant") for record in scene])
+    answered = np.array([bool(record.get("answered", record["choice"] is not None)) for record in scene])
+    success = np.mean([bool(record["success"]) for record in scene])
+    pairs = [bool(a and b) for a, b in combinations(right, 2)]
+    rates = right.mean(), (answered & ~right).mean(), (~answered).mean(), success, np.mean(pairs) if pairs else np.nan
+    return [float(rate) for rate in rates]
+
+
+def _permuted(scene: Sequence[Record], rng: np.random.Generator, draws: int) -> Array:
+    """Return the share of right answers in a scene (D,) when they are exchanged among variants of one instruction."""
+    instruction, goal = _alike(str(scene[0]["task"]))
+    right = np.zeros(draws)
+    groups: dict[Any, list[Record]] = {}
+    for record in scene:
+        groups.setdefault(instruction.get(record.get("variant") or 0), []).append(record)
+    for group in groups.values():
+        shown = np.array([goal.get(k := record.get("variant") or 0, k) for record in group])
+        chosen = np.array([-1 if (k := record["choice"]) is None else goal.get(k, k) for record in group])
+        right += (rng.permuted(np.tile(chosen, (draws, 1)), axis=1) == shown).sum(axis=1)
+    return right / len(scene)
+
+
+@cache
+def _alike(name: str) -> tuple[dict[int, str], dict[int, int]]:
+    """Return variant -> instruction and variant -> first variant with its goal; empty for unknown tasks."""
+    try:
+        task = get_task(name)
+    except MemobenchError:
+        return {}, {}
+    variants = [task.variant(k) for k in task.random_variants]
+    first: dict[Any, int] = {}
+    for one in variants:
+        first.setdefault((one.language, one.goal), one.variant_index)
+    instructions = {one.variant_index: one.language for one in variants}
+    return instructions, {one.variant_index: first[one.language, one.goal] for one in variants}
 
 
 def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
@@ -129,14 +185,17 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     drawn = mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
     weights = [1 / (len(groups) * len(group) * len(task.values)) for group in groups for task in group]
     scenes = max(1.0, 1 / sum(len(task.values) * weight**2 for task, weight in zip(tasks, weights, strict=True)))
-    estimates = {name: _estimate(rates[k], drawn[:, k], scenes) for k, name in enumerate(RATES)}
+    estimates = {name: _estimate(rates[k], drawn[:, k], scenes) for k, name in enumerate((*RATES, RELIABLE))}
     decided, of_draws = 1 - rates[2], 1 - drawn[:, 2]
     if decided > 0:
         right = drawn[of_draws > 0, 0] / of_draws[of_draws > 0]
         estimates[RIGHT] = _estimate(rates[0] / decided, right, max(1.0, scenes * decided))
     alone = len(tasks) == 1
     chances = [[task.chance for task in group] for group in groups]
+    permuted = mean([[task.permuted for task in group] for group in groups])
     return Evidence(
+        p=(1 + int((permuted >= rates[0] - 1e-9).sum())) / (1 + len(permuted)),
+        effective=scenes,
         scenes=sum(len(task.values) for task in tasks),
         variants=tasks[0].variants if alone else None,
         chance=tasks[0].chance if alone else float(mean(chances)),
@@ -155,7 +214,7 @@ def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
 def evidence_section(evidence: FoundEvidence) -> Section:
     """Return the tables of an evaluation in which each scene was run with each variant, with a title."""
     found, notes = evidence
-    header = ("scenes", "variants", "chance", *RATES, "right, of the decided")
+    header = ("scenes", "chance", *SHOWN.values(), "p")
     kinds = [*found["memory_types"].items(), *found[AVERAGE].items()]
     tables = [
         Table("evidence_tasks", "", ("task", *header), tuple(_row(Name(n), e) for n, e in found["tasks"].items()))
@@ -167,9 +226,8 @@ def evidence_section(evidence: FoundEvidence) -> Section:
 
 
 def _row(name: str, found: Evidence) -> tuple[Cell, ...]:
-    variants = None if found.variants is None else Count(found.variants)
-    cells = [_cell(found.rates[rate]) if rate in found.rates else None for rate in (*RATES, RIGHT)]
-    return (name, Count(found.scenes), variants, Numbers(figure(found.chance)), *cells)
+    cells = [_cell(found.rates[rate]) if rate in found.rates else None for rate in SHOWN]
+    return (name, Count(found.scenes), Numbers(figure(found.chance)), *cells, Numbers(f"{found.p:.2g}"))
 
 
 def _cell(found: Estimate) -> Numbers:
@@ -201,7 +259,8 @@ def _data(found: Evidence) -> dict[str, Any]:
         for name, rate in found.rates.items()
     }
     rates.setdefault(RIGHT, None)
-    return {"scenes": found.scenes, "variants": found.variants, "chance": percent(found.chance), **rates}
+    size = {"scenes": found.scenes, "effective_scenes": round(found.effective, 1), "variants": found.variants}
+    return {**size, "chance": percent(found.chance), "p": found.p, **rates}
 
 
 def evidence_phrase(evidence: FoundEvidence) -> list[str]:

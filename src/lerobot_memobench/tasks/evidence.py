@@ -1,7 +1,8 @@
 """A scene with each of a task's variants: only the past differs. Which variant did an execution choose to act on?
 
-The instruction of most variants is the same, so what is right stands in the past alone: in the demonstration prompt. A
-policy that knows nothing of it gives one answer, the same in all variants, and its rate of right ones is known exactly.
+The instruction of most variants is the same, so the right answer follows from the past alone, from the demonstration
+prompt. A policy without the past that cannot look before it chooses gives the same answer in all variants. Its rate of
+right ones is the chance.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.formula import Atom, Formula
+from lerobot_memobench.tasks.formula import Atom, Formula, atoms
 from lerobot_memobench.tasks.progress import Evaluator
 from lerobot_memobench.tasks.task import REFERENTS, Task
 
@@ -52,7 +53,11 @@ def _variants(task: Task) -> list[Task]:
 
 
 class Choice:
-    """Follows which variant's goal an execution brings about first; call ``step`` once per execution step.
+    """Follows which variant an execution acts on; call ``step`` once per execution step.
+
+    The answer is given by the objects that are lifted and the joints that are moved, in order: when they fit one goal
+    alone, it is chosen; when they fit none, the answer is wrong. Where the goals handle the same things in the same
+    order (one object, several places), the goal that comes true first is chosen, or the only one that still can.
 
     Args:
         task: the variant that is being run. The execution chooses among those of its instruction; among all of them
@@ -67,19 +72,49 @@ class Choice:
         self._variants = {one.goal: one.variant_index for one in reversed(rivals)} | {task.goal: task.variant_index}
         self._evaluator = Evaluator(self._variants)
         self._first: int | None = None
+        self._fitting = {
+            one.variant_index: handled(one) for one in rivals if one.variant_index in self._variants.values()
+        }
+        self._watched = list(dict.fromkeys(atom for order in self._fitting.values() for atom in order))
+        self._handled: list[Atom] = []
 
     def step(self, holds: Callable[[Atom], bool]) -> None:
         """Take in the state after one control step."""
-        if self._first is not None:
+        if len(self._fitting) < 2 or self._first is not None:
+            return
+        for atom in self._watched:
+            if atom not in self._handled and holds(atom):
+                self._handled.append(atom)
+                fits = {k: order for k, order in self._fitting.items() if order[: len(self._handled)] == self._handled}
+                self._fitting = fits
+        if len(self._fitting) < 2:
             return
         reached = self._evaluator.step(holds)
         self._first = next((k for k, now in zip(self._variants.values(), reached, strict=True) if now), None)
 
     @property
+    def answered(self) -> bool:
+        """Whether an answer was given, though it may be none of the variants'."""
+        return self.variant is not None or not self._fitting
+
+    @property
     def variant(self) -> int | None:
-        """The variant whose goal came true first; else the only one that still can; None where nothing was chosen."""
-        if self._first is not None:
+        """The variant that was chosen; None where nothing was, or none of them."""
+        if self._first is not None or not self._fitting:
             return self._first
+        if len(self._fitting) == 1:
+            return next(iter(self._fitting))
         settled = zip(self._variants.values(), self._evaluator.settled, strict=True)
         left = [k for k, value in settled if value is not False]
         return left[0] if len(left) == 1 else None
+
+
+def handled(task: Task) -> list[Atom]:
+    """Return the objects that a task's checkpoints lift and the joints that they move, in order, each once."""
+    found = []
+    for atom in (atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)):
+        if atom.predicate in ("on", "in"):
+            found.append(Atom("lifted", atom.args[:1]))
+        elif atom.predicate in ("open", "turnon"):
+            found.append(Atom("ajar", atom.args))
+    return list(dict.fromkeys(found))
