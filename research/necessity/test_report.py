@@ -105,8 +105,8 @@ def test_a_trained_policy_stands_beside_the_bounds(tmp_path: Path) -> None:
     assert found["trained"] == {"policy": "me", "success": 2, "n": 6, "balanced": True}
     assert published["trained"] is None
     assert "| 33.3 [9.7–70.0] of 6 |" in side_by_side([], [found])
-    write_episodes(tmp_path, lines[::3])
-    (found,) = with_evaluations([result(STRICT_TASK, "drawn", 0.0)], read_evaluations([tmp_path]))
+    write_episodes(tmp_path / "few", lines[::3])
+    (found,) = with_evaluations([result(STRICT_TASK, "drawn", 0.0)], read_evaluations([tmp_path / "few"]))
     assert "of 2, variants out of balance |" in side_by_side([], [found])
 
 

@@ -1,0 +1,118 @@
+"""Measure how far a drawer has to be pulled until a camera or the object observation shows what is in it.
+
+    python -m research.necessity.visibility --scenes 5 --poses 400
+
+Every drawer that holds an object is pulled by the same distance, its content with it. The agent's camera is fixed; the
+wrist camera is tried from random poses of the arm near the cabinet. Per distance: the most pixels of a hidden object in
+a picture, and in how many looks the object observation lists it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import Annotated
+
+import mujoco
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, VALIDATION_SEED
+from lerobot_memobench.sim import robot
+from lerobot_memobench.sim.object_slots import ObjectSlots
+from lerobot_memobench.sim.scene import DEAD_CENTRE
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from research.command import run
+
+DISTANCES = (0.0, DEAD_CENTRE["drawer"], 0.012, 0.015, 0.018, 0.020, 0.025, 0.030, 0.040)
+"""How far drawers are pulled, m."""
+NEAR = 0.30
+"""Distance of the hand from the front of the cabinet within which a pose counts, m."""
+
+
+def hidden(task: str, seed: int) -> Episode:
+    """Return an episode of a finding task whose execution begins."""
+    episode = Episode(get_task(task), referent="random", demonstration_prompt=False)
+    episode.reset(seed)
+    while episode.phase != EXECUTION:
+        episode.step(np.zeros(ACTION_DIM, np.float32))
+    return episode
+
+
+def pull(sim: Simulation, places: tuple[tuple[str, str], ...], distance: float) -> None:
+    """Pull the drawers in which something is hidden, with their content."""
+    for thing, place in places:
+        articulation, q = sim.world.articulation(place)
+        address = int(sim.model.joint(articulation.joint).qposadr[0])
+        before = sim.site_pose(place)[0]
+        sim.data.qpos[address] = q - distance
+        mujoco.mj_kinematics(sim.model, sim.data)
+        free = int(sim.model.joint(int(sim.model.body(thing).jntadr[0])).qposadr[0])
+        sim.data.qpos[free : free + 3] += sim.site_pose(place)[0] - before
+    mujoco.mj_step1(sim.model, sim.data)
+
+
+def poses(sim: Simulation, rng: np.random.Generator, count: int) -> Iterator[NDArray[np.float64]]:
+    """Yield joint angles (7,) at which the hand is near the drawers."""
+    addresses = [int(sim.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
+    low, high = np.array([sim.model.joint(name).range for name in robot.ARM_JOINTS]).T
+    front = np.mean([sim.site_pose(a.handle_site)[0] for a, _ in sim.world.joints.values()], axis=0)
+    kept = sim.data.qpos.copy()
+    while count:
+        angles = np.clip(robot.ARM_START + rng.normal(0.0, 0.6, len(addresses)), low, high)
+        sim.data.qpos[addresses] = angles
+        mujoco.mj_kinematics(sim.model, sim.data)
+        if np.linalg.norm(sim.eef_pose()[0] - front) < NEAR:
+            count -= 1
+            yield angles
+    sim.data.qpos[:] = kept
+
+
+def visibility(
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes of each of the ten finding tasks.")] = 5,
+    looks: Annotated[int, typer.Option("--poses", min=1, help="Poses of the arm per scene.")] = 400,
+    seed: Annotated[int, typer.Option(help="First seed of the scenes.")] = VALIDATION_SEED,
+) -> None:
+    """Print a table: distance, most pixels by camera, looks in which the object observation lists the content."""
+    pixels = {camera: np.zeros(len(DISTANCES), int) for camera in MJCF_CAMERAS}
+    listed, tried = np.zeros(len(DISTANCES), int), 0
+    for task in (name for name in task_names(suite="strict") if name.startswith("find_")):
+        for number in range(scenes):
+            episode = hidden(task, seed + number)
+            sim, places = episode.sim, episode.task.prompt.places if episode.task.prompt else ()
+            slots, rng = ObjectSlots(sim), np.random.default_rng([seed, number])
+            roots = [sim.model.body(thing).rootid[0] for thing, _ in places]
+            content = np.isin(sim.model.body_rootid[sim.model.geom_bodyid], roots)
+            kinds = {slots.things[slots._owner[sim.model.body(thing).id]].kind for thing, _ in places}
+            start = sim.snapshot()
+            addresses = [int(sim.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
+            for angles in [robot.ARM_START, *poses(sim, rng, looks)]:
+                tried += 1
+                for level, distance in enumerate(DISTANCES):
+                    sim.restore(start)
+                    pull(sim, places, distance)
+                    sim.data.qpos[addresses] = angles
+                    mujoco.mj_step1(sim.model, sim.data)
+                    for camera in MJCF_CAMERAS:
+                        shown = sim.geoms(camera)
+                        seen = int((content[shown[shown >= 0]]).sum())
+                        pixels[camera][level] = max(pixels[camera][level], seen)
+                    listed[level] += any(
+                        seen and thing.kind in kinds for seen, thing in zip(slots._visible(), slots.things, strict=True)
+                    )
+    print(
+        f"{tried} looks\n\n| pulled, mm | "
+        + " | ".join(f"{camera}, pixels" for camera in pixels)
+        + " | objects, looks |"
+    )
+    print("|---:|" + "---:|" * (len(pixels) + 1))
+    for level, distance in enumerate(DISTANCES):
+        counts = " | ".join(str(found[level]) for found in pixels.values())
+        print(f"| {1000 * distance:.0f} | {counts} | {listed[level]} |")
+
+
+if __name__ == "__main__":
+    sys.exit(run("necessity.visibility", visibility))
