@@ -67,8 +67,6 @@ class MemoryPolicyServer(LeRobotModelServer):
             for step, (image, wrist) in enumerate(frames):
                 images = {"agentview": image, "wrist": wrist}
                 self._act({**obs, "images": images, "states": obs["state_history"][step]}, PROMPT, step)
-            for step in range(len(frames), now):
-                self._act(obs, PROMPT, step)
         if ctx.episode_id != self._episode:
             raise RuntimeError("this server has one memory, and another episode has begun; use one environment")
         return {"actions": self._act(obs, EXECUTION, now)}

@@ -199,7 +199,7 @@ def spaces_page() -> str:
         "phase": "0 demonstration prompt, or the robot idles; 1 execution",
         "step": "control steps since the phase began; of strict tasks since the episode began",
         "environment_state": f"{SLOTS} object slots, with `env.obs_type` of that name or `both`",
-        "picture_step": "step that the pictures show; with `env.render_every` above 1",
+        "picture_age": "control steps since the pictures were drawn; with `env.render_every` above 1",
         "expert_action": "the scripted expert's; with `env.expert_action=true`",
         "blind_action": "the published routine's; with `env.blind_action=true`",
     }

@@ -135,7 +135,7 @@ class WindowPolicy(PreTrainedPolicy):
         span = (self.config.frames - 1) * self.config.stride + 1
         self.rows = self.rows or [Row(span) for _ in clocks]
         for row, token, clock in zip(self.rows, self.tokens(batch), clocks, strict=True):
-            if clock != row.clock:  # a row that is over repeats its last frame
+            if clock[1] == -1 or clock != row.clock:  # -1: strict, no clock; a row that is over repeats its frame
                 row.past.append(token)
             if clock[1] == 0:  # a phase begins: what was planned before it is void
                 row.queue.clear()

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from folders import Setting, StrictTask
-from words import HOME, TIMES, Texts, ready, region, times
+from words import AS_BEGUN, CABINET, DRAWERS, HOME, PLACES, TIMES, Texts, left_ajar, region, times
 
-from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Round, When
+from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Never, Round, When
 
 REST = 40
 """Control steps of rest by which a policy says that it is done."""
@@ -21,7 +21,6 @@ class Counted:
         asked: what the instruction asks for. did: what a memory says of it.
         begun, ended: atoms between which the event is under way, and how a memory tells the first (coarse,
             intermediate, fine).
-        things: what stands loose in the scene.
     """
 
     name: str
@@ -33,7 +32,6 @@ class Counted:
     begun: Atom
     ended: Atom
     opened: Texts
-    things: tuple[str, ...]
 
 
 def _drawer(drawer: str) -> Counted:
@@ -52,11 +50,10 @@ def _drawer(drawer: str) -> Counted:
             f"pulled the {drawer} drawer out",
             f"pulled the cabinet's {drawer} drawer out until it stood open",
         ),
-        ("akita_black_bowl_1",),
     )
 
 
-def _stove(suffix: str, where: str, things: tuple[str, ...]) -> Counted:
+def _stove(suffix: str, where: str) -> Counted:
     return Counted(
         f"turn_the_stove_on_and_off{suffix}_a_given_number_of_times",
         f"turn_on_the_stove_and_turn_it_off{suffix}",
@@ -67,7 +64,6 @@ def _stove(suffix: str, where: str, things: tuple[str, ...]) -> Counted:
         Atom("turnon", ("flat_stove_1",)),
         Atom("turnoff", ("flat_stove_1",)),
         ("stove lit", "switched the stove on", "rotated the stove's knob until the burner glowed red"),
-        things,
     )
 
 
@@ -86,12 +82,11 @@ EVENTS = (
             "swung the microwave's door open",
             "pulled the handle of the microwave until its door stood open",
         ),
-        ("white_bowl_1", "plate_1"),
     ),
     _drawer("top"),
     _drawer("middle"),
-    _stove("", "", ("chefmate_8_frypan_1", "moka_pot_1")),
-    _stove("_near_the_shelf", " near the shelf", ("chefmate_8_frypan_1", "white_bowl_1")),
+    _stove("", ""),
+    _stove("_near_the_shelf", " near the shelf"),
 )
 
 
@@ -105,39 +100,46 @@ def strict_tasks() -> list[StrictTask]:
             "SUUC",
             tuple(_setting(event, number) for number in TIMES),
             spoilt_as="miscount",
+            regions=PLACES if _at_cabinet(event) else (),
         )
         for event in EVENTS
     ]
 
 
+def _at_cabinet(event: Counted) -> bool:
+    return event.begun.args[0].startswith(CABINET)
+
+
 def _setting(event: Counted, number: int) -> Setting:
-    before = ready(*event.things)
-    goal = When((Hold(REST, And((HOME, event.ended))), times(number, before, event.begun, event.ended)))
-    steps = [*_checkpoints(event, number, before), (goal, _rested(event, number))]
+    asked = f"{event.asked} {TIMES[number]}"
+    joints = map(region, DRAWERS) if _at_cabinet(event) else event.begun.args
+    counted = And((AS_BEGUN, *times(number, event.begun, event.ended)))
+    goal = And((Never(left_ajar(*joints)), When((Hold(REST, And((HOME, event.ended))), counted))))
+    steps = [*_checkpoints(event, number), (goal, _rested(event, number))]
     return Setting(
-        f"{event.asked} {TIMES[number]}",
+        f"{asked}, leaving everything as it was",
         goal,
         tuple(formula for formula, _ in steps),
         tuple(texts for _, texts in steps),
-        f"{event.asked[0].upper()}{event.asked[1:]} {TIMES[number]}, coming home after each time, and then rest.",
+        f"{asked[0].upper()}{asked[1:]}, coming home after each time, and then rest.",
     )
 
 
-def _checkpoints(event: Counted, number: int, before: Formula) -> list[tuple[Formula, Texts]]:
+def _checkpoints(event: Counted, number: int) -> list[tuple[Formula, Texts]]:
     """Return three moments, whatever the number: the labels of a task's checkpoints are those of all its variants."""
-    underway = [(_begun(event, k, before), _opened(event, k, number)) for k in range(1, number + 1)]
-    complete = [(_done(event, k, before), _counted(event, k, number)) for k in range(1, number + 1)]
+    underway = [(_begun(event, k), _opened(event, k, number)) for k in range(1, number + 1)]
+    complete = [(_done(event, k), _counted(event, k, number)) for k in range(1, number + 1)]
     if number == 1:
-        return [underway[0], complete[0], (And((_done(event, 1, before), HOME)), _home(event))]
+        return [underway[0], complete[0], (And((_done(event, 1), HOME)), _home(event))]
     return complete if number == 3 else [complete[0], underway[1], complete[1]]
 
 
-def _done(event: Counted, number: int, before: Formula) -> Formula:
-    return Exactly(number, Round((before, event.begun, event.ended)))
+def _done(event: Counted, number: int) -> Formula:
+    return Exactly(number, Round((AS_BEGUN, event.begun, event.ended)))
 
 
-def _begun(event: Counted, number: int, before: Formula) -> Formula:
-    return Exactly(number, Round((before, event.begun)))
+def _begun(event: Counted, number: int) -> Formula:
+    return Exactly(number, Round((AS_BEGUN, event.begun)))
 
 
 def _counted(event: Counted, done: int, asked: int) -> Texts:

@@ -1,4 +1,7 @@
-"""Finding: the video shows in which drawer a thing is hidden; shut drawers do not tell."""
+"""Finding: the video shows in which drawer an object is hidden; closed drawers do not show it.
+
+A wrong drawer that is pulled beyond what is closed loses the episode: a little further its content can be seen.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from dataclasses import dataclass
 from itertools import permutations
 
 from folders import Setting, StrictTask
-from words import CABINET, DRAWERS, Texts, region
+from words import DRAWERS, PLACES, Texts, region
 
 from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import And, Atom, Formula, Never, Not, Or
@@ -15,7 +18,6 @@ from lerobot_memobench.tasks.task import Prompt
 TABLE = "kitchen_table"
 SPOT = Region("table_region", TABLE, ((-0.09, 0.10, 0.05, 0.24), (-0.40, -0.60, 0.40, 0.60)))
 """Where a found thing goes: anywhere on the table's top. The first range is the free spot that experts use."""
-PLACES = tuple(Region(f"{drawer}_region", CABINET) for drawer in DRAWERS)
 
 
 @dataclass(frozen=True)
@@ -84,12 +86,12 @@ def _strict_task(name: str, published: str, family: str, settings: tuple[Setting
 
 def _setting(asked: Thing, drawer: str, hidden: tuple[tuple[Thing, str], ...]) -> Setting:
     place = region(drawer)
-    wrong = tuple(Atom("open", (region(other),)) for other in DRAWERS if other != drawer)
+    wrong = tuple(Atom("ajar", (region(other),)) for other in DRAWERS if other != drawer)
     on_table = Atom("on", (asked.instance, SPOT.full_name))
     goal: Formula = And((Never(Or(wrong)), Atom("wasopen", (place,)), on_table))
     checkpoints = (Atom("open", (place,)), Not(Atom("in", (asked.instance, place))), goal)
     return Setting(
-        f"find the {asked.words} in the cabinet and put it on the table",
+        f"find the {asked.words} in the cabinet without moving a wrong drawer and put it on the table",
         goal,
         checkpoints,
         (_opened(asked, drawer), _taken(asked, drawer), _found(asked, drawer, hidden)),

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from itertools import permutations
 
 from folders import Setting, StrictTask
-from words import DRAWERS, Texts, ready, region
+from words import AS_BEGUN, DRAWERS, PLACES, Texts, left_ajar, region
 
 from lerobot_memobench.tasks.bddl import Region
-from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Not, Or, Round, When
+from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Never, Not, Or, Round, When
 
 BOWL, PAN, WHITE = "akita_black_bowl_1", "chefmate_8_frypan_1", "white_bowl_1"
 STOVE, MICROWAVE = "flat_stove_1", "microwave_1"
@@ -35,13 +35,13 @@ def _once(event: Event) -> Formula:
     return And((Exactly(1, Round(event)), event[1]))
 
 
-def _before(event: Event, later: Formula, scene: Formula) -> Formula:
+def _before(event: Event, later: Formula) -> Formula:
     """When the later thing begins, the event has happened exactly once, from and back to the scene as it began."""
-    return When((later, Exactly(1, Round((scene, *event, scene)))))
+    return When((later, Exactly(1, Round((AS_BEGUN, *event, AS_BEGUN)))))
 
 
-def _done(event: Event, scene: Formula) -> Formula:
-    return Exactly(1, Round((scene, *event)))
+def _done(event: Event) -> Formula:
+    return Exactly(1, Round((AS_BEGUN, *event)))
 
 
 # --- drawers ---
@@ -54,24 +54,26 @@ def _three_drawers() -> StrictTask:
         "ordering",
         "SUC",
         tuple(_checks(order) for order in permutations(DRAWERS)),
+        regions=PLACES,
         moved=(ASIDE,),
     )
 
 
 def _checks(order: Sequence[str]) -> Setting:
-    scene = ready(BOWL)
     first, second, third = events = [_drawer(name) for name in order]
     goal = And(
         (
-            _before(first, second[0], scene),
-            _before(second, third[0], scene),
+            Never(left_ajar(*map(region, DRAWERS))),
+            _before(first, second[0]),
+            _before(second, third[0]),
             *(_once(event) for event in events),
         )
     )
     return Setting(
-        f"check the {order[0]} drawer, then the {order[1]} drawer and then the {order[2]} drawer, each exactly once",
+        f"check the {order[0]} drawer, then the {order[1]} drawer and then the {order[2]} drawer, each exactly once, "
+        "leaving everything as it was",
         goal,
-        (_done(first, scene), _done(second, scene), goal),
+        (_done(first), _done(second), goal),
         _checked(order),
         f"Look into the {order[0]}, the {order[1]} and the {order[2]} drawer in turn, coming home after each.",
     )
@@ -99,14 +101,16 @@ def _checked(order: Sequence[str]) -> tuple[Texts, Texts, Texts]:
 
 
 def _bowl_in_drawer() -> StrictTask:
-    scene, middle, top = ready(BOWL), _drawer("middle"), _drawer("top")
+    middle, top = _drawer("middle"), _drawer("top")
     begun = Or((top[0], Not(Atom("inplace", (BOWL,)))))
     stowed = Atom("in", (BOWL, region("top")))
-    goal = And((_before(middle, begun, scene), _once(middle), _once(top), stowed))
+    unmarked = Never(left_ajar(*map(region, DRAWERS)))
+    goal = And((unmarked, _before(middle, begun), _once(middle), _once(top), stowed))
     setting = Setting(
-        "check the middle drawer exactly once, then put the black bowl in the top drawer and close it",
+        "check the middle drawer exactly once, leaving everything as it was, then put the black bowl in the top drawer "
+        "and close it",
         goal,
-        (_done(middle, scene), top[0], goal),
+        (_done(middle), top[0], goal),
         (
             (
                 "middle drawer inspected",
@@ -132,28 +136,26 @@ def _bowl_in_drawer() -> StrictTask:
         "ordering",
         "SUC",
         (setting,),
+        regions=PLACES,
     )
 
 
 # --- appliances ---
 
 
-def _carried(
-    asked: str, summary: str, event: Event, things: Sequence[str], placed: Atom, texts: Sequence[Texts]
-) -> Setting:
+def _carried(asked: str, summary: str, event: Event, placed: Atom, texts: Sequence[Texts]) -> Setting:
     """An appliance is used once, then a thing is carried: when it leaves its place, that must have been."""
-    scene = ready(*things)
-    goal = And((_before(event, Not(Atom("inplace", (placed.args[0],))), scene), _once(event), placed))
-    begun = Exactly(1, Round((scene, event[0])))
-    return Setting(asked, goal, (begun, _done(event, scene), goal), tuple(texts), summary)
+    unmarked, moved = Never(left_ajar(*event[0].args)), Not(Atom("inplace", (placed.args[0],)))
+    goal = And((unmarked, _before(event, moved), _once(event), placed))
+    begun = Exactly(1, Round((AS_BEGUN, event[0])))
+    return Setting(asked, goal, (begun, _done(event), goal), tuple(texts), summary)
 
 
 def _bowl_on_plate() -> StrictTask:
     setting = _carried(
-        "open and close the microwave exactly once, then put the white bowl on the plate",
+        "open and close the microwave exactly once, leaving everything as it was, then put the white bowl on the plate",
         "Swing the microwave's door open and shut, come home, then move the white bowl from its top onto the plate.",
         (Atom("open", (MICROWAVE,)), Atom("close", (MICROWAVE,))),
-        (WHITE, "plate_1"),
         Atom("on", (WHITE, "plate_1")),
         (
             (
@@ -184,24 +186,22 @@ def _bowl_on_plate() -> StrictTask:
 
 def _pans() -> list[StrictTask]:
     return [
-        _pan("on_it", "on it", "stove", f"{STOVE}_cook_region", "moka_pot_1", "onto the stove's cooking plate"),
+        _pan("on_it", "on it", "stove", f"{STOVE}_cook_region", "onto the stove's cooking plate"),
         _pan(
             "on_the_shelf",
             "on the shelf",
             "shelf",
             "wooden_two_layer_shelf_1_top_side",
-            WHITE,
             "onto the top board of the wooden shelf",
         ),
     ]
 
 
-def _pan(suffix: str, where: str, support: str, place: str, other: str, onto: str) -> StrictTask:
+def _pan(suffix: str, where: str, support: str, place: str, onto: str) -> StrictTask:
     setting = _carried(
-        f"turn the stove on and off exactly once, then put the frying pan {where}",
+        f"turn the stove on and off exactly once, leaving everything as it was, then put the frying pan {where}",
         f"Switch the stove on and off, come home, then set the frying pan on the {support}.",
         (Atom("turnon", (STOVE,)), Atom("turnoff", (STOVE,))),
-        (PAN, other),
         Atom("on", (PAN, place)),
         (
             ("stove lit", "switched the stove on", "rotated the stove's knob until the burner glowed red"),

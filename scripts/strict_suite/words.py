@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Round
+from lerobot_memobench.tasks.bddl import Region
+from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Or, Round
 
 HOME = Atom("handhome", ())
+AS_BEGUN = Atom("asbegun", ())
+"""The scene as it began, to the bit: nothing in it can be read as a note on the past."""
 CABINET = "wooden_cabinet_1"
 DRAWERS = ("top", "middle", "bottom")
+PLACES = tuple(Region(f"{drawer}_region", CABINET) for drawer in DRAWERS)
 TIMES = {1: "once", 2: "twice", 3: "three times"}
 Texts = tuple[str, str, str]
 
@@ -16,12 +20,12 @@ def region(drawer: str) -> str:
     return f"{CABINET}_{drawer}_region"
 
 
-def ready(*things: str) -> Formula:
-    """The scene as it began: the hand home, things in their places. Nothing visible tells what has been done."""
-    found = (HOME, *(Atom("inplace", (thing,)) for thing in things))
-    return And(found) if len(found) > 1 else HOME
+def left_ajar(*joints: str) -> Formula:
+    """The hand is home and a door, drawer or knob stands in between: it could be read as a note."""
+    ajar = tuple(Atom("ajar", (joint,)) for joint in joints)
+    return And((HOME, Or(ajar) if len(ajar) > 1 else ajar[0]))
 
 
-def times(number: int, before: Formula, *event: Formula) -> Formula:
+def times(number: int, *event: Formula) -> tuple[Formula, Formula]:
     """The event has happened exactly so often, each time from the scene as it began."""
-    return And((Exactly(number, Round((before, *event))), Exactly(number, Round(event))))
+    return Exactly(number, Round((AS_BEGUN, *event))), Exactly(number, Round(event))

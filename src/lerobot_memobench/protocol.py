@@ -13,12 +13,15 @@ PROMPT_HORIZON = 1500
 750; with one of them grasped at the fifth try more than 1000."""
 IDLE_STEPS = 1800
 """Control steps that the robot idles at most before the execution of a strict task: the seed draws how many, uniformly
-from 0 on. So the step tells little of what has been done (docs/research/clock.md)."""
+from 0 on. So a policy that counts its calls cannot conclude from the count what has been done."""
 PROMPT, EXECUTION = 0, 1
 """Values of ``phase``: a demonstration prompt plays or the robot idles, and actions have no effect; the policy acts."""
 OBS_PHASE, OBS_STEP = CLOCK = ("observation.phase", "observation.step")
-"""A policy's names for an episode's phase and for the control steps since it began, of a strict task since the episode
-did. A dataset has columns of these names: both are float32, (B,) in a batch, and raw, in training as in a rollout."""
+"""A policy's names for an episode's phase and for the control steps since it began. A dataset has columns of these
+names: both are float32, (B,) in a batch, and raw, in training as in a rollout."""
+NO_CLOCK, ENDED = -1, -2
+"""Values of ``step`` in the execution of a strict task: it runs, it has ended. A policy that could read a clock would
+need no memory: it would begin each event at a time that names it."""
 
 # -- seeds
 

@@ -305,9 +305,12 @@ def test_a_short_training_shows_its_loss(training: Called) -> None:
     assert training.value("log_freq") == "5"
 
 
+EMPTY_DATASET = json.dumps({"codebase_version": "v3.0", "total_episodes": 0, "total_frames": 0, "features": {}})
+
+
 def test_train_on_a_folder(training: Called, in_folder: Path) -> None:
     (in_folder / "demos" / "meta").mkdir(parents=True)
-    (in_folder / "demos" / "meta" / "info.json").write_text("{}")
+    (in_folder / "demos" / "meta" / "info.json").write_text(EMPTY_DATASET)
     assert main(["train", "policy=act", "dataset=demos"]) == 0
     assert training.value("dataset.repo_id") == "local/demos"
     assert training.value("dataset.root") == "demos"
@@ -475,7 +478,7 @@ def test_a_training_goes_on_as_it_was_begun(training: Called, capsys: pytest.Cap
 def test_a_training_goes_on_with_its_dataset(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("mine", "other"):
         Path(name, "meta").mkdir(parents=True)
-        Path(name, "meta", "info.json").write_text("{}")
+        Path(name, "meta", "info.json").write_text(EMPTY_DATASET)
     file = training_run(Path("run")) / "train_config.json"
     words = ["train", "output_dir=run", "resume=true"]
     new_run = (

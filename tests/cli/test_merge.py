@@ -11,6 +11,8 @@ from typing import Any
 
 import dill
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from lerobot_memobench.cli.evaluate import SHARD_PROGRAM
 from lerobot_memobench.cli.lerobot import main as lerobot
@@ -132,12 +134,12 @@ def test_another_or_no_checkpoint_is_refused(fake_lerobot: Any, capsys: pytest.C
     folder = Path("checkpoint")
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps({"type": "memobench_random", "device": "cpu"}))
-    (folder / "model.safetensors").write_bytes(b"weights")
+    save_file({"weight": torch.zeros(1)}, folder / "model.safetensors")
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         (folder / name).write_text(json.dumps({"name": name, "steps": []}))
     assert lerobot([*COMMAND, "output_dir=out", "policy=checkpoint"]) == 0
     assert memobench(["rerun", "out", "--out", "again"]) == 0
-    (folder / "model.safetensors").write_bytes(b"others")
+    save_file({"weight": torch.ones(1)}, folder / "model.safetensors")
     capsys.readouterr()
     assert memobench(["rerun", "out", "--out", "other"]) == 2
     assert "is not the one that was evaluated" in capsys.readouterr().err

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes
@@ -129,11 +131,11 @@ def test_another_protocol_is_refused(
 def test_other_weights_are_refused(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
     policy = random_checkpoint(Path("checkpoint"))
     killed_after(fake_lerobot, 3, "output_dir=out", f"policy={policy}")
-    (policy / "model.safetensors").write_bytes(b"other weights")
+    save_file({"weight": torch.ones(1)}, policy / "model.safetensors")
     capsys.readouterr()
     assert evaluate("output_dir=out", "resume=true", f"policy={policy}") == 2
     assert "policy.sha256: " in capsys.readouterr().err
-    (policy / "model.safetensors").write_bytes(b"weights")
+    save_file({"weight": torch.zeros(1)}, policy / "model.safetensors")
     (policy / "train_config.json").write_text("{}")  # says nothing about what the policy does
     assert evaluate("output_dir=out", "resume=true", f"policy={policy}") == 0
 
@@ -142,7 +144,7 @@ def random_checkpoint(folder: Path) -> Path:
     """A checkpoint folder of a policy that needs no statistics."""
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps({"type": "memobench_random", "device": "cpu"}))
-    (folder / "model.safetensors").write_bytes(b"weights")
+    save_file({"weight": torch.zeros(1)}, folder / "model.safetensors")
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         (folder / name).write_text(json.dumps({"name": name, "steps": []}))
     return folder

@@ -166,9 +166,9 @@ def test_a_flaw_is_named(name: str, window: Subject) -> None:
 
 
 def test_another_history_in_training_is_named(window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
-    reader = window.dataset.reader
-    later = {key: [d - key.startswith("observation.") for d in deltas] for key, deltas in reader.delta_indices.items()}
-    monkeypatch.setattr(reader, "delta_indices", later)
+    rows = window.dataset.reader.get_item.__self__  # `samples.keep_in_memory`
+    later = {key: [d - key.startswith("observation.") for d in deltas] for key, deltas in rows.deltas.items()}
+    monkeypatch.setattr(rows, "deltas", later)
     assert failed(window) == {"same history in training"}
 
 

@@ -40,6 +40,7 @@ from lerobot_memobench.datasets.validate import Verdict, exit_status, validate
 from lerobot_memobench.envs.episode import first_execution_step
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import checkpoint_folder
+from lerobot_memobench.protocol import NO_CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from tests.support.short_demonstrations import beginning, drawn_steps
@@ -164,12 +165,12 @@ def strict_demonstration(name: str) -> Demonstration:
 
 @pytest.mark.parametrize("name", [COUNTING, HIGHLIGHT])
 def test_a_robot_that_idles_is_recorded_at_rest(name):
-    """Its step counts through, its actions are zeros, and what a policy sees is the execution's first frame."""
+    """Its actions are zeros, and a policy sees the execution's first frame, which shows no clock."""
     demo = strict_demonstration(name)
     begins, found = first_execution_step(get_task(name), IDLING_SEED, True), labels(demo)
     assert demo.success
     assert demo.exec_start == begins > 0
-    np.testing.assert_array_equal(found.step, np.arange(len(demo)))
+    np.testing.assert_array_equal(found.step, [*range(begins), *[NO_CLOCK] * (len(demo) - begins)])
     np.testing.assert_array_equal(found.phase, np.arange(len(demo)) >= begins)
     idle = ~demo.actions.any(axis=1)
     rest = int(np.flatnonzero(idle)[0])

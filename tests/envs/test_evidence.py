@@ -53,7 +53,7 @@ def test_a_scene_is_run_with_each_variant_before_the_next(tmp_path: Path) -> Non
 
 
 def test_an_episode_that_cannot_be_run_names_its_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: Any) -> None:
+    def fails(*_: Any, **__: Any) -> None:
         raise MemobenchError("no simulator")
 
     monkeypatch.setattr(Episode, "reset", fails)

@@ -12,7 +12,7 @@ import pytest
 from lerobot_memobench.envs.episode import Episode, first_execution_step, referent_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import BOTH, RESET
-from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, IDLE_STEPS, PROMPT, PROMPT_HORIZON
+from lerobot_memobench.protocol import ACTION_DIM, ENDED, EXECUTION, IDLE_STEPS, NO_CLOCK, PROMPT, PROMPT_HORIZON
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
@@ -85,7 +85,7 @@ def test_actions_have_no_effect_and_nothing_is_simulated_while_it_idles(
         told.append(seen)
         scenes.append(env.scene_hash())
         drawn.append(calls["render"])
-    assert [int(one["step"][0]) for one in told] == [*range(begins + 1)]
+    assert [int(one["step"][0]) for one in told] == [*range(begins), NO_CLOCK]
     assert all(env.observation_space.contains(one) for one in (told[0], told[-1]))
     rest = calls["step"]  # so many frames were simulated: the prompt's
     assert (rest == 0) == (get_task(name).prompt is None)
@@ -99,7 +99,7 @@ def test_actions_have_no_effect_and_nothing_is_simulated_while_it_idles(
     for step in range(1, 4):
         assert not truncated
         seen, _, _, truncated, _ = env.step(ACTION)
-        assert (seen["step"], seen["phase"]) == ([begins + step], [EXECUTION])
+        assert (seen["step"], seen["phase"]) == ([ENDED if step == 3 else NO_CLOCK], [EXECUTION])
     assert truncated
     assert (env.record()["prompt_steps"], env.record()["steps"]) == (begins, 3)
     assert begins + 3 <= env._max_episode_steps == (get_task(name).prompt_steps or 0) + IDLE_STEPS + 3
@@ -122,7 +122,7 @@ def test_idling_within_reset_ends_at_the_same_frame(shown: bool) -> None:
         env.close()
     for part, value in observations[0].items():
         np.testing.assert_array_equal(value, observations[1][part])
-    assert observations[0]["step"] == [first_execution_step(get_task(HIGHLIGHT), seed, shown)]
+    assert observations[0]["step"] == [NO_CLOCK]
 
 
 def test_published_episodes_begin_at_once_and_their_step_begins_anew() -> None:

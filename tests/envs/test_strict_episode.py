@@ -44,7 +44,7 @@ def test_every_episode_is_drawn_whatever_referent_is_asked_for(referent: str) ->
     for variant, words in enumerate(("once", "twice", "three times")):
         env.reset(seed=seed_of(STOVE, variant))
         assert env.episode.task.variant_index == variant
-        assert env.task_description == f"turn the stove on and off {words}"
+        assert env.task_description == f"turn the stove on and off {words}, leaving everything as it was"
 
 
 @pytest.mark.parametrize("referent", ["fixed", "random", "drawn"])

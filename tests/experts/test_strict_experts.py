@@ -38,7 +38,7 @@ def words(task: Task) -> list[str]:
 
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_a_round_is_planned_as_often_as_asked_for_and_then_a_rest(number: int) -> None:
-    around = ["handhome", "open microwave_1", "close microwave_1"]
+    around = ["asbegun", "open microwave_1", "close microwave_1"]
     rest = ["handhome", "close microwave_1", "rest 40"]
     assert words(get_task(MICROWAVE).variant(number - 1)) == around * number + rest
 
@@ -53,7 +53,7 @@ def test_what_is_counted_twice_is_planned_once() -> None:
 
 def test_things_are_put_away_before_the_drawer_is_shut() -> None:
     plan = words(get_task(BOWL))
-    assert plan[:5] == ["handhome", "open middle", "close middle", "handhome", "open top"]
+    assert plan[:5] == ["asbegun", "open middle", "close middle", "asbegun", "open top"]
     assert plan.index("in top") < plan.index("close top")
 
 
@@ -73,6 +73,9 @@ def test_every_counting_goal_is_reached_by_its_plan_without_physics() -> None:
             assert follows(base.variant(k)), (name, k)
 
 
+HOME = {Atom("handhome", ()), Atom("asbegun", ())}
+
+
 def follows(task: Task) -> bool:
     """Return whether the goal comes true on paper when the plan is carried out."""
     undone = {"open": "close", "turnon": "turnoff"}
@@ -80,14 +83,14 @@ def follows(task: Task) -> bool:
     plan = plan_of(task.goal)
     moved = [step for step in plan if isinstance(step, Atom) and step.predicate in undone]
     true = {Atom(undone[step.predicate], step.args) for step in moved}
-    true |= {Atom("handhome", ())} | {Atom("inplace", (thing,)) for thing in task.objects}
+    true |= HOME | {Atom("inplace", (thing,)) for thing in task.objects}
     progress = Progress(task)
     for step in plan:
         if isinstance(step, Atom) and step not in true:
-            true -= {Atom("handhome", ()), Atom(ends.get(step.predicate, ""), step.args)}
+            true -= HOME | {Atom(ends.get(step.predicate, ""), step.args)}
             if step.predicate in ("in", "on"):
                 true.discard(Atom("inplace", step.args[:1]))
-            true.add(step)
+            true |= HOME if step in HOME else {step}
         for _ in range(1 if isinstance(step, Atom) else step.number):
             progress.step(true.__contains__)
     return progress.success

@@ -19,7 +19,7 @@ from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, made_for_training
 
 OBJECTS = {"size": "small", "perception": "objects", "memory_frames": 32}
-OWN = ("--memory_stride=null", "--memory_fusion=null")
+OWN = ("--memory_stride=null", "--memory_fusion=null", "--subgoals=null")
 SETTINGS = {
     "slots": ("recurrent", {"memory_settings": {"slots": 16}}),
     "time codes": ("recurrent", {"memory_settings": {"time_codes": False}}),

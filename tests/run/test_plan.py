@@ -387,13 +387,13 @@ def test_a_name_arrives_as_it_is_typed(name: str, monkeypatch: pytest.MonkeyPatc
     assert isinstance(found.env, MemobenchEnvConfig)
     assert (found.output_dir, Path(found.env.log_dir or "")) == (Path(name), Path(name))
     Path(name).mkdir()
-    line = ["policy=memobench_small", f"dataset={name}", f"output_dir={name}", f"policy.feature_cache_dir={name}"]
+    line = ["policy=memobench_small", f"dataset={name}", f"output_dir={name}", f"policy.repo_id=user/{name}"]
     arguments = read_arguments("train", split_arguments(line))
     trained = draccus.parse(TrainPipelineConfig, args=[flag for flag in arguments.for_parser if "policy" not in flag])
     assert (trained.output_dir, Path(trained.dataset.root or "")) == (Path(name), Path(name))
     assert trained.dataset.repo_id == f"local/{name}"
     policy: Any = policy_config(arguments)
-    assert Path(policy.feature_cache_dir) == Path(name)
+    assert policy.repo_id == f"user/{name}"
 
 
 def test_a_text_that_the_parser_would_open_as_a_file_is_refused() -> None:

@@ -192,7 +192,7 @@ def test_a_strict_card_is_repeated_only_where_the_robot_idles_as_long(told: dict
     flags = ["--env.type=memobench", "--policy.type=memobench_random", "--env.suite=strict"]
     asked = {"tasks": [COUNTING], "episodes": 1, "suite": "strict", **told}
     write_card(Path(), card(flags, protocol=asked))
-    idled = f"idled {told.get('idle', 0)} steps at most, and idles {IDLE_STEPS} here.*repeat it with that version"
+    idled = f"idle={told.get('idle', 0)}, and this version idle={IDLE_STEPS}.*repeat it with that version"
     with pytest.raises(MemobenchError, match=idled):
         rerun.repeat(Path("card.json"), None, None, lambda plan: pytest.fail("it was run"), print)
 

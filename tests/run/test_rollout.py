@@ -115,12 +115,13 @@ MEMORY = {"chunk_size": PLAN, "n_action_steps": PLAN, "num_inference_steps": 1, 
 FIRST, LAST = PROMPT, PROMPT + HORIZON
 """Of the execution, which are always drawn."""
 
+WITHOUT = {key: value for key, value in MEMORY.items() if not key.startswith("memory_")} | {"memory_fusion": "none"}
 CASES: dict[str, tuple[str, dict[str, Any], list[int]]] = {
     "expert": ("memobench_expert", {}, [0, FIRST, LAST]),
     "random": ("memobench_random", {}, [0, FIRST, LAST]),
     "memory": ("memobench_mem", MEMORY, list(range(LAST + 1))),
     "memory of every fourth": ("memobench_mem", {**MEMORY, "memory_stride": 4}, [0, 4, FIRST, 8, 10, 12, 14, LAST]),
-    "no memory": ("memobench_mem", {**MEMORY, "memory_fusion": "none"}, [0, FIRST, 10, 14, LAST]),
+    "no memory": ("memobench_mem", WITHOUT, [0, FIRST, 10, 14, LAST]),
 }
 
 

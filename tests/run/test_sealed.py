@@ -186,7 +186,7 @@ def test_the_count_travels_with_a_checkpoint_and_is_no_part_of_it(
     for name in ("notes.txt", "other.json", "other.safetensors"):  # nothing loads them
         (folder / name).write_text("{}")
     assert numbers(plan_line([*line, "output_dir=c"])) == [3]
-    steps = [{"state_file": "other.safetensors"}]
+    steps = [{"registry_name": "to_batch_processor", "state_file": "other.safetensors"}]
     (folder / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
     assert numbers(plan_line([*line, "output_dir=d"])) == [1]
     (folder / "other.safetensors").write_text("[]")

@@ -272,8 +272,9 @@ def validate(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     suite: OfSuite = None,
 ) -> int:
-    """Replay every episode in the simulator, and read every file to its end. The first disagreement of each is
-    reported, and files that were written again.
+    """Replay every episode and read every file to its end.
+
+    The first disagreement of each is reported, and files that were written again.
     """
     from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
     from lerobot_memobench.datasets.validate import exit_status

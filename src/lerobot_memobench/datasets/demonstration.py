@@ -21,6 +21,7 @@ from lerobot_memobench.protocol import (
     CAMERAS,
     CONTROL_HZ,
     EXECUTION,
+    NO_CLOCK,
     OBS_PHASE,
     OBS_STEP,
     PROMPT,
@@ -144,7 +145,7 @@ class Labels:
 
     Attributes:
         phase: (T,) int64, 0 prompt, 1 execution.
-        step: (T,) int64, control steps since that phase began; of a task that idles, since the episode began.
+        step: (T,) int64, control steps since that phase began; `NO_CLOCK` in the execution of a task that idles.
         index: (T,) int64, checkpoints completed in order at frames before t: the number of the one worked on.
         operation: (T,) int64, 0 S, 1 U, 2 C of that checkpoint, -1 when none is left.
         completed: (T, 6) bool, checkpoint k has been satisfied at some frame up to and including t.
@@ -214,7 +215,7 @@ def labels(demo: Demonstration) -> Labels:
     acting = frames >= demo.exec_start
     return Labels(
         phase=np.where(acting, EXECUTION, PROMPT).astype(np.int64),
-        step=np.where(acting & (not task.idles), frames - demo.exec_start, frames),
+        step=np.where(acting, NO_CLOCK if task.idles else frames - demo.exec_start, frames),
         index=index,
         operation=np.array(codes, dtype=np.int64)[index],
         completed=np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),

@@ -22,7 +22,7 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_memobench.envs.acting import acting, parameters_of
 from lerobot_memobench.envs.command_line import policy_being_run, rename_map, training_runs
-from lerobot_memobench.envs.episode_log import SETTINGS, check_protocol, idling
+from lerobot_memobench.envs.episode_log import SETTINGS, check_protocol, revision
 from lerobot_memobench.envs.observations import (
     AUTO,
     EVERY,
@@ -82,7 +82,7 @@ class MemobenchEnvConfig(EnvConfig):
             whole meshes: for films, at ten times the cost).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
             of actions a policy executes per prediction: it looks at nothing else. A policy that remembers the frames
-            in between refuses it; `observation.picture_step` tells such a one which step it is shown.
+            in between refuses it; `observation.picture_age` has the control steps since the pictures were drawn.
         replan_steps: that number, noted in the episode log; None for the policy's own `n_action_steps`.
         expert_action: offer the scripted expert's action as `observation.expert_action`.
         blind_action: offer that of the published routine, blind to prompt and instruction, as
@@ -180,7 +180,7 @@ class MemobenchEnvConfig(EnvConfig):
     def protocol(self) -> dict[str, Any]:
         """What must agree for two evaluations to be one, or to be compared; without what is still `auto`."""
         chosen = {name: getattr(self, name) for name in SETTINGS if getattr(self, name) != AUTO}
-        return {**chosen, **idling(self.suite)}
+        return {**chosen, **revision(self.suite)}
 
     def selected(self) -> list[tuple[str, int, Path]]:
         """Return memory type, task id and folder of each chosen task; unknown names raise `MemobenchError`."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.pacing import NOTHING, Pacing, steps_per_action
+from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
 from lerobot_memobench.errors import check_choice
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
@@ -21,9 +22,11 @@ from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import (
     ACTION_DIM,
     CAMERAS,
+    ENDED,
     EXECUTION,
     HORIZON,
     IDLE_STEPS,
+    NO_CLOCK,
     PROMPT,
     PROMPT_HORIZON,
     SPLITS,
@@ -97,12 +100,13 @@ class Episode:
     def _rng(self, stream: int) -> np.random.Generator:
         return generator(self.published, self.seed, stream)
 
-    def reset(self, seed: int, variant: int | None = None) -> None:
+    def reset(self, seed: int, variant: int | None = None, *, keep_prompt: bool = False) -> None:
         """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions.
 
         Args:
             seed: of the scene.
             variant: the one that is shown, whatever the seed draws; which one the execution chooses is then followed.
+            keep_prompt: whether its prompt is simulated once and kept (`prompt_cache`).
         """
         self.seed = int(seed)
         self.fault: Fault | None = None
@@ -126,12 +130,11 @@ class Episode:
         self._wrong: list[Atom] = []
         self._expert: Expert | None = None
         self._blind: Iterator[NDArray[np.float32]] | None = None
-        self._demonstrator: Iterator[NDArray[np.float32]] | None = None
-        self._next_prompt_action: NDArray[np.float32] | None = None
+        self._prompt: Prompt | None = None
         if self.demonstration_prompt or (task.prompt is not None and not task.prompt.restores):
-            self._prompt = PromptDemonstrator(task, self.sim, self._rng(2))
-            self._demonstrator = self._prompt.actions()
-            self._next_prompt_action = next(self._demonstrator, None)
+            longest = PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
+            file = prompt_file(task, self.seed, self.scene_hash) if keep_prompt else None
+            self._prompt = prompt_of(PromptDemonstrator(task, self.sim, self._rng(2)), self.sim, longest, file)
         if not self.demonstration_prompt:
             self._show_unseen()
         self._starts = first_execution_step(self.published, self.seed, self.demonstration_prompt)
@@ -139,34 +142,32 @@ class Episode:
 
     def _show_unseen(self) -> None:
         """Play the prompt before the first frame: without it there would be nothing to find."""
-        while self._demonstrator is not None:
+        self.skip_prompt_frames()
+        while self._prompt is not None:
             self._step_prompt()
         self.step_index = 0
 
-    def _step_prompt(self) -> None:
-        """Show the prompt's next action; when there is none, let the scene rest: nothing is simulated."""
-        if self._next_prompt_action is None:
-            self.applied_action = np.zeros(ACTION_DIM, np.float32)
-        else:
-            self.applied_action = np.asarray(self._next_prompt_action, dtype=np.float32)
-            self.sim.step(self.applied_action)
-        self.step_index += 1
-        if self._demonstrator is None:
-            return
-        longest = self.task.prompt_steps
-        self._next_prompt_action = next(self._demonstrator, None)
-        if self._next_prompt_action is None or self.step_index >= (PROMPT_HORIZON if longest is None else longest):
-            self._end_prompt()
+    def skip_prompt_frames(self) -> None:
+        """Leave out the frames of a kept prompt but its end: the caller reads none of them."""
+        if self._prompt is not None:
+            self._prompt.observed = False
 
-    def _end_prompt(self) -> None:
+    def _step_prompt(self) -> None:
+        """Show the prompt's next step; when there is none, let the scene rest: nothing is simulated."""
+        self.applied_action = np.zeros(ACTION_DIM, np.float32) if self._prompt is None else self._prompt.step()
+        self.step_index += 1
+        if self._prompt is not None and self._prompt.over:
+            self._end_prompt(self._prompt)
+
+    def _end_prompt(self, prompt: Prompt) -> None:
         """Put the scene back exactly as it was, unless something was hidden in it."""
-        self.prompt_shown = self._prompt.shown
+        self.prompt_shown = prompt.shown
         self.sim.end_prompt(self._start, () if self.task.prompt is None else self.task.prompt.places)
-        self._demonstrator = self._next_prompt_action = None
+        self._prompt = None
 
     def _begin_if_due(self) -> None:
         """Hand over to the policy, where prompt and rest are over."""
-        if self._demonstrator is not None or self.step_index < self._starts:
+        if self._prompt is not None or self.step_index < self._starts:
             return
         self.sim.begin_execution()
         self.exec_start = self.step_index
@@ -182,7 +183,7 @@ class Episode:
     @property
     def idling(self) -> bool:
         """Nothing moves until the execution begins: the prompt is over, or there is none."""
-        return self.phase == PROMPT and self._demonstrator is None
+        return self.phase == PROMPT and self._prompt is None
 
     @property
     def still(self) -> bool:
@@ -191,12 +192,15 @@ class Episode:
 
     @property
     def clock(self) -> int:
-        """Control steps as a policy is told them: the same at the first execution frame, whatever the prompt showed.
+        """Value of ``step`` in observations: control steps since the phase began; `NO_CLOCK` where a task idles.
 
-        They count through where the task idles, which hides when the execution began. Elsewhere they count from the
-        beginning of the phase: prompts take the time that they need, which would tell what they showed.
+        Where it idles the count begins with the episode and ends with the execution, which shows no clock.
         """
-        return self.step_index - (0 if self.task.idles else self.exec_start or 0)
+        if self.phase == PROMPT:
+            return self.step_index
+        if self.task.idles:
+            return ENDED if self.done else NO_CLOCK
+        return self.step_index - (self.exec_start or 0)
 
     @property
     def heeds(self) -> bool:

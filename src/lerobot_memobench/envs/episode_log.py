@@ -80,7 +80,8 @@ class Outcome(TypedDict, total=False):
         prompt_steps: control steps before the execution: of the demonstration prompt, and of idling.
         steps: execution steps.
         paused_steps: control steps of pauses, where there were to be some.
-        choice: where each scene is run with each variant: which one was acted on, None for no one that could be told.
+        choice: where each scene is run with each variant: which one was acted on; None: none of them.
+        answered: whether an answer was given; False with a choice of None: none was.
         variants: then, of the task: how many there are to choose from.
         chance: then, of the task: the rate of right choices without the past; None where the instruction tells.
         failure: class of the failure; None for a success.
@@ -98,6 +99,7 @@ class Outcome(TypedDict, total=False):
     steps: Count | None
     paused_steps: Whole
     choice: Count | None
+    answered: bool
     variants: Count
     chance: Number | None
     failure: Name | None
@@ -164,7 +166,7 @@ def episode_record(episode: Episode, number: int, replan_steps: int | None, wall
         "steps": episode.exec_steps,
         **({"paused_steps": episode.pacing.paused_steps} if episode.pacing.pauses else {}),
         "success": episode.success,
-        **({} if episode.choice is None else evidence_line(task, episode.choice.variant)),
+        **({} if episode.choice is None else evidence_line(task, episode.choice.variant, episode.choice.answered)),
         "checkpoints": [
             {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
             for checkpoint, first, ordered in zip(
@@ -179,9 +181,9 @@ def episode_record(episode: Episode, number: int, replan_steps: int | None, wall
     }
 
 
-def evidence_line(task: Task, choice: int | None) -> dict[str, Any]:
-    """Return what the line of an episode says of a choice among a task's variants."""
-    return {"choice": choice, "variants": len(task.random_variants), "chance": chance(task)}
+def evidence_line(task: Task, choice: int | None, answered: bool) -> dict[str, Any]:
+    """Return the part of an episode's line about its choice among a task's variants."""
+    return {"choice": choice, "answered": answered, "variants": len(task.random_variants), "chance": chance(task)}
 
 
 def key_of(record: Mapping[str, Any]) -> tuple[str, int, str]:
@@ -438,7 +440,9 @@ SETTINGS = (
 IDLE = "idle"
 """Control steps that the robot of a strict task idles at most before the execution. It is no choice: protocols hold it
 because the first strict evaluations were without."""
-UNTOLD: dict[str, Any] = {"suite": PUBLISHED, "pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0}
+GOALS, STRICT_GOALS = "goals", 2
+"""Revision of the goals of strict tasks: 1 could be reached without a memory, by notes in the scene and a clock."""
+UNTOLD: dict[str, Any] = {"suite": PUBLISHED, "pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1}
 """What a protocol means that leaves these out: there was nothing else when it was written."""
 INPUTS = "inputs"
 """Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote them down."""
@@ -469,7 +473,7 @@ class Settings(TypedDict, total=False):
         oracle_memory: whether the instruction tells what was done so far.
         pause_steps, speed: of the execution, see `pacing`.
         evidence: whether each scene is run with each variant.
-        idle: see `IDLE`; of strict tasks alone.
+        idle, goals: see `IDLE`, `GOALS`; of strict tasks alone.
         inputs: what the policy was given.
     """
 
@@ -486,6 +490,7 @@ class Settings(TypedDict, total=False):
     pause_steps: Whole
     speed: Number
     idle: Count | None
+    goals: Count
     evidence: bool
     inputs: Name | None
 
@@ -518,9 +523,9 @@ class WholeProtocol(Settings):
     episodes: Episodes
 
 
-def idling(suite: str) -> dict[str, int]:
-    """Return what the protocol of a suite says of idling: nothing where its tasks do not idle."""
-    return {IDLE: IDLE_STEPS} if suite == STRICT else {}
+def revision(suite: str) -> dict[str, int]:
+    """Return the part of a suite's protocol that changed with versions: idling and goals of strict tasks."""
+    return {IDLE: IDLE_STEPS, GOALS: STRICT_GOALS} if suite == STRICT else {}
 
 
 def differences(

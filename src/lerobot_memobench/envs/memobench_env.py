@@ -20,9 +20,9 @@ from lerobot_memobench.envs.episode_log import (
     EpisodeLog,
     episode_record,
     has_log,
-    idling,
     not_run_record,
     read_log,
+    revision,
 )
 from lerobot_memobench.envs.observations import (
     EVERY,
@@ -69,9 +69,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, or ``environment_state``
     float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and
-    actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began, of a strict task since
-    the episode began; on request ``expert_action`` (7,), ``blind_action`` (7,). A strict task's robot idles before the
-    execution, with ``phase`` 0.
+    actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began, in the execution of a
+    strict task `NO_CLOCK` or `ENDED`; on request ``expert_action`` (7,), ``blind_action`` (7,). A strict task's robot
+    idles before the execution, with ``phase`` 0.
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
@@ -150,7 +150,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "oracle_memory": oracle_memory,
             "pause_steps": pause_steps,
             "speed": speed,
-            **idling(self._task.suite),
+            **revision(self._task.suite),
             "evidence": evidence,
             **acting.protocol,
         }
@@ -208,6 +208,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         With the prompt played in here (`prompt_in`), the first observation is that of the first execution frame.
         """
         super().reset(seed=seed)
+        named = seed is not None  # an episode of a drawn seed does not come again
         self._seed = seed = int(self.np_random.integers(*UNSEEDED)) if seed is None else int(seed)
         self._started = time.monotonic()
         self._began, self._closed, self._over, self._not_run = True, False, False, None
@@ -217,7 +218,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._scene_seed = self._seed_base + scene
         note_sealed(self._scene_seed, self._log_dir)
         with self._noting():
-            self.episode.reset(self._scene_seed, variant)
+            self.episode.reset(self._scene_seed, variant, keep_prompt=named)
         if self._not_run is not None:
             return blank(self.observation_space), self._info()
         self._describe(0)
@@ -234,6 +235,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def _play_prompt(self) -> None:
         """Let prompt and rest run to their end; they are drawn for a video only."""
         self._observer.needed = False
+        if self._video is None:
+            self.episode.skip_prompt_frames()
         while self.episode.phase == PROMPT:
             self.episode.step(np.zeros(ACTION_DIM, np.float32))
             self._observe()
@@ -354,7 +357,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             return blank(self.observation_space)
         episode = self.episode
         observation: dict[str, Any] = {
-            **self._observer.observation(),
+            **self._observer.observation(episode.step_index),
             "agent_pos": episode.sim.proprio(),
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.clock], dtype=np.float32),

@@ -17,6 +17,7 @@ from lerobot_memobench.protocol import (
     ACTION_DIM,
     CAMERAS,
     CONTROL_HZ,
+    ENDED,
     EXECUTION,
     HORIZON,
     IDLE_STEPS,
@@ -180,22 +181,23 @@ def observation_space(
 ) -> spaces.Dict:
     """Return the space of observations, with the actions of the scripted expert or the blind routine on request.
 
-    Where not every step is drawn, ``picture_step`` tells which step the pictures show.
+    Where not every step is drawn, ``picture_age`` has the control steps since the pictures were drawn. ``step`` is
+    `NO_CLOCK` or `ENDED` in the execution of strict tasks.
     """
     reach = np.repeat(np.array([3.0, 2 * np.pi, 0.1], np.float32), (3, 3, 2))  # m, rad, m
-    steps = spaces.Box(0, PROMPT_HORIZON + IDLE_STEPS + horizon, (1,), np.float32)
+    longest = PROMPT_HORIZON + IDLE_STEPS + horizon
     parts: dict[str, spaces.Space[Any]] = {
         "agent_pos": spaces.Box(-reach, reach, (PROPRIO_DIM,), np.float32),
         # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
         # tell by itself when each row of a batch starts and stands still.
         "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
-        "step": steps,
+        "step": spaces.Box(ENDED, longest, (1,), np.float32),
     }
     if obs_type != OBJECTS:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         parts["pixels"] = spaces.Dict(dict.fromkeys(CAMERAS, image))
         if render_every > 1:
-            parts["picture_step"] = steps
+            parts["picture_age"] = spaces.Box(0, longest, (1,), np.float32)
     if obs_type != PIXELS:
         low, high = (np.tile(np.repeat(ends, [*FIELDS.values()]), SLOTS) for ends in zip(*BOUNDS.values(), strict=True))
         parts["environment_state"] = spaces.Box(low.astype(np.float32), high.astype(np.float32), (SIZE,), np.float32)
@@ -272,15 +274,15 @@ class Observer:
         if not self._pictures_rest:  # a scene at rest is drawn once
             self._images: dict[str, Image] = episode.images()
         self._pictures_rest = episode.still
-        self._picture_step, self._picture_clock = episode.step_index, episode.clock
+        self._picture_step = episode.step_index
 
-    def observation(self) -> dict[str, Any]:
-        """Return the observation's pictures and objects, see `observation_space`."""
+    def observation(self, step_index: int) -> dict[str, Any]:
+        """Return the pictures and objects of an episode's observation, see `observation_space`."""
         found: dict[str, Any] = {}
         if self._has_pictures:
             found["pixels"] = dict(self._images)
             if self._render_every > 1:
-                found["picture_step"] = np.array([self._picture_clock], dtype=np.float32)
+                found["picture_age"] = np.array([step_index - (self._picture_step or 0)], dtype=np.float32)
         if self._has_objects:
             found["environment_state"] = self._objects.copy()  # repeated where it is not read
         return found

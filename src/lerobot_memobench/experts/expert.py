@@ -54,8 +54,10 @@ REPAIRS = 3
 Step = Atom | Hold
 """An atom to bring about, or a rest: a `Hold` whose child is so already."""
 
-_NOT_BROUGHT_ABOUT = ("inplace",)
-"""Predicates that an expert keeps true by leaving things alone."""
+_NOT_BROUGHT_ABOUT = ("inplace", "ajar", "lifted")
+"""Predicates that an expert leaves alone."""
+_HOME = ("handhome", "asbegun")
+"""Predicates that an expert brings about by coming home."""
 
 
 def steps_of(formula: Formula) -> list[Atom]:
@@ -199,7 +201,7 @@ class Expert:
         if isinstance(step, Hold):
             rest = step.number
         else:
-            rest = LINGER if step.predicate == "handhome" and not self._holds(step) else 0
+            rest = LINGER if step.predicate in _HOME and not self._holds(step) else 0
             yield from self.achieve(step)
         for _ in range(rest):
             yield self.hand.toward(*self.sim.home, OPEN)
@@ -212,7 +214,7 @@ class Expert:
     def achieve(self, atom: Atom) -> Steps:
         """Bring one atom about, unless it is already so; for home that is not near enough."""
         hand = self.hand
-        if atom.predicate == "handhome":
+        if atom.predicate in _HOME:
             for _ in range(TRIES):  # the arm may be pushed on the way
                 yield from come_home(hand, *self.sim.home)
                 if self._holds(atom):

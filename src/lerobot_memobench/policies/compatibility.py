@@ -19,6 +19,7 @@ from lerobot_memobench.policies.checkpoint import (
     shipped_policies,
     statistics_shapes,
 )
+from lerobot_memobench.protocol import ENDED, NO_CLOCK
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
@@ -40,8 +41,8 @@ SIZE_COUNTS = {
 they have one. All others bring every picture to a size of their own."""
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 """What the names of the cameras begin with that LeRobot's ``policy.empty_cameras`` adds: nobody has them."""
-PICTURE_STEP = "picture_step"
-"""Observation: the step whose pictures are shown; told by an environment that does not draw every step."""
+PICTURE_AGE = "picture_age"
+"""Observation: control steps since its pictures were drawn, of an environment that does not draw every step."""
 REFUSAL = "leave env.render_every at 1 for a policy that remembers the frames between its plans"
 
 
@@ -199,11 +200,25 @@ def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, Policy
             )
 
 
-def require_fresh(step: int | None, picture_step: int | None) -> None:
-    """Refuse a frame that is to be remembered and shows an earlier step; None where the environment tells no step.
+def require_fresh(picture_age: int | None) -> None:
+    """Refuse a frame that is to be remembered and shows an earlier step; None where every step is drawn.
 
     Raises:
-        MemobenchError: it does.
+        MemobenchError: its pictures are some control steps old.
     """
-    if None not in (step, picture_step) and step != picture_step:
-        raise MemobenchError(f"the frame of step {step} shows step {picture_step} again; {REFUSAL}")
+    if picture_age:
+        raise MemobenchError(f"the pictures of a frame are {picture_age} control steps old; {REFUSAL}")
+
+
+Clock = tuple[int, int]
+"""Phase and step of an observation (`lerobot_memobench.protocol`)."""
+
+
+def begins_episode(last: Clock | None, now: Clock) -> bool:
+    """Return whether an observation is the first of an episode, given the clock of the one before."""
+    return last is None or (now[1] != ENDED and (now < last or last[1] == ENDED))
+
+
+def is_frozen(last: Clock | None, now: Clock) -> bool:
+    """Return whether nothing has moved since the observation before: the episode has ended."""
+    return now[1] == ENDED or (now == last and now[1] != NO_CLOCK)

@@ -20,12 +20,12 @@ from typing import Any
 from draccus.utils import is_enum, is_literal, is_union
 
 from lerobot_memobench.envs.episode_log import (
-    IDLE,
     MOST_EPISODES,
+    UNTOLD,
     differences,
-    idling,
     read_log,
     read_protocol_file,
+    revision,
 )
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.errors import MemobenchError
@@ -33,7 +33,7 @@ from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.protocol import HORIZON, IDLE_STEPS, SEALED
+from lerobot_memobench.protocol import HORIZON, SEALED
 from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, flag_value, setting_type, without_none
 from lerobot_memobench.run.arguments import settings as settings_of
 from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_otherwise, tree_hash
@@ -108,11 +108,12 @@ def repeat(
             f"not draw in balance; repeat it with that version ({_version_of(card)})"
         )
     told = card["protocol"]
-    if told.get(IDLE, 0) != idling(told.get("suite", PUBLISHED)).get(IDLE, 0):
-        raise MemobenchError(
-            f"the robot of the card's strict episodes idled {told.get(IDLE, 0)} steps at most, and idles {IDLE_STEPS} "
-            f"here: an earlier version ran them; repeat it with that version ({_version_of(card)})"
-        )
+    for name, here in revision(told.get("suite", PUBLISHED)).items():
+        if (there := told.get(name, UNTOLD[name])) != here:
+            raise MemobenchError(
+                f"the card's protocol of strict tasks has {name}={there}, and this version {name}={here}: an earlier "
+                f"version ran it; repeat it with that version ({_version_of(card)})"
+            )
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_card(card, out)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
-from lerobot_memobench.sim.assets.builder import SITE_GROUP
+from lerobot_memobench.sim.assets.builder import SITE_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE, build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -84,6 +84,7 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
     if task.suite == STRICT:
         add_detents(spec, assets)
         stop_rolling(spec, task.objects)
+        seal_drawers(spec, assets)
     return spec, assets
 
 
@@ -97,6 +98,9 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
 # In the published scenes an artichoke in a drawer, or a biscuit on its edge, rolls on until something stops it; at the
 # back of a shut drawer no hand from above can take it. In the strict suite, where things are hidden and found, rolling
 # friction brings them to rest within a second.
+#
+# In the published scenes a drawer has a play of 1.5 mm, through which the wrist camera sees its content. In the strict
+# suite a board behind the front fills the opening.
 
 LEVER = 0.05
 """Distance from a hinge to the spring's moving end, m."""
@@ -109,9 +113,11 @@ ROLLING = 0.002
 """Rolling friction, m: how far from under the middle a surface holds a thing that rolls."""
 
 
-_DETENTS = {"drawer": (0.009, 5.0), "door": (0.035, 0.45), "knob": (0.09, 0.15)}
-"""How far from the closed end the dead centre is, m or rad, and how hard the spring presses there, N or Nm: harder than
-the joint's friction, from wherever the joint counts as closed or off."""
+DEAD_CENTRE = {"drawer": 0.009, "door": 0.035, "knob": 0.09}
+"""Distance of the spring's dead centre from the closed end, m or rad."""
+_PRESS = {"drawer": 5.0, "door": 0.45, "knob": 0.15}
+"""Force of the spring at the closed end, N or Nm: more than the joint's friction, from wherever it counts as closed or
+off."""
 
 
 def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
@@ -129,7 +135,7 @@ def _add_spring(
     spec: mujoco.MjSpec, fixture: mujoco.MjsBody, joint: mujoco.MjsJoint, articulation: Articulation
 ) -> None:
     """Add the spring: it runs from beside the way of a point of the moving part to that point."""
-    travel, press = _DETENTS[articulation.kind]
+    travel, press = DEAD_CENTRE[articulation.kind], _PRESS[articulation.kind]
     lever = 1.0 if articulation.kind == "drawer" else LEVER
     reach = travel * lever
     dead_centre = articulation.closed_q + np.sign(articulation.open_q - articulation.closed_q) * travel
@@ -165,3 +171,20 @@ def stop_rolling(spec: mujoco.MjSpec, names: Iterable[str]) -> None:
             if geom.contype or geom.conaffinity:
                 geom.condim = 6
                 geom.friction = [*geom.friction[:2], ROLLING]
+
+
+def seal_drawers(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
+    """Add the boards that close the play of drawers: they are seen, and touched by nothing."""
+    for asset in assets.values():
+        for body, (centre, half) in asset.seals.items():
+            spec.body(body).add_geom(
+                name=f"{body}_seal",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=list(centre),
+                size=list(half),
+                group=VISUAL_GROUP,
+                contype=0,
+                conaffinity=0,
+                mass=0.0,
+                rgba=[0.28, 0.21, 0.17, 1.0],
+            )

@@ -70,6 +70,8 @@ class Snapshot:
     goal_position: Array
     goal_rotation: Array
     gripper: Array
+    goes_on: bool
+    """Whether it continues the state before it (`Start.mark_step`)."""
 
 
 class Simulation:
@@ -95,8 +97,9 @@ class Simulation:
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
         self.world = World(task, self.model, self.data, scene.assets)
-        self._start = Start(self.model, self.data, tuple(task.objects))
+        self._start = Start(self.model, self.data, tuple(task.objects), self.world.joints)
         self._at_home: Snapshot | None = None
+        self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
         self._controller = make_controller(self.model)
         self._placer = Placer(task, self.model, self.data, scene.assets)
@@ -131,8 +134,9 @@ class Simulation:
         self.begin_execution()
 
     def begin_execution(self) -> None:
-        """Take the places of all things now for those that ``inplace`` compares with."""
-        self._start.mark_things()
+        """Take the present state as the one with which the atoms of `SINCE_START` compare."""
+        self._start.mark_scene()
+        self._begun = self.snapshot()
 
     def step(self, action: ArrayLike) -> None:
         """Advance by one control step of 50 ms.
@@ -150,8 +154,12 @@ class Simulation:
         self._controller.set_goal(self.data, action)
         self._controller.advance(self.data, float(action[6]), SUBSTEPS)
         self._check_physics(time)
-        if self._at_home is not None and action[6] <= 0.0 and self._start.in_detent():
-            self._stand_as(self._at_home)  # unless it is told to close: it must be able to
+        closing = action[6] > 0.0  # a hand must be able to leave the detent by closing
+        if self._at_home is not None and self._begun is not None and not closing and self._start.in_detent():
+            if self._start.nearly_as_begun():
+                self._put_back(self._begun)
+            else:
+                self._put_back(self._at_home, arm_only=True)
 
     def _check_physics(self, time: float) -> None:
         """Raise what MuJoCo has warned of since ``time``: it goes on from the model's initial state without a word."""
@@ -162,17 +170,18 @@ class Simulation:
             counts[:] = 0
             raise UnstablePhysicsError(f"the physics broke down {time:.2f} s after the scene was set up: {said}")
 
-    def _stand_as(self, home: Snapshot) -> None:
-        """Put arm, fingers and controller back as they were, to the bit; time and all other things stay as they are.
+    def _put_back(self, start: Snapshot, arm_only: bool = False) -> None:
+        """Restore a snapshot to the bit, except for the time: the whole scene, or arm, fingers and controller.
 
         Joint angles too, not only the hand's pose: seven joints can hold one pose in many ways, and which one it is
-        would tell where the arm has come from.
+        would show where the arm has come from.
         """
         time, qpos, qvel = self.data.time, self.data.qpos.copy(), self.data.qvel.copy()
-        self.restore(home)
-        others = max(self._finger_qpos) + 1  # the arm comes first in the model, its fingers last of it
-        self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
-        mujoco.mj_step1(self.model, self.data)
+        self.restore(start)
+        if arm_only:
+            others = max(self._finger_qpos) + 1  # the arm comes first in the model, its fingers last of it
+            self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
+            mujoco.mj_step1(self.model, self.data)
         self.data.time = time
 
     # --- state ----------------------------------------------------------------------------------------------
@@ -181,6 +190,11 @@ class Simulation:
     def state_dim(self) -> int:
         """Length of `state()`: 1 + nq + nv of the compiled model."""
         return int(1 + self.model.nq + self.model.nv)
+
+    @property
+    def physics_dim(self) -> int:
+        """Length of `Snapshot.physics`."""
+        return mujoco.mj_stateSize(self.model, self._full)
 
     def state(self) -> Array:
         """Return time, qpos and qvel as one vector (state_dim,), as the published files store it."""
@@ -220,20 +234,23 @@ class Simulation:
 
     def snapshot(self) -> Snapshot:
         """Return all that decides how the simulation goes on, controller and solver warm start included."""
-        physics = np.empty(mujoco.mj_stateSize(self.model, self._full))
+        physics = np.empty(self.physics_dim)
         mujoco.mj_getState(self.model, self.data, physics, self._full)
         controller = self._controller
-        return Snapshot(
-            physics, controller.goal_position.copy(), controller.goal_rotation.copy(), controller.gripper.copy()
-        )
+        position, rotation = controller.goal_position.copy(), controller.goal_rotation.copy()
+        return Snapshot(physics, position, rotation, controller.gripper.copy(), self._start.goes_on)
 
-    def restore(self, snapshot: Snapshot) -> None:
-        """Go back to a snapshot of this simulation, bit for bit."""
+    def restore(self, snapshot: Snapshot, *, replayed: bool = False) -> None:
+        """Go to a snapshot of this simulation, bit for bit.
+
+        Args:
+            replayed: the present state is the one before the snapshot, as when it was taken.
+        """
+        self._start.mark_step(goes_on=replayed and snapshot.goes_on)
         mujoco.mj_setState(self.model, self.data, snapshot.physics, self._full)
         self._controller.goal_position = snapshot.goal_position.copy()
         self._controller.goal_rotation = snapshot.goal_rotation.copy()
         self._controller.gripper = snapshot.gripper.copy()
-        self._start.mark_step(goes_on=False)
         mujoco.mj_step1(self.model, self.data)
 
     def end_prompt(self, start: Snapshot, hidden: Sequence[tuple[str, str]] = ()) -> None:

@@ -1,13 +1,14 @@
 """Answer the atoms of the task language from the simulator's state.
 
 `World` knows the predicates of the present, whose meaning is LIBERO's, so that results compare (paper, section 3.1).
-`Start` knows those that compare the present with how the episode began: is the hand home, is a thing in its place?
+`Start` knows those that compare the present with how the execution began: is the hand home, is the scene as it was?
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isnan
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +18,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
+from lerobot_memobench.sim.scene import DEAD_CENTRE
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
@@ -35,11 +37,15 @@ DETENT_OPENING = 0.01
 """How far each finger may be from where it was, m: a hand that holds something is not caught."""
 DETENT_SPEED = (0.03, 0.15)
 """How fast the hand may be, m/s and rad/s: learned policies hover at 2 cm/s. An action of 0.2 leaves in a step."""
-SAME_ARM = 1e-4
-"""Difference of the arm's joints and fingers (rad, m) and their velocities up to which it stands as it did: states that
-were read from a file are rounded."""
+SAME_STATE = 1e-4
+"""Difference of positions and velocities (m, rad, m/s, rad/s) below which two states are equal. States that were read
+from a file are rounded."""
 PLACE_DISTANCE = 0.01
-"""How far a thing may be from where it stood, m: two pixels, up to which pictures count as the same."""
+"""Distance of an object from its start below which it is in place, m: two pixels."""
+LIFTED_HEIGHT = 0.02
+"""Height of an object above its start from which it is lifted, m: more than a push raises it."""
+DETENT_SHIFT, DETENT_TURN = 0.001, 0.02
+"""Distance (m) and angle (rad) of an object from its start up to which home's detent puts it back."""
 
 
 class World:
@@ -62,11 +68,11 @@ class World:
             self._owner[geom] = roots.get(body, -1)
             if model.geom(geom).name.startswith(TABLE):
                 self._owner[geom] = self._table
-        self._joints: dict[str, tuple[Articulation, int]] = {}
+        self.joints: dict[str, tuple[Articulation, int]] = {}
         for name, asset in assets.items():
             for region, articulation in asset.articulations.items():
                 address = int(model.joint(articulation.joint).qposadr[0])
-                self._joints[f"{name}_{region}" if region else name] = (articulation, address)
+                self.joints[f"{name}_{region}" if region else name] = (articulation, address)
 
     def holds(self, atom: Atom) -> bool:
         """Return whether an atom is true now.
@@ -97,11 +103,11 @@ class World:
 
     def articulation(self, name: str) -> tuple[Articulation, float]:
         """Return the joint behind a drawer, door or knob, and its position, m or rad."""
-        if name not in self._joints:
+        if name not in self.joints:
             raise MemobenchError(
-                f"{name!r} of task {self._task.name} cannot be opened or switched; {nearest(name, self._joints)}"
+                f"{name!r} of task {self._task.name} cannot be opened or switched; {nearest(name, self.joints)}"
             )
-        articulation, address = self._joints[name]
+        articulation, address = self.joints[name]
         return articulation, float(self._data.qpos[address])
 
     def _index(self, name: str) -> int:
@@ -166,28 +172,42 @@ class World:
 
 
 class Start:
-    """What the present is compared with: the hand's pose after the scene settled, things as the execution found them.
+    """Compare the present state with the start of the execution.
 
-    Within any tolerance a pose can carry a number. So nothing is tolerated: in strict scenes home has a detent, and an
-    arm counts as home only as the detent makes it stand (`in_detent`).
+    Any tolerance within which a pose or a place may differ can carry a number from one event to the next. Strict scenes
+    have none: home has a detent, which puts back the arm (`in_detent`) and, if the scene is nearly as it began
+    (`nearly_as_begun`), everything else.
 
     Args:
-        model, data: a simulation's; poses must belong to the present state.
-        things: names of the instances whose places are remembered.
+        model, data: of the simulation; poses must belong to the present state.
+        objects: names of the objects.
+        joints: name in atoms -> articulation and address in qpos, of each door, drawer and knob.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, things: Sequence[str]) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        objects: Sequence[str],
+        joints: Mapping[str, tuple[Articulation, int]],
+    ) -> None:
         self._data = data
         self._grip = model.site(robot.GRIP_SITE).id
         self._model = model
         self._fingers = [int(model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
-        self._joints = slice(0, max(self._fingers) + 1)  # the arm comes first in the model, its fingers last of it
-        self._bodies = {name: int(model.body(name).id) for name in things}
+        arm = np.arange(
+            max(self._fingers) + 1
+        )  # the arm and its fingers are first in the model, by a hinge or slide each
+        self._arm_part = np.concatenate([arm, model.nq + arm])
+        self._left: NDArray[np.float64] | None = None
+        self._bodies = {name: int(model.body(name).id) for name in objects}
+        self._joints = joints
         self.mark_hand()
+        self.mark_scene()
 
     def mark_hand(self) -> None:
-        """Take the arm's present state for its home."""
-        self._arm, self._stood = self._arm_now(), False
+        """Take the arm's present state as its home."""
+        self._arm, self._left = self._state_now()[self._arm_part], None
         self._position, self._rotation, self._opening = self._hand()
 
     @property
@@ -196,24 +216,78 @@ class Start:
         return self._position, self._rotation
 
     def mark_step(self, goes_on: bool = True) -> None:
-        """Note where a step begins: who leaves home in it was there. A state that does not go on was not left."""
-        self._stood = goes_on and self._stands()
+        """Note the state in which a step begins: a hand that leaves home in it was there.
 
-    def mark_things(self) -> None:
-        """Take every thing's present place for its own."""
+        Args:
+            goes_on: whether the state continues the one before; False after a restore.
+        """
+        self._left = self._state_now() if goes_on else None
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the state continues the one before."""
+        return self._left is not None
+
+    def mark_scene(self) -> None:
+        """Take the present state of the scene as the one in which the execution begins."""
+        self._begun = self._state_now()
         self._places = {name: self._data.xpos[body].copy() for name, body in self._bodies.items()}
+        self._turns = {name: self._data.xquat[body].copy() for name, body in self._bodies.items()}
 
     def holds(self, atom: Atom) -> bool:
-        """Return whether ``handhome`` or ``inplace`` is true now."""
-        if atom.predicate == "handhome":
-            return self._stood or self._stands()
-        (name,) = atom.args
-        moved = self._data.xpos[self._bodies[name]] - self._places[name]
-        return float(np.linalg.norm(moved)) <= PLACE_DISTANCE
+        """Return whether an atom of `SINCE_START` is true now.
 
-    def _stands(self) -> bool:
-        """Whether the arm stands as when the scene had settled, joint for joint."""
-        return bool(np.abs(self._arm_now() - self._arm).max() <= SAME_ARM)
+        Raises:
+            MemobenchError: ``ajar`` of a name that has no joint.
+        """
+        match atom.predicate, atom.args:
+            case "handhome", ():
+                return self._is_or_was(self._arm, self._arm_part)
+            case "asbegun", ():
+                return self._is_or_was(self._begun)
+            case "ajar", (name,):
+                return self._is_ajar(name)
+            case "lifted", (name,):
+                return bool(self._data.xpos[self._bodies[name]][2] - self._places[name][2] > LIFTED_HEIGHT)
+        (name,) = atom.args
+        return self._shift(name) <= PLACE_DISTANCE
+
+    def nearly_as_begun(self) -> bool:
+        """Return whether objects and joints are so near their start that home's detent puts them back."""
+        return all(self._shift(name) <= DETENT_SHIFT and self._turn(name) <= DETENT_TURN for name in self._bodies) and (
+            all(self._joint_shift(name) <= DEAD_CENTRE[self._joints[name][0].kind] for name in self._joints)
+        )
+
+    def _is_or_was(self, state: NDArray[np.float64], part: Any = ...) -> bool:
+        """Whether a part of the state is, or was at the beginning of the step, equal to ``state``."""
+        states = [self._state_now()] if self._left is None else [self._state_now(), self._left]
+        return any(bool(np.abs(one[part] - state).max() <= SAME_STATE) for one in states)
+
+    def _is_ajar(self, name: str) -> bool:
+        if name not in self._joints:
+            raise MemobenchError(f"{name!r} cannot be opened or switched; {nearest(name, self._joints)}")
+        joint, address = self._joints[name]
+        q = float(self._data.qpos[address])
+        open_or_on = q >= joint.on_at_least if joint.kind == "knob" else q < joint.open_below
+        return self._joint_shift(name) > DEAD_CENTRE[joint.kind] and not open_or_on
+
+    def _shift(self, name: str) -> float:
+        """Distance of an object from its start, m."""
+        return float(np.linalg.norm(self._data.xpos[self._bodies[name]] - self._places[name]))
+
+    def _turn(self, name: str) -> float:
+        """Angle of an object from its start, rad."""
+        cosine = abs(float(self._data.xquat[self._bodies[name]] @ self._turns[name]))
+        return 2.0 * float(np.arccos(min(cosine, 1.0)))
+
+    def _joint_shift(self, name: str) -> float:
+        """Distance of a joint from its start, m or rad."""
+        address = self._joints[name][1]
+        return abs(float(self._data.qpos[address] - self._begun[address]))
+
+    def _state_now(self) -> NDArray[np.float64]:
+        """Positions and velocities of everything."""
+        return np.append(self._data.qpos, self._data.qvel)
 
     def in_detent(self) -> bool:
         """Return whether the open hand has come to rest near its home, so that the detent catches it."""
@@ -235,10 +309,6 @@ class Start:
         site = mujoco.mjtObj.mjOBJ_SITE
         mujoco.mj_objectVelocity(self._model, self._data, site, self._grip, velocity, 0)
         return np.array([np.linalg.norm(velocity[3:]), np.linalg.norm(velocity[:3])])
-
-    def _arm_now(self) -> NDArray[np.float64]:
-        """Positions and velocities of arm and fingers."""
-        return np.append(self._data.qpos[self._joints], self._data.qvel[self._joints])
 
     def _hand(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Position (3,), rotation (3, 3) of the grip site and finger positions (2,)."""

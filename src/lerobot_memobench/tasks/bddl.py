@@ -42,6 +42,7 @@ _KINDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "on": (_THING, (*_THING, "region")),
     "in": (_THING, ("region",)),
     "inplace": (("object",),),
+    "lifted": (("object",),),
 }
 """Predicate -> what each of its arguments may be; the others speak of what can be opened or switched."""
 

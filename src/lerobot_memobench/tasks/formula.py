@@ -24,14 +24,17 @@ PREDICATES: dict[str, tuple[str, int]] = {
     "wasopen": ("WasOpen", 1),
     "wasturnedon": ("WasTurnedOn", 1),
     "handhome": ("HandHome", 0),
+    "asbegun": ("AsBegun", 0),
+    "ajar": ("Ajar", 1),
     "inplace": ("InPlace", 1),
+    "lifted": ("Lifted", 1),
 }
 
 #: Latched predicate -> the predicate of the world that sets it.
 LATCHES: dict[str, str] = {"wasopen": "open", "wasturnedon": "turnon"}
 
 #: Predicates that compare the present with how the execution began; they say nothing of a starting state.
-SINCE_START = frozenset({"handhome", "inplace"})
+SINCE_START = frozenset({"handhome", "asbegun", "ajar", "inplace", "lifted"})
 
 #: Largest number in a formula: more steps than any episode has.
 MAX_NUMBER = 100_000

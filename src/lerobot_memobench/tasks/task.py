@@ -185,7 +185,7 @@ class Task:
 
     @property
     def idles(self) -> bool:
-        """Whether the robot idles before the execution, and the step counts through from the episode's first one."""
+        """Whether the robot idles before the execution, which then shows no clock."""
         return self.suite == STRICT
 
     @property

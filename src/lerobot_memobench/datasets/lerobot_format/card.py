@@ -66,7 +66,7 @@ COLUMNS = {
     "for no input; `memobench_mem` with `perception=objects` reads them, others by `lerobot train obs_type=both`",
     "executed_action": "what moved the arm: `action`, but where it was moved off its way (`generate --perturb`)",
     "observation.phase": "0 demonstration prompt, or the robot idles (the policy does not act), 1 execution",
-    "observation.step": "control steps since that phase began; of strict tasks since the episode began",
+    "observation.step": "control steps since that phase began; -1 in the execution of strict tasks",
     "checkpoint.index": "number of checkpoints completed in order before this frame",
     "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
     "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",

@@ -60,12 +60,14 @@ class EpisodePlace:
         start: its first frame in the dataset's global index.
         length: frames.
         record: None where this package wrote none.
+        instructions: of its frames, each once.
     """
 
     index: int
     start: int
     length: int
     record: EpisodeRecord | None
+    instructions: tuple[str, ...] = ()
 
 
 def list_episodes(folder: Path) -> list[EpisodePlace]:
@@ -117,7 +119,7 @@ def check_suite_of(folder: Path, suite: str) -> None:
 
 
 def check_idling(folder: Path, places: Iterable[EpisodePlace] | None = None) -> None:
-    """Refuse a LeRobotDataset with demonstrations of strict tasks from before the robot idled: its steps tell the past.
+    """Refuse a LeRobotDataset with strict demonstrations of earlier goals, or from before the robot idled.
 
     Args:
         places: its episodes; None: they are listed.
@@ -132,6 +134,13 @@ def check_idling(folder: Path, places: Iterable[EpisodePlace] | None = None) -> 
         from lerobot_memobench.envs.episode import first_execution_step
 
         task, found = get_task(record.task_name), record.exec_start_index
+        asked = task.variant(record.variant).language
+        if place.instructions and asked not in place.instructions:
+            raise MemobenchError(
+                f"episode {place.index} of {folder} ({record.task_name}, seed {record.seed}) has the instruction "
+                f"{place.instructions[0]!r}, and this version {asked!r}: the goals of strict tasks have changed; "
+                "generate the demonstrations again"
+            )
         begins = [first_execution_step(task, record.seed, prompt) for prompt in (True, False)]
         if found not in begins:
             raise MemobenchError(
@@ -227,7 +236,7 @@ def _check(folder: Path) -> None:
 
 def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]]:
     """The rows of meta/episodes, or that of one episode, in their order and without statistics."""
-    own = ("episode_index", "length", "dataset_from_index", *EpisodeRecord.model_fields)
+    own = ("episode_index", "length", "dataset_from_index", "tasks", *EpisodeRecord.model_fields)
     chosen = None if episode_index is None else [("episode_index", "==", episode_index)]
     return _read(folder / "meta" / "episodes", own, chosen).sort_by("episode_index").to_pylist()
 
@@ -235,7 +244,8 @@ def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]
 def _place(folder: Path, row: dict[str, Any], told: str | None) -> EpisodePlace:
     number = int(row["episode_index"])
     record = from_frames(told, f"{folder}, episode {number}") if told else from_meta(row)
-    return EpisodePlace(number, int(row["dataset_from_index"]), int(row["length"]), record)
+    instructions = tuple(row.get("tasks") or ())
+    return EpisodePlace(number, int(row["dataset_from_index"]), int(row["length"]), record, instructions)
 
 
 def _read(folder: Path, names: tuple[str, ...] | None, chosen: list[tuple[str, str, int]] | None) -> pa.Table:

@@ -23,6 +23,7 @@ OWN_DEFAULTS: Mapping[str, Any] = {
     "memory_frames": MEMORY_FRAMES,
     "memory_phase": False,
     "memory_settings": {},
+    "subgoals": None,
 }
 """Field -> value by which a memory takes its own default."""
 

@@ -28,7 +28,7 @@ from transformers.initialization import no_init_weights
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_resumed, check_weights
-from lerobot_memobench.policies.compatibility import PICTURE_STEP, cure, require_fresh
+from lerobot_memobench.policies.compatibility import PICTURE_AGE, cure, require_fresh
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
 from lerobot_memobench.policies.memobench_mem.average import WeightAverage
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
@@ -91,7 +91,7 @@ logger = logging.getLogger(__name__)
 
 FSDP_PREFIX = "_fsdp_wrapped_module."
 """What torch's FSDP puts into the names of what it wraps."""
-OBS_PICTURE = f"observation.{PICTURE_STEP}"
+OBS_PICTURE_AGE = f"observation.{PICTURE_AGE}"
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "modulator", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
@@ -431,7 +431,7 @@ class MemobenchMemPolicy(PI05Policy):
         phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
         clocks = list(zip(phases or [EXECUTION] * count, steps, strict=True))
         self._calls += 1
-        steps, started, frozen = self.rollout.observe(clocks, lambda rows: self._write(batch, clocks, rows))
+        steps, started, frozen = self.rollout.observe(clocks, lambda rows: self._write(batch, rows))
         observed = [key for key in (name, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch]
         for row in range(count):
             if started[row]:
@@ -439,13 +439,13 @@ class MemobenchMemPolicy(PI05Policy):
         return steps, started, frozen
 
     @torch.no_grad()
-    def _write(self, batch: dict[str, Tensor], clocks: list[tuple[int, int]], rows: list[int]) -> None:
+    def _write(self, batch: dict[str, Tensor], rows: list[int]) -> None:
         """Write the present frames of some rows to their memories; refuse a frame of an earlier step."""
         memory = self.model.memory
         assert memory is not None
-        if OBS_PICTURE in batch and self.perception.pictures:
+        if OBS_PICTURE_AGE in batch and self.perception.pictures:
             for row in rows:
-                require_fresh(clocks[row][1], round(float(batch[OBS_PICTURE][row])))
+                require_fresh(round(float(batch[OBS_PICTURE_AGE][row])))
         frames = self.perception.remember(batch, rows).to(self._device)
         with self._acting():
             for row, frame in zip(rows, frames.split(1), strict=True):  # one by one: no row depends on others

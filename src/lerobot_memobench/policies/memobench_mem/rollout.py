@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lerobot_memobench.policies.compatibility import begins_episode, is_frozen
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, rotation
 from lerobot_memobench.policies.memobench_mem.reads import ChunkReads
 
@@ -81,8 +82,8 @@ class Row:
 class Rollout:
     """The rows of a vector environment.
 
-    A row starts anew when its clock goes back (to an earlier phase, or an earlier step of the phase), and is frozen
-    while its clock stays the same (its episode is over, or the environment is waiting), whatever the other rows do.
+    By its clock a row knows when an episode begins and whether it has ended (`begins_episode`, `is_frozen`), whatever
+    the other rows do. Where observations show no clock, an observation is a control step.
 
     Args:
         remembers: whether frames are written at all.
@@ -128,14 +129,15 @@ class Rollout:
 
     def _tick(self, number: int, clock: tuple[int, int]) -> bool:
         """Set a row's clock; return whether a new episode began."""
-        step, last = clock[1], self.rows[number].clock
-        if last is None or clock < last:
-            self.rows[number] = Row(clock, step)
+        row, step = self.rows[number], clock[1]
+        last = row.clock
+        if begins_episode(last, clock):
+            self.rows[number] = Row(clock, max(step, 0))
             return True
-        row = self.rows[number]
-        row.clock, row.frozen = clock, clock == last
-        if not row.frozen:  # a phase begins at step 0, one after the last of the prompt; or its clock counts through
-            row.position += step - last[1] if step > last[1] else 1 + step
+        assert last is not None  # else an episode begins
+        row.clock, row.frozen = clock, is_frozen(last, clock)
+        if not row.frozen:  # a phase begins at step 0, one after the last of the prompt, or without a clock
+            row.position += step - last[1] if step > last[1] >= 0 else 1 + max(step, 0)
         return False
 
     def writes_next(self) -> bool:

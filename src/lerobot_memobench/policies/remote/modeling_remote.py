@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.baselines.modeling_baselines import UntrainedPolicy
+from lerobot_memobench.policies.compatibility import begins_episode, is_frozen
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.session import Row, Session
 from lerobot_memobench.protocol import ACTION_DIM, EXECUTION
@@ -26,8 +27,8 @@ Action = NDArray[np.float32]
 class Actor:
     """One environment: when its episode begins, when the server is asked, which action is next.
 
-    The environment's ``phase`` and ``step`` tell its rows' episodes apart: they go back with each, and stand still once
-    an episode has ended. An environment that tells no step is taken to begin with the policy's reset and to go on.
+    By ``phase`` and ``step`` of an observation it knows when an episode begins and whether it has ended
+    (`begins_episode`, `is_frozen`). In an environment without them an episode begins with the policy's reset.
     """
 
     def __init__(self, config: RemoteConfig, session: Session) -> None:
@@ -44,10 +45,11 @@ class Actor:
         """Return the action (7,) for the present observation; the server may be asked."""
         told, phase = row.scalar("step"), row.scalar("phase")
         last, self._clock = self._clock, self._now(told, phase)
-        self._rests = self._clock == last or (told is not None and row.blank)
+        begins = begins_episode(last, self._clock)
+        self._rests = (not begins and is_frozen(last, self._clock)) or (told is not None and row.blank)
         if self._rests:
             return np.zeros(ACTION_DIM, np.float32)  # the episode has ended, or was never run
-        if last is None or self._clock < last:
+        if begins:
             self.session.begin(row)
             self._queue.clear()
             self._prompt = False

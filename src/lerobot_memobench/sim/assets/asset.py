@@ -81,6 +81,7 @@ class Asset:
     of anything else [m]; ``clear_radius``: radius of that surface [m].
     ``glow``: full names of visual geoms whose rgba is ``glow_on`` while the fixture is on, else ``glow_off``.
     ``round``: the outline from above is a circle about the origin.
+    ``seals``: body -> centre and half size in its frame of the board behind a drawer's front that closes its play [m].
     """
 
     name: str
@@ -97,6 +98,9 @@ class Asset:
     glow_on: tuple[float, float, float, float] = (1.0, 0.12, 0.04, 1.0)
     glow_off: tuple[float, float, float, float] = (0.34, 0.34, 0.35, 1.0)
     round: bool = False
+    seals: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = field(
+        default_factory=lambda: MappingProxyType({})
+    )
 
     @property
     def bottom(self) -> float:
