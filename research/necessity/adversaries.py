@@ -46,8 +46,6 @@ LEVELS = ("bottom", "middle", "top")
 TIMES = ("once", "twice", "three times")
 NOTE = 0.03
 """Distance that stands for one event where a drawer or an object is the note, m."""
-HOVER = np.array([0.0, 0.0, 0.08])
-"""Where the hand waits, from its home, m."""
 ROUND = 160
 """Control steps within which an event is done and the hand is home again."""
 
@@ -135,12 +133,6 @@ class Seat:
         """Stay at home."""
         for _ in range(steps):
             yield self.expert.hand.toward(*self.env.episode.sim.home, OPEN)
-
-    def wait_away(self, steps: int = 1) -> Motion:
-        """Stay above home."""
-        position, rotation = self.env.episode.sim.home
-        for _ in range(steps):
-            yield self.expert.hand.toward(position + HOVER, rotation, OPEN)
 
     def leave_ajar(self, name: str, to: float) -> Motion:
         """Move a drawer, door or knob to a position and let go of it."""

@@ -195,9 +195,7 @@ class Start:
         self._grip = model.site(robot.GRIP_SITE).id
         self._model = model
         self._fingers = [int(model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
-        arm = np.arange(
-            max(self._fingers) + 1
-        )  # the arm and its fingers are first in the model, by a hinge or slide each
+        arm = np.arange(max(self._fingers) + 1)  # arm and fingers are first in the model, with one position a joint
         self._arm_part = np.concatenate([arm, model.nq + arm])
         self._left: NDArray[np.float64] | None = None
         self._bodies = {name: int(model.body(name).id) for name in objects}
