@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.catalogue import get_task, load_task
+from lerobot_memobench.tasks.catalogue import BOWL, get_task, load_task
 from lerobot_memobench.tasks.formula import Atom, format_formula, parse_formula
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import Prompt
@@ -82,3 +82,11 @@ def test_memory_grows_by_one_intermediate_text_per_checkpoint() -> None:
 def test_prompt_says_that_nothing_is_done_yet() -> None:
     assert with_memory("Put it back", "") == "Put it back Memory: nothing yet"
     assert with_memory("Put it back", "took it") == "Put it back Memory: took it"
+
+
+def test_a_task_keeps_its_world_through_variants() -> None:
+    published = get_task(BOWL)
+    there = published.variant(1).in_world("libero")
+    assert there.world == there.variant(0).world == there.variant(2).world == "libero"
+    assert there.variant(0) == published.in_world("libero") != published
+    assert published.world == "memobench"

@@ -19,12 +19,15 @@ MemoryType = Literal["temporal", "spatial", "object", "procedural"]
 Operation = Literal["S", "U", "C"]
 PromptKind = Literal["routine", "pick", "point", "highlight", "hide"]
 Suite = Literal["published", "strict"]
+World = Literal["memobench", "libero"]
 Texts = tuple[str, str, str]
 
 MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
 OPERATIONS: tuple[Operation, ...] = get_args(Operation)
 SUITES: tuple[Suite, ...] = get_args(Suite)
 PUBLISHED, STRICT = SUITES
+WORLDS: tuple[World, ...] = get_args(World)
+MEMOBENCH, LIBERO = WORLDS
 REFERENTS = ("fixed", "random")
 #: The referent of strict episodes, whatever is asked for (`Task.drawn`).
 DRAWN = "drawn"
@@ -136,6 +139,8 @@ class Task:
         derived_from: the published task in whose scene it takes place; None for a task of its own.
         drawn: every episode draws its variant by seed, whatever referent is asked for; a variant is not drawn again.
         spoilt_as: failure class of an episode whose goal could no longer be reached; None for that of its checkpoints.
+        world: assets, placement, contacts and predicates of the scene: `memobench`, the package's own, or `libero`, the
+            paper's. It is a property of an evaluation and never stated in a task's files.
     """
 
     name: str
@@ -161,17 +166,23 @@ class Task:
     derived_from: str | None = None
     drawn: bool = False
     spoilt_as: str | None = None
+    world: World = "memobench"
 
-    # Two tasks are the same when their files and variant are: pickled copies in worker processes stay equal
+    # Two tasks are the same when their files, variant and world are: pickled copies in worker processes stay equal
     # and hashable.
-    def _key(self) -> tuple[str, str, str, int]:
-        return self.name, self.bddl_text, json.dumps(self.metadata, sort_keys=True), self.variant_index
+    def _key(self) -> tuple[str, str, str, int, str]:
+        return self.name, self.bddl_text, json.dumps(self.metadata, sort_keys=True), self.variant_index, self.world
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Task) and self._key() == other._key()
 
     def __hash__(self) -> int:
-        return hash((self.name, self.bddl_text, self.variant_index))
+        return hash((self.name, self.bddl_text, self.variant_index, self.world))
+
+    def in_world(self, world: World) -> Task:
+        """Return the task in another world; scene, instruction, goal and checkpoints stay the same."""
+        published = self.published and self.published.in_world(world)
+        return dataclasses.replace(self, world=world, published=published)
 
     @property
     def scene_name(self) -> str:
