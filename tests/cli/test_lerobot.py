@@ -388,7 +388,8 @@ def test_a_copy_has_a_file_or_nothing_for_the_link(training: Called, last: str |
     if last is not None:
         link.write_text(last)
     found = Path("run/checkpoints/000040" if last else "run/checkpoints/000080") / "pretrained_model"
-    assert folder_with_checkpoint("run") == found
+    for text in ("run", "run/checkpoints/last", "run/checkpoints/last/pretrained_model"):
+        assert folder_with_checkpoint(text) == found
     assert main(["train", "output_dir=run", "resume=true"]) == 0
     assert training.value("config_path") == str(found / "train_config.json")
     assert not link.exists(), "LeRobot makes it"

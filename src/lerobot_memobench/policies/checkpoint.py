@@ -78,7 +78,7 @@ def checkpoint_folder(text: str) -> Path | None:
 
 def folder_with_checkpoint(text: str) -> Path | None:
     """Return the checkpoint in a folder: itself, or the last one of a training run; None when there is none."""
-    base = Path(text).expanduser()
+    base = _through_last(Path(text).expanduser())
     for folder in (base, *(checkpoint / "pretrained_model" for checkpoint in (base, *checkpoints_of(base)))):
         if (folder / CONFIG_FILE).is_file():
             return folder
@@ -95,6 +95,15 @@ def checkpoints_of(run: Path) -> list[Path]:
     numbered.sort(key=lambda path: int(path.name), reverse=True)
     named = [last] if last.is_dir() else [path for path in numbered if path.name == text_of_link(last)]
     return [*named, *numbered]
+
+
+def _through_last(path: Path) -> Path:
+    """Return a path at or in a run's ``checkpoints/last`` with the checkpoint that the link named, where it is lost."""
+    for last in (path, path.parent):
+        if (last.parent.name, last.name) == (CHECKPOINTS, LAST) and not last.is_dir():
+            found = checkpoints_of(last.parent.parent)
+            return found[0] / path.relative_to(last) if found else path
+    return path
 
 
 def text_of_link(path: Path) -> str | None:
