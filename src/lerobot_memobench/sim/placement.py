@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 import mujoco
@@ -95,6 +96,10 @@ class Placer:
                 joints[articulation.joint] = articulation.open_q if opened else articulation.closed_q
         return joints
 
+    def place(self, seed: int) -> Placement:
+        """Draw the placement of a seed; see `draw`."""
+        return self.draw(np.random.default_rng([seed, zlib.crc32(self._task.scene_name.encode())]))
+
     def draw(self, rng: np.random.Generator) -> Placement:
         """Draw until nothing overlaps; return the last draw, and leave it written in model and data.
 
@@ -154,17 +159,7 @@ class Placer:
 
     def write(self, placement: Placement) -> None:
         """Write a placement into the model (fixtures) and data (objects, joints); velocities stay."""
-        for name, pose in placement.poses.items():
-            body = self._model.body(name)
-            if self._assets[name].kind == "fixture":
-                self._model.body_pos[body.id], self._model.body_quat[body.id] = pose[:3], pose[3:]
-            else:
-                address = int(self._model.joint(f"{name}_joint0").qposadr[0])
-                self._data.qpos[address : address + 7] = pose
-        for joint, q in placement.joints.items():
-            self._data.qpos[int(self._model.joint(joint).qposadr[0])] = q
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
+        write(placement, self._model, self._data, self._assets)
 
     def _overlap(self) -> tuple[str, str] | None:
         """Return the names of the first two bodies whose geoms stand in each other."""
@@ -175,3 +170,18 @@ class Placer:
                 roots = [self._model.body(self._model.body_rootid[body]).name for body in bodies]
                 return roots[0], roots[1]
         return None
+
+
+def write(placement: Placement, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]) -> None:
+    """Write a placement into a model (fixtures) and data (objects, joints); velocities stay."""
+    for name, pose in placement.poses.items():
+        body = model.body(name)
+        if assets[name].kind == "fixture":
+            model.body_pos[body.id], model.body_quat[body.id] = pose[:3], pose[3:]
+        else:
+            address = int(model.joint(f"{name}_joint0").qposadr[0])
+            data.qpos[address : address + 7] = pose
+    for joint, q in placement.joints.items():
+        data.qpos[int(model.joint(joint).qposadr[0])] = q
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
