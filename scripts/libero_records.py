@@ -7,7 +7,7 @@ package's other requirements; ten minutes on one core. `actions` runs in this pa
 actions and starts that `rollouts` plays. Records hold facts (numbers that LIBERO computes), none of its files.
 
 The goal is cut out of the task files: stock LIBERO does not know its words, and is asked atom by atom. Scans of the
-paper's authors are boxes, of the sizes that `sim.libero.classes` says.
+paper's authors are boxes, of the sizes in `sim.libero.classes`.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def fixture_poses(env: Any) -> NDArray[np.float64]:
 
 
 def holds(env: Any, atom: str) -> bool:
-    """Return whether an atom is true, as LIBERO says."""
+    """Return whether an atom is true in LIBERO."""
     return bool(env._eval_predicate(atom.split()))
 
 
@@ -200,7 +200,7 @@ def fields(model: mujoco.MjModel) -> Arrays:
     touched = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     for name in FIELDS:
         values = np.asarray(getattr(model, name), dtype=np.float64)
-        if name in POLYNOMIALS and values.ndim == 2:  # newer MuJoCo keeps coefficients of higher order beside it
+        if name in POLYNOMIALS and values.ndim == 2:  # newer MuJoCo has coefficients of higher orders, too
             assert not values[:, 1:].any()
             values = values[:, 0]
         found[name] = values[touched] if name.startswith("geom_") else values
@@ -264,7 +264,7 @@ def models() -> Arrays:
 
 
 def scenes() -> Arrays:
-    """Record where everything is after `seed(s)` and `reset()`, for each task and seed."""
+    """Record where everything is after `seed(s)` and `reset()`, and for the first seed once it has settled."""
     kept: Arrays = {}
     for name in task_files():
         env, qpos, fixtures = make(name), [], []
@@ -277,6 +277,10 @@ def scenes() -> Arrays:
             env.reset()
             qpos.append(np.array(env.sim.data.qpos))
             fixtures.append(fixture_poses(env))
+            if k == 0:
+                for _ in range(STABILISATION_STEPS):
+                    env.step(NO_OP)
+                kept[f"{name}:settled"] = np.array(env.sim.data.qpos)
         kept[f"{name}:qpos"] = np.round(np.array(qpos) / GRAIN).astype(np.int64)
         kept[f"{name}:fixtures"] = np.round(np.array(fixtures) / GRAIN).astype(np.int64)
         print("scenes of", name, flush=True)
@@ -287,7 +291,7 @@ def scenes() -> Arrays:
 
 
 def predicates() -> Arrays:
-    """Record what LIBERO says of states of seven scenes: resting, near resting, and thrown about."""
+    """Record LIBERO's answers about states of seven scenes: resting, near resting, and thrown about."""
     kept: Arrays = {}
     for name, atoms in PREDICATES.items():
         env, rng = make(name), np.random.default_rng(5)
@@ -375,7 +379,7 @@ def settle(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 def actions() -> Arrays:
     """Make what `rollouts` plays: our expert's actions, and a start of LIBERO's scene with its things in place of ours.
 
-    Things are put so that the boxes around what is touched of them have one middle, seen from above.
+    Things are put so that the boxes around their collision geoms have one middle, from above.
     """
     from lerobot_memobench.envs.episode import Episode
     from lerobot_memobench.sim.simulation import Simulation
@@ -397,7 +401,7 @@ def actions() -> Arrays:
         theirs.set_state(state, poses)
         for thing in task.objects:
             address = 1 + int(theirs.model.joint(f"{thing}_joint0").qposadr[0])
-            state[address : address + 2] += (seen_from_above(ours, thing) - seen_from_above(theirs, thing))[:2]
+            state[address : address + 2] += (middle_from_above(ours, thing) - middle_from_above(theirs, thing))[:2]
         played = []
         while not episode.done and len(played) < 700:
             played.append(episode.expert_action())
@@ -409,7 +413,7 @@ def actions() -> Arrays:
     return kept
 
 
-def seen_from_above(sim: Any, name: str) -> NDArray[np.float64]:
+def middle_from_above(sim: Any, name: str) -> NDArray[np.float64]:
     """Return the middle (2,) of the box around a thing, m."""
     position, rotation = sim.body_pose(name)
     low, high = np.array(sim.assets[name].low), np.array(sim.assets[name].high)

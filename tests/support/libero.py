@@ -50,7 +50,7 @@ KINDS_OF_SCENES = (
 
 
 def some_of_all(names: list[str]) -> list[Any]:
-    """Return tasks as parameters of a test, of which all but one of each kind of scene are slow."""
+    """Return tasks as parameters of a test; all but one of each kind of scene are slow."""
     return [name if name in KINDS_OF_SCENES else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 

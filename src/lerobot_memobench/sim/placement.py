@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
@@ -37,6 +38,21 @@ class Placement:
     """Position of each articulated joint, m or rad."""
 
 
+def placing_atoms(task: Task, assets: Iterable[str]) -> dict[str, Atom]:
+    """Return the atom of `init` that places each thing, in the order of `init`.
+
+    Raises:
+        MemobenchError: one is not placed.
+    """
+    places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
+    missing = [name for name in assets if name not in places]
+    if missing:
+        raise MemobenchError(
+            f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to its :init"
+        )
+    return places
+
+
 class Placer:
     """Draw placements of one task and write them into a simulation.
 
@@ -49,13 +65,7 @@ class Placer:
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
-        self._places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
-        missing = [name for name in assets if name not in self._places]
-        if missing:
-            raise MemobenchError(
-                f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to "
-                "its :init"
-            )
+        self._places = placing_atoms(task, assets)
         self._order = self._sorted()
 
     def _sorted(self) -> list[str]:

@@ -45,12 +45,14 @@ class Scene:
     """Every fixture but the table, then every object, by instance name; in LIBERO's world objects go first."""
     stand_ins: tuple[str, ...] = ()
     """Classes that are boxes, because the user does not have the paper's scans of them."""
-    looks: Callable[[], mujoco.MjModel] | None = None
-    """Returns the model to draw, of the same joints, where ``model`` leaves out what is only seen."""
+    drawing: Callable[[], mujoco.MjModel] | None = None
+    """Returns the model to draw, of the same bodies and joints, where ``model`` has no visual geoms."""
+    opaque_group: int = VISUAL_GROUP
+    """Group of the geoms of ``model`` that hide things behind them."""
 
 
 def scene_key(task: Task) -> tuple[str, ...]:
-    """Return what tells scenes apart. Variants of a task (another referent) share theirs: they differ in goal."""
+    """Return the name of a task's scene. Variants of a task (another referent) share it: they differ in goal."""
     return task.name, task.suite, task.bddl_text, task.world
 
 

@@ -95,7 +95,7 @@ class Simulation:
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
-        self.stand_ins = scene.stand_ins
+        self.stand_ins, self.opaque_group = scene.stand_ins, scene.opaque_group
         kind = KINDS[task.world]
         self.world = kind.predicates(task, self.model, self.data, scene.assets)
         self._start = Start(self.model, self.data, tuple(task.objects), self.world.joints)
@@ -295,20 +295,20 @@ class Simulation:
         for asset, geom in self._glow:
             lit = self.holds(Atom("turnon", (asset.name,)))
             self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
-        model, data = self._looks()
+        model, data = self._drawing()
         return self._renderer(camera, model).draw(model, data, MJCF_CAMERAS[camera], self.highlights)
 
     def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
-        model, data = self._looks()
+        model, data = self._drawing()
         return self._renderer(camera, model).draw_geoms(model, data, MJCF_CAMERAS[camera])
 
-    def _looks(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return what is drawn in the present state: the model that moves, or the scene's looks in the same pose."""
-        if self._scene.looks is None:
+    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Return the model to draw and its present state: those that move, or the scene's drawing in the same pose."""
+        if self._scene.drawing is None:
             return self.model, self.data
         if self._drawn is None:
-            model = copy.copy(self._scene.looks())
+            model = copy.copy(self._scene.drawing())
             self._drawn = model, mujoco.MjData(model)
         model, data = self._drawn
         for name, pose in self.fixture_poses().items():

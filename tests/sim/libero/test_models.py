@@ -45,10 +45,10 @@ def test_the_model_is_stock_liberos(name: str) -> None:
 @needs_assets
 @pytest.mark.slow
 @pytest.mark.parametrize("name", task_names())
-def test_what_is_only_seen_moves_nothing(name: str) -> None:
+def test_visual_geoms_change_no_motion(name: str) -> None:
     sim = simulate(name)
     sim.reset(7)
-    whole = scene_spec(sim.task, seen=True).compile()
+    whole = scene_spec(sim.task, visuals=True).compile()
     ends = []
     for model in (copy.copy(sim.model), whole):
         data = mujoco.MjData(model)

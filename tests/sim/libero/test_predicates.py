@@ -1,4 +1,4 @@
-"""Atoms hold where stock LIBERO says that they do."""
+"""Atoms hold where they hold in stock LIBERO."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Stored actions, played open loop, make the same atoms true at the same steps as in stock LIBERO.
 
-The record is of MuJoCo 3.3.7. Another version lets things settle some 10⁻⁵ m elsewhere, and what is touched then goes
-its own way; `docs/develop/paper_world.md` has what 3.3.7 itself gives here.
+The record is of MuJoCo 3.3.7. Another version lets things settle some 10⁻⁵ m elsewhere, and things that are touched
+then go their own way; `docs/develop/paper_world.md` has the outcome under 3.3.7 itself.
 """
 
 from __future__ import annotations

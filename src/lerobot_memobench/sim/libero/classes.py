@@ -52,13 +52,13 @@ class LiberoClass:
 
     Attributes:
         mjcf: its file below the folder of assets.
-        turns: drawn one after the other when a thing is set down. A fixture is turned as its task says.
-        parts: region of the part, or "" where there is one part -> the part.
+        turns: drawn one after the other when a thing is set down. A fixture is turned as its task states.
+        parts: pairs of the part's region, or "" where the fixture is the part's name, and the part.
     """
 
     mjcf: str
     turns: tuple[Turn, ...] = (("x", pi / 2),)
-    parts: dict[str, Part] | None = None
+    parts: tuple[tuple[str, Part], ...] = ()
 
 
 def _scanned(name: str) -> LiberoClass:
@@ -134,10 +134,10 @@ CLASSES: dict[str, LiberoClass] = {
     "wooden_two_layer_shelf": _modelled("wooden_two_layer_shelf"),
     "wooden_cabinet": LiberoClass(
         "articulated_objects/wooden_cabinet.xml",
-        parts={f"{level}_region": _drawer(level, height) for level, height in _DRAWERS.items()},
+        parts=tuple((f"{level}_region", _drawer(level, height)) for level, height in _DRAWERS.items()),
     ),
-    "microwave": LiberoClass("articulated_objects/microwave.xml", parts={"": _DOOR}),
-    "flat_stove": LiberoClass("articulated_objects/flat_stove.xml", parts={"": _KNOB}),
+    "microwave": LiberoClass("articulated_objects/microwave.xml", parts=(("", _DOOR),)),
+    "flat_stove": LiberoClass("articulated_objects/flat_stove.xml", parts=(("", _KNOB),)),
 }
 
 SCANS: dict[str, tuple[float, float, float]] = {
@@ -164,3 +164,8 @@ SCANS: dict[str, tuple[float, float, float]] = {
 }
 """Classes that the paper's authors scanned -> half extents of the box that stands in where their scan is missing, m:
 those of this package's own object of the class, z up."""
+
+
+def parts_of(class_name: str) -> tuple[tuple[str, Part], ...]:
+    """Return the parts of a class; objects and scans have none."""
+    return CLASSES[class_name].parts if class_name in CLASSES else ()

@@ -1,7 +1,7 @@
 """Find LIBERO's assets, and the scans of the paper's authors, and refuse any file that is not the one known here.
 
 LIBERO's assets come from its asset packages, whose code is never imported, or from a folder of the user's. The authors'
-scans are under terms of their own: the user downloads them and says where they are.
+scans are under terms of their own: the user downloads them and names their folder.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def assets_folder() -> Path:
         if (Path(place) / "assets").is_dir():
             return Path(place) / "assets"
     raise MemobenchError(
-        f"LIBERO's assets, of which the world 'libero' is built, are not installed; run: {INSTALL} "
+        f"the world 'libero' needs LIBERO's assets, which are not installed; run: {INSTALL} "
         f"(or set {ASSETS_VARIABLE} to the folder of assets of a LIBERO checkout)"
     )
 
@@ -82,7 +82,7 @@ def _checked(folder: Path, name: str) -> Path:
 
 
 def scan(class_name: str) -> Path | None:
-    """Return the MJCF file of an authors' scan; None where the user has not said where the scans are.
+    """Return the MJCF file of an authors' scan; None where the user names no folder of scans.
 
     The scans of a category are numbered in the order of their names: ``<category>`` is the first one, and
     ``<category>__k`` the one that k others go before.

@@ -1,7 +1,7 @@
-"""Read the MJCF of LIBERO's classes: bodies, assets and the sites that say how large a thing is.
+"""Read the MJCF of LIBERO's classes: bodies, assets and the sites that give a thing's size.
 
-robosuite, through which LIBERO loads these files, writes default classes out, drops what is named twice, and puts a
-thing's name before every name in its file. So does this module.
+robosuite, through which LIBERO loads these files, writes default classes out, keeps the
+first of two assets with one name, and puts a thing's name before every name in its file. So does this module.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ REFERENCES = ("mesh", "material", "texture")
 
 @dataclass(frozen=True)
 class ClassFile:
-    """What a class's files say. Do not change its elements.
+    """A class as its files have it. Do not change its elements.
 
     Attributes:
         body: the thing's body, under which everything of it hangs; its default classes are written out.
-        assets: returns meshes, textures and materials, with files as absolute paths: what is only seen.
+        assets: returns meshes, textures and materials, with files as absolute paths; physics needs none.
         radius: radius from above within which nothing else may stand, m.
         bottom, top: heights of its underside and of its top over its origin, m.
         turns: drawn one after the other when it is set down.
@@ -49,7 +49,7 @@ class ClassFile:
 
 
 def class_file(class_name: str) -> ClassFile:
-    """Return what the files of a class say; a scan that the user does not have is a box.
+    """Return a class as its files have it; a scan that the user does not have is a box.
 
     Raises:
         MemobenchError: the class is unknown in LIBERO's world, or its files are missing or other ones.
@@ -89,12 +89,12 @@ def _libero_class(class_name: str, path: Path) -> ClassFile:
 
 @cache
 def _scanned_class(path: Path) -> ClassFile:
-    """Read an authors' scan: its body has no wrapper with sites, so its vertices say how large it is."""
+    """Read an authors' scan: its body has no wrapper with sites, so its vertices give its size."""
     root = _read(path)
     body = root.find("worldbody/body")
     points = [line.split()[1:4] for file in sorted(path.parent.glob("visuals/*.obj")) for line in _vertex_lines(file)]
     if body is None or not points:
-        raise MemobenchError(f"the scan {path} has no body or no visuals/*.obj beside it; download the scans again")
+        raise MemobenchError(f"the scan {path} lacks its body or its visuals/*.obj; download the scans again")
     vertices = np.array(points, dtype=np.float64)
 
     def inside(name: str) -> Path:

@@ -4,7 +4,7 @@ Episode k of the paper's evaluation has seed 7 + k. All draws of a scene come fr
 
 1. seven normal numbers, the arm's noise, which LIBERO multiplies by zero;
 2. for each (Open|Close|TurnOn|TurnOff x) of `:init`, a position of its joints. The list of them grows at each load of
-   the model, and an environment loads it when it is made and when it is reset: two rounds, of which the last counts;
+   the model, and an environment loads it when it is made and when it is reset: two rounds; the last one counts;
 3. for each (On x <region of the table>) of `:init`: a range, x and y, again while a thing overlaps what stands already,
    then the angles of its turns;
 4. the same for (On x <region of a fixture>), then (In x <region>), then (On x <thing>).
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_SIZE, TABLE_TOP
-from lerobot_memobench.sim.libero.classes import CLASSES, Turn
+from lerobot_memobench.sim.libero.classes import Turn, parts_of
 from lerobot_memobench.sim.libero.mjcf import ClassFile, class_file
-from lerobot_memobench.sim.placement import Placement, Pose, write
+from lerobot_memobench.sim.placement import Placement, Pose, placing_atoms, write
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
@@ -45,7 +45,7 @@ class LiberoPlacer:
     """Place the things of one simulation.
 
     Args:
-        task: the task whose `init` atoms say where things stand.
+        task: the task whose `init` atoms place the things.
         model: the simulation's own model: fixtures are moved in it.
         data: state that is written.
         assets: kind and class by instance.
@@ -53,13 +53,14 @@ class LiberoPlacer:
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
+        self._places = list(placing_atoms(task, assets).values())
         self._files = {name: class_file(asset.class_name) for name, asset in assets.items()}
 
     def place(self, seed: int) -> Placement:
         """Draw the placement of a seed, leave it written in model and data, and return it.
 
         Raises:
-            MemobenchError: a region has no room for what is to stand in it.
+            MemobenchError: a region has no room for its thing.
         """
         rng = np.random.RandomState(seed)  # the stream of LIBERO's own `np.random.seed`
         rng.randn(7)
@@ -74,7 +75,6 @@ class LiberoPlacer:
 
     def _in_order(self) -> list[Atom]:
         """Return the atoms that place something: on the table, on fixtures, in regions, on things."""
-        placed = [atom for atom in self._task.init if atom.predicate in ("on", "in")]
 
         def turn(atom: Atom) -> int:
             if atom.args[1] in self._assets:
@@ -83,7 +83,7 @@ class LiberoPlacer:
                 return 2
             return 0 if self._task.regions[atom.args[1]].target == TABLE else 1
 
-        return sorted(placed, key=turn)
+        return sorted(self._places, key=turn)
 
     # --- joints ---
 
@@ -93,18 +93,21 @@ class LiberoPlacer:
         for _ in range(LOADS):
             for atom in self._task.init:
                 if len(atom.args) == 1:
-                    named = self._parts(atom.args[0])
-                    low, high = next(iter(named.values()))[atom.predicate]
+                    named = self._parts(atom)
+                    low, high = next(iter(named.values()))
                     joints.update(dict.fromkeys(named, rng.uniform(low, high)))
         return joints
 
-    def _parts(self, name: str) -> dict[str, Mapping[str, tuple[float, float]]]:
-        """Return joint -> ranges of a fixture's parts, or of the one that a region is of."""
-        found: dict[str, Mapping[str, tuple[float, float]]] = {}
-        for instance, asset in self._assets.items():
-            for region, articulation in asset.articulations.items():
-                if name in (instance, f"{instance}_{region}"):
-                    found[articulation.joint] = (CLASSES[asset.class_name].parts or {})[region].ranges
+    def _parts(self, atom: Atom) -> dict[str, tuple[float, float]]:
+        """Return joint -> range in which an atom's predicate holds, for a fixture's parts or the one of a region."""
+        found = {
+            f"{instance}_{part.joint}": part.ranges[atom.predicate]
+            for instance, asset in self._assets.items()
+            for region, part in parts_of(asset.class_name)
+            if atom.args[0] in (instance, f"{instance}_{region}") and atom.predicate in part.ranges
+        }
+        if not found:
+            raise MemobenchError(f"task {self._task.name}: nothing in the world 'libero' can start as {atom}")
         return found
 
     def _centre_fixtures(self, joints: dict[str, float]) -> None:
@@ -136,7 +139,7 @@ class LiberoPlacer:
         )
 
     def _room(self, atom: Atom, poses: Mapping[str, Pose]) -> tuple[Sequence[Rectangle], Array]:
-        """Return the rectangles from which a thing's origin is drawn, and what is added to it (3,): z of its underside.
+        """Return the rectangles from which a thing's x and y are drawn, and an offset (3,): z is that of its underside.
 
         A thing on a fixture's region keeps its radius off the edge of half of it; in a region or on a thing it is in
         the middle.

@@ -1,7 +1,7 @@
 """Build a task's scene in LIBERO's world: its kitchen, the arm of robosuite 1.4.0, objects, then fixtures.
 
-A simulation moves a model without what is only seen, which moves to the bit as the whole one and is compiled in some
-30 ms. The whole one, whose meshes and textures have 80 MB, is compiled at the first picture.
+A simulation moves a model without visual geoms, which moves to the bit as the whole one and is built in some 25 ms. The
+whole one, whose meshes and textures have 80 MB, is compiled at the first picture.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Articulation, Asset, Handle
-from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP
+from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.libero import mjcf
-from lerobot_memobench.sim.libero.classes import CLASSES, Part
+from lerobot_memobench.sim.libero.classes import Part, parts_of
 from lerobot_memobench.sim.scene import (
     AGENTVIEW,
     AGENTVIEW_POSITION,
@@ -57,8 +57,8 @@ def build_scene(task: Task) -> Scene:
     model = scene_spec(task).compile()
     assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
     boxes = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name).stand_in]
-    looks = cache(lambda: scene_spec(task, seen=True).compile())
-    return Scene(scene_key(task), model, assets, tuple(sorted(set(boxes))), looks)
+    drawing = cache(lambda: scene_spec(task, visuals=True).compile())
+    return Scene(scene_key(task), model, assets, tuple(sorted(set(boxes))), drawing, COLLISION_GROUP)
 
 
 def instances(task: Task) -> Iterator[tuple[str, str]]:
@@ -68,23 +68,40 @@ def instances(task: Task) -> Iterator[tuple[str, str]]:
             yield from ((name, class_name) for name in declared if declared[name] == class_name != TABLE)
 
 
-def scene_spec(task: Task, seen: bool = False) -> mujoco.MjSpec:
+def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
     """Return a task's scene as a specification that may still be changed or saved.
 
     Args:
         task: what stands where.
-        seen: with what is only seen, too.
+        visuals: with visual geoms, materials and lights.
     """
-    spec = mujoco.MjSpec.from_string(scene_xml(task, seen))
+    spec = mujoco.MjSpec.from_string(scene_xml(task, visuals))
     spec.modelname = "libero"
     # robosuite's files reserve room for 5,000 contacts, 1.3 GB of addresses per simulation; no scene uses 1 MB.
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
-    if seen:
+    if visuals:
         robot.thin(spec)
+        _draw_floor(spec)
     return spec
 
 
-def scene_xml(task: Task, seen: bool) -> str:
+def _draw_floor(spec: mujoco.MjSpec) -> None:
+    """Draw a flat box in place of the plane that is the floor: `sim.gl` draws no planes."""
+    floor, half = spec.geom("floor"), 0.005
+    floor.group = COLLISION_GROUP
+    spec.worldbody.add_geom(
+        name="floor_visual",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[floor.size[0], floor.size[1], half],
+        pos=[0.0, 0.0, -half],
+        group=VISUAL_GROUP,
+        contype=0,
+        conaffinity=0,
+        material=floor.material,
+    )
+
+
+def scene_xml(task: Task, visuals: bool) -> str:
     """Return a task's scene as MJCF, in which every file is an absolute path."""
     root = ET.fromstring(robot.robot_xml())
     world, assets = root.find("worldbody"), root.find("asset")
@@ -104,7 +121,7 @@ def scene_xml(task: Task, seen: bool) -> str:
         else:
             _add_handles(body, name, class_name)
         world.append(body)
-    if seen:
+    if visuals:
         assets.extend(_kitchen_assets(kitchen))
         for class_name, known in classes.items():
             assets.extend(mjcf.shared_assets(class_name, known))
@@ -175,14 +192,14 @@ def _kitchen_assets(arena: ET.Element) -> Iterator[ET.Element]:
 
 def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
     """Add a site at the middle of each handle, for experts; sites are neither seen nor touched."""
-    for part in (CLASSES[class_name].parts or {}).values():
+    for _, part in parts_of(class_name):
         moving = next(one for one in body.iter("body") if one.get("name") == f"{name}_{part.body}")
         place = {"pos": mjcf.words(part.handle), "quat": mjcf.words(part.handle_quaternion), "size": "0.005"}
         moving.append(ET.Element("site", {"name": f"{name}_{part.joint}_handle", "group": str(SITE_GROUP), **place}))
 
 
 def _strip(world: ET.Element, assets: ET.Element) -> None:
-    """Remove what is only seen."""
+    """Remove visual geoms, materials and lights."""
     _remove(world, lambda one: one.tag == "light")
     _remove(world, lambda one: one.tag == "geom" and one.get("contype") == one.get("conaffinity") == "0")
     for geom in world.iter("geom"):
@@ -198,22 +215,19 @@ def _remove(root: ET.Element, unwanted: Callable[[ET.Element], bool]) -> None:
 
 
 def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Asset:
-    """Return what is known of an instance."""
-    low, high = _bounds(model, model.body(name).id)
-    regions = {}
-    for site in range(model.nsite):
-        full = model.site(site).name
-        if full.startswith(f"{name}_") and model.site_type[site] == mujoco.mjtGeom.mjGEOM_BOX:
-            regions[full.removeprefix(f"{name}_")] = full
-    parts = (CLASSES[class_name].parts if class_name in CLASSES else None) or {}
+    """Return the facts about an instance."""
+    root = model.body(name).id
+    low, high = _bounds(model, root)
+    mine = (model.body_rootid[model.site_bodyid] == root) & (model.site_type == mujoco.mjtGeom.mjGEOM_BOX)
+    regions = [model.site(site).name for site in np.flatnonzero(mine)]
     return Asset(
         name=name,
         class_name=class_name,
         kind="object" if name in task.objects else "fixture",
         low=low,
         high=high,
-        articulations=MappingProxyType({region: _articulation(name, part) for region, part in parts.items()}),
-        regions=MappingProxyType(regions),
+        articulations=MappingProxyType({region: _articulation(name, part) for region, part in parts_of(class_name)}),
+        regions=MappingProxyType({full.removeprefix(f"{name}_"): full for full in regions}),
         supports=high[2],
     )
 
@@ -238,7 +252,7 @@ Triple = tuple[float, float, float]
 
 
 def _bounds(model: mujoco.MjModel, root: int) -> tuple[Triple, Triple]:
-    """Return the corners of the box around what is touched of a thing, in its frame, joints at zero."""
+    """Return the corners of the box around a thing's collision geoms, in its frame, joints at zero."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     frame, origin = data.xmat[root].reshape(3, 3), data.xpos[root]

@@ -14,7 +14,7 @@ from lerobot_memobench.tasks.task import Task
 
 
 class LiberoWorld(World):
-    """What LIBERO's code would say of one simulation, asked atom by atom.
+    """What LIBERO's code would answer about one simulation, asked atom by atom.
 
     Differences from `World`, read in LIBERO's `site_object.py` and `base_object_states.py`:
 
