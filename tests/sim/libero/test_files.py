@@ -69,11 +69,26 @@ def scan_folder(folder: Path, category: str, names: tuple[str, ...]) -> Path:
         path = folder / category / name / "usd" / "MJCF"
         (path / "visuals").mkdir(parents=True)
         corners = [(x, y, z * 0.01 * height) for x in (-0.02, 0.02) for y in (-0.03, 0.03) for z in (-1, 1)]
-        (path / "visuals" / "model.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners))
+        faces = [
+            "1 3 2",
+            "2 3 4",
+            "5 6 7",
+            "6 8 7",
+            "1 2 5",
+            "2 6 5",
+            "3 7 4",
+            "4 7 8",
+            "1 5 3",
+            "3 5 7",
+            "2 4 6",
+            "4 8 6",
+        ]
+        lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {face}" for face in faces]
+        (path / "visuals" / "model.obj").write_text("\n".join(lines))
         (path / f"{name}.xml").write_text(
             f'<mujoco model="{name}"><asset><mesh name="model" file="visuals/model.obj"/></asset>'
             f'<worldbody><body name="object"><geom class="visual" type="mesh" mesh="model"/>'
-            f'<geom class="touched" type="box" size="0.02 0.03 {0.01 * height}"/></body></worldbody>'
+            '<geom class="touched" type="mesh" mesh="model"/></body></worldbody>'
             '<default><default class="visual"><geom group="1" contype="0" conaffinity="0"/></default>'
             '<default class="touched"><geom group="0" condim="4"/></default></default></mujoco>'
         )
@@ -92,13 +107,22 @@ def test_scans_of_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
     scan_folder(tmp_path, "box_of_oatmeal", ("a", "b", "c", "d"))
     scene = build_scene(task)
     assert scene.stand_ins == ()
-    tomato = scene.model.body("beefsteak_tomato__1_1").id
-    (touched,) = (scene.model.geom_bodyid == tomato).nonzero()[0]
-    assert scene.model.geom_size[touched].tolist() == pytest.approx([0.02, 0.03, 0.02])  # the second scan
+    tomato = "beefsteak_tomato__1_1"
+    (touched,) = (scene.model.geom_bodyid == scene.model.body(tomato).id).nonzero()[0]
     assert scene.model.geom_condim[touched] == 4
+    assert scene.assets[tomato].high == pytest.approx((0.02, 0.03, 0.02))  # the second scan
     assert mjcf.class_file("beefsteak_tomato__1").bottom == pytest.approx(-0.02)
     with pytest.raises(MemobenchError, match="holds 2 scans"):
         mjcf.class_file("beefsteak_tomato__2")
+
+
+@needs_assets
+def test_a_scan_that_is_damaged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    scan_folder(scan_folder(tmp_path, "box_of_oatmeal", tuple("abcd")), "beefsteak_tomato", ("a", "b"))
+    (tmp_path / "beefsteak_tomato/b/usd/MJCF/visuals/model.obj").write_text("v 0 0 0\n")
+    monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
+    with pytest.raises(MemobenchError, match="cannot be built"):
+        build_scene(get_task(TOMATO).in_world("libero"))
 
 
 def test_a_scan_that_names_a_file_outside_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,7 @@
 """Read the MJCF of LIBERO's classes: bodies, assets and the sites that give a thing's size.
 
-robosuite, through which LIBERO loads these files, writes default classes out, keeps the
-first of two assets with one name, and puts a thing's name before every name in its file. So does this module.
+robosuite, through which LIBERO loads these files, writes default classes out, keeps the first of two assets with one
+name, and puts a thing's name before every name in its file. So does this module.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class ClassFile:
 
     Attributes:
         body: the thing's body, under which everything of it hangs; its default classes are written out.
-        assets: returns meshes, textures and materials, with files as absolute paths; physics needs none.
+        assets: returns meshes, textures and materials, with files as absolute paths.
         radius: radius from above within which nothing else may stand, m.
         bottom, top: heights of its underside and of its top over its origin, m.
         turns: drawn one after the other when it is set down.
@@ -46,6 +46,16 @@ class ClassFile:
     top: float
     turns: tuple[Turn, ...]
     stand_in: bool = False
+
+    @property
+    def collides_by_mesh(self) -> bool:
+        """Whether physics needs its meshes, too. No class of LIBERO's own does."""
+        return any("mesh" in geom.attrib and not is_visual(geom) for geom in self.body.iter("geom"))
+
+
+def is_visual(element: ET.Element) -> bool:
+    """Return whether an element is a geom without contacts."""
+    return element.tag == "geom" and element.get("contype") == element.get("conaffinity") == "0"
 
 
 def class_file(class_name: str) -> ClassFile:

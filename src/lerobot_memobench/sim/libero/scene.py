@@ -54,11 +54,18 @@ def build_scene(task: Task) -> Scene:
             f"task {task.name} is of the strict suite, whose detents and hidden things the world 'libero' does not "
             "have; take world=memobench"
         )
-    model = scene_spec(task).compile()
+    model = _compiled(task)
     assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
     boxes = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name).stand_in]
-    drawing = cache(lambda: scene_spec(task, visuals=True).compile())
+    drawing = cache(lambda: _compiled(task, visuals=True))
     return Scene(scene_key(task), model, assets, tuple(sorted(set(boxes))), drawing, COLLISION_GROUP)
+
+
+def _compiled(task: Task, visuals: bool = False) -> mujoco.MjModel:
+    try:
+        return scene_spec(task, visuals).compile()
+    except ValueError as error:  # MuJoCo cannot read a file
+        raise MemobenchError(f"the scene of task {task.name} in the world 'libero' cannot be built: {error}") from None
 
 
 def instances(task: Task) -> Iterator[tuple[str, str]]:
@@ -121,10 +128,11 @@ def scene_xml(task: Task, visuals: bool) -> str:
         else:
             _add_handles(body, name, class_name)
         world.append(body)
+    for class_name, known in classes.items():
+        if visuals or known.collides_by_mesh:
+            assets.extend(mjcf.shared_assets(class_name, known))
     if visuals:
         assets.extend(_kitchen_assets(kitchen))
-        for class_name, known in classes.items():
-            assets.extend(mjcf.shared_assets(class_name, known))
     else:
         _strip(world, assets)
     return ET.tostring(root, encoding="unicode")
@@ -201,7 +209,7 @@ def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
 def _strip(world: ET.Element, assets: ET.Element) -> None:
     """Remove visual geoms, materials and lights."""
     _remove(world, lambda one: one.tag == "light")
-    _remove(world, lambda one: one.tag == "geom" and one.get("contype") == one.get("conaffinity") == "0")
+    _remove(world, mjcf.is_visual)
     for geom in world.iter("geom"):
         geom.attrib.pop("material", None)
     used = {geom.get("mesh") for geom in world.iter("geom")}
