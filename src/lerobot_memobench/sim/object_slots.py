@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets.asset import Articulation
-from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
 from lerobot_memobench.sim.assets.registry import known_classes, split_class
 from lerobot_memobench.sim.gl.rasterizer import Highlight
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
@@ -96,7 +95,7 @@ class ObjectSlots:
         self._numbers = np.arange(len(self._points)).reshape(-1, POINTS)  # of a thing's points
         self._cameras = [sim.model.camera(name).id for name in MJCF_CAMERAS.values()]
         self._group = np.zeros(6, np.uint8)
-        self._group[VISUAL_GROUP] = 1
+        self._group[sim.opaque_group] = 1
 
     def owners(self, geoms: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the index in `things` that each geom belongs to, for ids of any shape; -1 for none and for id -1."""
@@ -115,10 +114,12 @@ class ObjectSlots:
         self.things.append(Thing(classes().index(kind), body, joint))
 
     def _surface(self, index: int, body: int) -> Array:
-        """Return POINTS points of a thing's visual geoms, far apart, a little inside, in its body's frame."""
+        """Return POINTS points of a thing's opaque geoms, far apart, a little inside, in its body's frame."""
         model = self._sim.model
         found = []
-        for geom in np.flatnonzero((self._owner[model.geom_bodyid] == index) & (model.geom_group == VISUAL_GROUP)):
+        for geom in np.flatnonzero(
+            (self._owner[model.geom_bodyid] == index) & (model.geom_group == self._sim.opaque_group)
+        ):
             points = corners(model, geom)
             points = points @ rotation(model.geom_quat[geom]).T + model.geom_pos[geom]
             inner = model.geom_bodyid[geom]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
@@ -36,6 +38,21 @@ class Placement:
     """Position of each articulated joint, m or rad."""
 
 
+def placing_atoms(task: Task, assets: Iterable[str]) -> dict[str, Atom]:
+    """Return the atom of `init` that places each thing, in the order of `init`.
+
+    Raises:
+        MemobenchError: one is not placed.
+    """
+    places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
+    missing = [name for name in assets if name not in places]
+    if missing:
+        raise MemobenchError(
+            f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to its :init"
+        )
+    return places
+
+
 class Placer:
     """Draw placements of one task and write them into a simulation.
 
@@ -48,13 +65,7 @@ class Placer:
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
-        self._places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
-        missing = [name for name in assets if name not in self._places]
-        if missing:
-            raise MemobenchError(
-                f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to "
-                "its :init"
-            )
+        self._places = placing_atoms(task, assets)
         self._order = self._sorted()
 
     def _sorted(self) -> list[str]:
@@ -94,6 +105,10 @@ class Placer:
                 opened = state in ("open", "turnon")
                 joints[articulation.joint] = articulation.open_q if opened else articulation.closed_q
         return joints
+
+    def place(self, seed: int) -> Placement:
+        """Draw the placement of a seed; see `draw`."""
+        return self.draw(np.random.default_rng([seed, zlib.crc32(self._task.scene_name.encode())]))
 
     def draw(self, rng: np.random.Generator) -> Placement:
         """Draw until nothing overlaps; return the last draw, and leave it written in model and data.
@@ -154,17 +169,7 @@ class Placer:
 
     def write(self, placement: Placement) -> None:
         """Write a placement into the model (fixtures) and data (objects, joints); velocities stay."""
-        for name, pose in placement.poses.items():
-            body = self._model.body(name)
-            if self._assets[name].kind == "fixture":
-                self._model.body_pos[body.id], self._model.body_quat[body.id] = pose[:3], pose[3:]
-            else:
-                address = int(self._model.joint(f"{name}_joint0").qposadr[0])
-                self._data.qpos[address : address + 7] = pose
-        for joint, q in placement.joints.items():
-            self._data.qpos[int(self._model.joint(joint).qposadr[0])] = q
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)
+        write(placement, self._model, self._data, self._assets)
 
     def _overlap(self) -> tuple[str, str] | None:
         """Return the names of the first two bodies whose geoms stand in each other."""
@@ -175,3 +180,18 @@ class Placer:
                 roots = [self._model.body(self._model.body_rootid[body]).name for body in bodies]
                 return roots[0], roots[1]
         return None
+
+
+def write(placement: Placement, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]) -> None:
+    """Write a placement into a model (fixtures) and data (objects, joints); velocities stay."""
+    for name, pose in placement.poses.items():
+        body = model.body(name)
+        if assets[name].kind == "fixture":
+            model.body_pos[body.id], model.body_quat[body.id] = pose[:3], pose[3:]
+        else:
+            address = int(model.joint(f"{name}_joint0").qposadr[0])
+            data.qpos[address : address + 7] = pose
+    for joint, q in placement.joints.items():
+        data.qpos[int(model.joint(joint).qposadr[0])] = q
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)

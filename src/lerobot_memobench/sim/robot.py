@@ -153,10 +153,21 @@ def _arrays() -> dict[str, np.ndarray]:
     return arrays
 
 
+def robot_xml() -> str:
+    """Return the MJCF of the arm and robosuite's physics options, its visual meshes with all their faces."""
+    return str(_arrays()["xml"])
+
+
 def robot_spec() -> mujoco.MjSpec:
     """Return a fresh spec that holds the arm and robosuite's physics options, for a scene to be added to."""
+    spec = mujoco.MjSpec.from_string(robot_xml())
+    thin(spec)
+    return spec
+
+
+def thin(spec: mujoco.MjSpec) -> None:
+    """Give the arm of a scene the thinned meshes, and draw nothing of it that a camera does not see."""
     arrays = _arrays()
-    spec = mujoco.MjSpec.from_string(str(arrays["xml"]))
     for mesh in spec.meshes:
         if f"v:{mesh.name}" in arrays:
             mesh.file = ""
@@ -168,13 +179,12 @@ def robot_spec() -> mujoco.MjSpec:
     # robosuite draws the grip site and its axes for debugging; a camera of the published stack does not see them.
     for site in spec.sites:
         site.group = 4
-    return spec
 
 
 @cache
 def whole_arm() -> mujoco.MjModel:
     """Return the arm alone, its visual meshes with all their faces. It is compiled once, in less than a second."""
-    return mujoco.MjModel.from_xml_string(str(_arrays()["xml"]))
+    return mujoco.MjModel.from_xml_string(robot_xml())
 
 
 # --- meshes: read and thinned out, since a face costs the same whether it is a pixel or not ---

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import mujoco
@@ -11,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.assets.builder import SITE_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE, build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
-from lerobot_memobench.tasks.task import STRICT, Task
+from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, Task
 
 Array = NDArray[np.float64]
 
@@ -33,42 +33,45 @@ SUBSTEPS = round(1 / (CONTROL_HZ * PHYSICS_STEP))
 
 ARENA_BYTES = 32 * 2**20
 """Room for contacts and constraints of one simulation."""
-CACHED_SCENES = 4
-"""Compiled scenes kept per process: evaluation takes one task after the other, each scene has some MB."""
 
 
 @dataclass(frozen=True)
 class Scene:
     """A compiled scene. The model is shared: change a copy only."""
 
-    key: tuple[str, str, str]
+    key: tuple[str, ...]
     model: mujoco.MjModel
     assets: dict[str, Asset]
-    """Every fixture but the table, then every object, by instance name."""
+    """Every fixture but the table, then every object, by instance name; in LIBERO's world objects go first."""
+    stand_ins: tuple[str, ...] = ()
+    """Classes that are boxes, because the user does not have the paper's scans of them."""
+    drawing: Callable[[], mujoco.MjModel] | None = None
+    """Returns the model to draw, of the same bodies and joints, where ``model`` has no visual geoms."""
+    opaque_group: int = VISUAL_GROUP
+    """Group of the geoms of ``model`` that hide things behind them."""
 
 
-_scenes: OrderedDict[tuple[str, str, str], Scene] = OrderedDict()
+def scene_key(task: Task) -> tuple[str, ...]:
+    """Return the name of a task's scene. Variants of a task (another referent) share it: they differ in goal."""
+    return task.name, task.suite, task.bddl_text, task.world
 
 
-def get_scene(task: Task) -> Scene:
-    """Return the compiled scene of a task, from this process's cache where it is there.
-
-    Variants of a task (another referent) share the scene: they differ in goal, not in what stands on the table.
-    """
-    key = (task.name, task.suite, task.bddl_text)
-    if key in _scenes:
-        _scenes.move_to_end(key)
-        return _scenes[key]
+def build_scene(task: Task) -> Scene:
+    """Return the compiled scene of a task in this package's own world."""
     spec, assets = scene_spec(task)
-    scene = Scene(key, spec.compile(), assets)
-    _scenes[key] = scene
-    while len(_scenes) > CACHED_SCENES:
-        _scenes.popitem(last=False)
-    return scene
+    return Scene(scene_key(task), spec.compile(), assets)
 
 
 def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
-    """Return a task's scene as a specification that may still be changed or saved, and its assets by instance."""
+    """Return a task's scene as a specification that may still be changed or saved, and its assets by instance.
+
+    Raises:
+        MemobenchError: the task is in another world than this package's own.
+    """
+    if task.world != MEMOBENCH:
+        raise MemobenchError(
+            f"the scene of task {task.name} is not written as MJCF in the world {task.world!r}; take world=memobench"
+        )
     spec = robot.robot_spec()
     spec.modelname = "memobench"
     spec.option.timestep = PHYSICS_STEP

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import reprlib
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,10 +17,10 @@ from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING, make_controller
 from lerobot_memobench.sim.gl.rasterizer import Highlight, Image, Rasterizer
-from lerobot_memobench.sim.placement import Placer
 from lerobot_memobench.sim.rendering import RenderSettings, get_renderer
-from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene
-from lerobot_memobench.sim.world import Start, World
+from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
+from lerobot_memobench.sim.world import Start
+from lerobot_memobench.sim.worlds import KINDS, get_scene
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
 
@@ -96,13 +95,16 @@ class Simulation:
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
-        self.world = World(task, self.model, self.data, scene.assets)
+        self.stand_ins, self.opaque_group = scene.stand_ins, scene.opaque_group
+        kind = KINDS[task.world]
+        self.world = kind.predicates(task, self.model, self.data, scene.assets)
         self._start = Start(self.model, self.data, tuple(task.objects), self.world.joints)
         self._at_home: Snapshot | None = None
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
+        self._drawn: tuple[mujoco.MjModel, mujoco.MjData] | None = None
         self._controller = make_controller(self.model)
-        self._placer = Placer(task, self.model, self.data, scene.assets)
+        self._placer = kind.placer(task, self.model, self.data, scene.assets)
         self._hand = self.model.body(robot.HAND_BODY).id
         self._grip = self.model.site(robot.GRIP_SITE).id
         self._arm_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
@@ -121,7 +123,7 @@ class Simulation:
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._arm_qpos] = robot.ARM_START
         self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
-        self._placer.draw(np.random.default_rng([seed, zlib.crc32(self.task.scene_name.encode())]))
+        self._placer.place(seed)
         self.highlights = ()
         mujoco.mj_step1(self.model, self.data)
         self._controller.reset(self.data)
@@ -293,16 +295,34 @@ class Simulation:
         for asset, geom in self._glow:
             lit = self.holds(Atom("turnon", (asset.name,)))
             self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
-        return self._renderer(camera).draw(self.model, self.data, MJCF_CAMERAS[camera], self.highlights)
+        model, data = self._drawing()
+        return self._renderer(camera, model).draw(model, data, MJCF_CAMERAS[camera], self.highlights)
 
     def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
-        return self._renderer(camera).draw_geoms(self.model, self.data, MJCF_CAMERAS[camera])
+        model, data = self._drawing()
+        return self._renderer(camera, model).draw_geoms(model, data, MJCF_CAMERAS[camera])
 
-    def _renderer(self, camera: str) -> Rasterizer:
+    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Return the model to draw and its present state: those that move, or the scene's drawing in the same pose."""
+        if self._scene.drawing is None:
+            return self.model, self.data
+        if self._drawn is None:
+            model = copy.copy(self._scene.drawing())
+            self._drawn = model, mujoco.MjData(model)
+        model, data = self._drawn
+        for name, pose in self.fixture_poses().items():
+            body = model.body(name).id
+            model.body_pos[body], model.body_quat[body] = pose[:3], pose[3:]
+        data.qpos[:] = self.data.qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        return model, data
+
+    def _renderer(self, camera: str, model: mujoco.MjModel) -> Rasterizer:
         if camera not in MJCF_CAMERAS:
             raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, MJCF_CAMERAS)}")
-        return get_renderer(self._scene.key, self._scene.model, self.render_settings)
+        return get_renderer(self._scene.key, model, self.render_settings)
 
     def proprio(self) -> NDArray[np.float32]:
         """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""

@@ -1,0 +1,171 @@
+"""LIBERO's classes as a table: where the MJCF of each lies, and what LIBERO's Python code adds to it.
+
+Numbers are facts of LIBERO's code (`envs/objects`, MIT licence): the turns with which its samplers set things down, the
+ranges of joint positions that count as open, closed, on and off, and where handles are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import nan, pi
+from typing import Literal
+
+Turn = tuple[str, float]
+"""Axis (x, y or z) and angle, rad."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A drawer, door or knob of a fixture.
+
+    Attributes:
+        joint: its joint.
+        body: the body that moves.
+        handle: where the middle of its handle is in that body's frame, m.
+        handle_quaternion: from the handle's frame (x along it, y into the fixture) to the body's, wxyz.
+        handle_size: length of the handle, and its thickness along y and z, m.
+        clearance: free space behind the handle, m.
+        closed_q, open_q: good targets for the joint (off and on for a knob), m or rad.
+        ranges: `init` predicate -> between which positions LIBERO draws the joint.
+        open_below, closed_above, on_at_least, off_below: as of `Articulation`.
+    """
+
+    kind: Literal["drawer", "door", "knob"]
+    joint: str
+    body: str
+    handle: tuple[float, float, float]
+    handle_size: tuple[float, float, float]
+    clearance: float
+    closed_q: float
+    open_q: float
+    ranges: dict[str, tuple[float, float]]
+    handle_quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    open_below: float = nan
+    closed_above: float = nan
+    on_at_least: float = nan
+    off_below: float = nan
+
+
+@dataclass(frozen=True)
+class LiberoClass:
+    """An object's or fixture's class.
+
+    Attributes:
+        mjcf: its file below the folder of assets.
+        turns: drawn one after the other when a thing is set down. A fixture is turned as its task states.
+        parts: pairs of the part's region, or "" where the fixture is the part's name, and the part.
+    """
+
+    mjcf: str
+    turns: tuple[Turn, ...] = (("x", pi / 2),)
+    parts: tuple[tuple[str, Part], ...] = ()
+
+
+def _scanned(name: str) -> LiberoClass:
+    return LiberoClass(f"stable_scanned_objects/{name}/{name}.xml")
+
+
+def _grocery(name: str, *turns: Turn) -> LiberoClass:
+    return LiberoClass(f"stable_hope_objects/{name}/{name}.xml", turns or (("x", pi / 2),))
+
+
+def _modelled(name: str) -> LiberoClass:
+    return LiberoClass(f"turbosquid_objects/{name}/{name}.xml", (("x", 0.0),))
+
+
+_DRAWERS = {"top": 0.18393, "middle": 0.11041, "bottom": 0.04114}
+"""Drawer -> height of its handle, m."""
+
+
+def _drawer(level: str, height: float) -> Part:
+    return Part(
+        kind="drawer",
+        joint=f"{level}_level",
+        body=f"cabinet_{level}",
+        handle=(-0.00278, -0.10161, height),
+        handle_size=(0.0889, 0.0154, 0.01634),
+        clearance=0.015,
+        closed_q=0.005,
+        open_q=-0.155,
+        ranges={"open": (-0.16, -0.14), "close": (0.0, 0.005)},
+        open_below=-0.14,
+        closed_above=0.0,
+    )
+
+
+_DOOR = Part(
+    kind="door",
+    joint="microjoint",
+    body="microdoorroot",
+    handle=(0.2375, -0.054, 0.0),
+    handle_size=(0.13, 0.02, 0.02),
+    clearance=0.019,
+    handle_quaternion=(0.5**0.5, 0.0, -(0.5**0.5), 0.0),
+    closed_q=0.0,
+    open_q=-1.9,
+    ranges={"open": (-2.094, -1.3), "close": (-0.005, 0.0)},
+    open_below=-1.3,
+    closed_above=-0.005,
+)
+_KNOB = Part(
+    kind="knob",
+    joint="button",
+    body="button",
+    handle=(0.0, 0.0, 0.0257),
+    handle_size=(0.069, 0.024, 0.049),
+    clearance=0.03,
+    closed_q=-0.005,
+    open_q=1.0,
+    ranges={"turnon": (0.5, 2.1), "turnoff": (-0.005, 0.0)},
+    on_at_least=0.5,
+    off_below=0.0,
+)
+
+CLASSES: dict[str, LiberoClass] = {
+    "akita_black_bowl": _scanned("akita_black_bowl"),
+    "white_bowl": _scanned("white_bowl"),
+    "plate": _scanned("plate"),
+    "chefmate_8_frypan": _scanned("chefmate_8_frypan"),
+    "bbq_sauce": _grocery("bbq_sauce"),
+    "butter": _grocery("butter", ("x", 0.0)),
+    "milk": _grocery("milk", ("x", pi / 2), ("z", pi / 2)),
+    "ketchup": _grocery("ketchup", ("x", pi / 2), ("z", pi / 2)),
+    "moka_pot": _modelled("moka_pot"),
+    "wooden_two_layer_shelf": _modelled("wooden_two_layer_shelf"),
+    "wooden_cabinet": LiberoClass(
+        "articulated_objects/wooden_cabinet.xml",
+        parts=tuple((f"{level}_region", _drawer(level, height)) for level, height in _DRAWERS.items()),
+    ),
+    "microwave": LiberoClass("articulated_objects/microwave.xml", parts=(("", _DOOR),)),
+    "flat_stove": LiberoClass("articulated_objects/flat_stove.xml", parts=(("", _KNOB),)),
+}
+
+SCANS: dict[str, tuple[float, float, float]] = {
+    "artichoke": (0.029, 0.029, 0.026),
+    "bag_of_snacks": (0.023, 0.048, 0.060),
+    "bean_curd": (0.025, 0.030, 0.018),
+    "beefsteak_tomato__1": (0.031, 0.031, 0.026),
+    "biscuit": (0.029, 0.029, 0.012),
+    "bottle_of_coffee": (0.029, 0.029, 0.069),
+    "bottle_of_detergent__1": (0.029, 0.044, 0.075),
+    "bottle_of_fabric_softener": (0.027, 0.038, 0.078),
+    "bottle_of_olive_oil__1": (0.027, 0.027, 0.086),
+    "bottle_of_protein_powder__2": (0.033, 0.033, 0.060),
+    "box_of_cereal__2": (0.021, 0.050, 0.072),
+    "box_of_flour": (0.028, 0.043, 0.066),
+    "box_of_oatmeal__3": (0.024, 0.048, 0.069),
+    "broccoli": (0.032, 0.032, 0.026),
+    "brussels_sprouts__2": (0.025, 0.025, 0.024),
+    "cap__2": (0.026, 0.026, 0.015),
+    "carton_of_milk__6": (0.031, 0.031, 0.079),
+    "charger": (0.044, 0.027, 0.019),
+    "chestnut__2": (0.020, 0.024, 0.018),
+    "cork__3": (0.019, 0.019, 0.026),
+}
+"""Classes that the paper's authors scanned -> half extents of the box that stands in where their scan is missing, m:
+those of this package's own object of the class, z up."""
+
+
+def parts_of(class_name: str) -> tuple[tuple[str, Part], ...]:
+    """Return the parts of a class; objects and scans have none."""
+    return CLASSES[class_name].parts if class_name in CLASSES else ()

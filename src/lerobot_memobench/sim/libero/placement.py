@@ -1,0 +1,217 @@
+"""Place things as LIBERO's samplers do: the same draws of NumPy's `RandomState`, so that a seed gives LIBERO's scene.
+
+Episode k of the paper's evaluation has seed 7 + k. All draws of a scene come from one `RandomState`, in this order:
+
+1. seven normal numbers, the arm's noise, which LIBERO multiplies by zero;
+2. for each (Open|Close|TurnOn|TurnOff x) of `:init`, a position of its joints. The list of them grows at each load of
+   the model, and an environment loads it when it is made and when it is reset: two rounds; the last one counts;
+3. for each (On x <region of the table>) of `:init`: a range, x and y, again while a thing overlaps what stands already,
+   then the angles of its turns;
+4. the same for (On x <region of a fixture>), then (In x <region>), then (On x <thing>).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.assets.asset import Asset
+from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_SIZE, TABLE_TOP
+from lerobot_memobench.sim.libero.classes import Turn, parts_of
+from lerobot_memobench.sim.libero.mjcf import ClassFile, class_file
+from lerobot_memobench.sim.placement import Placement, Pose, placing_atoms, write
+from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.task import Task
+
+ATTEMPTS = 5000
+"""Draws of a place before a region counts as too crowded."""
+LOADS = 2
+"""Times that LIBERO has loaded the model by the end of the first reset."""
+OBJECT_GAP = 0.01
+"""Height over the table, or over another thing, at which a thing is set down, m."""
+FIXTURE_GAP = 0.01 - TABLE_SIZE[2]
+
+Array = NDArray[np.float64]
+Rectangle = tuple[float, float, float, float]
+"""x1, y1, x2, y2, m."""
+POINT: Rectangle = (0.0, 0.0, 0.0, 0.0)
+
+
+class LiberoPlacer:
+    """Place the things of one simulation.
+
+    Args:
+        task: the task whose `init` atoms place the things.
+        model: the simulation's own model: fixtures are moved in it.
+        data: state that is written.
+        assets: kind and class by instance.
+    """
+
+    def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
+        self._task, self._model, self._data, self._assets = task, model, data, assets
+        self._places = list(placing_atoms(task, assets).values())
+        self._files = {name: class_file(asset.class_name) for name, asset in assets.items()}
+
+    def place(self, seed: int) -> Placement:
+        """Draw the placement of a seed, leave it written in model and data, and return it.
+
+        Raises:
+            MemobenchError: a region has no room for its thing.
+        """
+        rng = np.random.RandomState(seed)  # the stream of LIBERO's own `np.random.seed`
+        rng.randn(7)
+        joints = self._draw_joints(rng)
+        self._centre_fixtures(joints)
+        poses: dict[str, Pose] = {}
+        for atom in self._in_order():
+            poses[atom.args[0]] = self._draw(atom, poses, rng)
+        placement = Placement(poses, joints)
+        write(placement, self._model, self._data, self._assets)
+        return placement
+
+    def _in_order(self) -> list[Atom]:
+        """Return the atoms that place something: on the table, on fixtures, in regions, on things."""
+
+        def turn(atom: Atom) -> int:
+            if atom.args[1] in self._assets:
+                return 3
+            if atom.predicate == "in":
+                return 2
+            return 0 if self._task.regions[atom.args[1]].target == TABLE else 1
+
+        return sorted(self._places, key=turn)
+
+    # --- joints ---
+
+    def _draw_joints(self, rng: np.random.RandomState) -> dict[str, float]:
+        """Draw the joints that `:init` mentions; the others are at zero."""
+        joints = {part.joint: 0.0 for asset in self._assets.values() for part in asset.articulations.values()}
+        for _ in range(LOADS):
+            for atom in self._task.init:
+                if len(atom.args) == 1:
+                    named = self._parts(atom)
+                    low, high = next(iter(named.values()))
+                    joints.update(dict.fromkeys(named, rng.uniform(low, high)))
+        return joints
+
+    def _parts(self, atom: Atom) -> dict[str, tuple[float, float]]:
+        """Return joint -> range in which an atom's predicate holds, for a fixture's parts or the one of a region."""
+        found = {
+            f"{instance}_{part.joint}": part.ranges[atom.predicate]
+            for instance, asset in self._assets.items()
+            for region, part in parts_of(asset.class_name)
+            if atom.args[0] in (instance, f"{instance}_{region}") and atom.predicate in part.ranges
+        }
+        if not found:
+            raise MemobenchError(f"task {self._task.name}: nothing in the world 'libero' can start as {atom}")
+        return found
+
+    def _centre_fixtures(self, joints: dict[str, float]) -> None:
+        """Bring fixtures to the origin: there LIBERO asks for the places of their regions."""
+        still = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        fixtures = {name: still for name, asset in self._assets.items() if asset.kind == "fixture"}
+        write(Placement(fixtures, joints), self._model, self._data, self._assets)
+
+    # --- places ---
+
+    def _draw(self, atom: Atom, poses: Mapping[str, Pose], rng: np.random.RandomState) -> Pose:
+        """Draw the pose of the thing that an atom places: the place until it is free of the others, then the turn.
+
+        LIBERO lets fixtures, and things that stand on things, overlap with others.
+        """
+        name, where = atom.args
+        rectangles, base = self._room(atom, poses)
+        alone = self._assets[name].kind == "fixture" or where in self._assets
+        others = {} if alone else poses
+        known, z = self._files[name], base[2] - self._files[name].bottom
+        for _ in range(ATTEMPTS):
+            x1, y1, x2, y2 = rectangles[rng.randint(len(rectangles))]
+            place = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
+            if all(apart(known, place, self._files[other], others[other]) for other in others):
+                return np.array([*place, *self._turn(name, where, rng)])
+        raise MemobenchError(
+            f"task {self._task.name}: {name} overlapped with something in each of {ATTEMPTS} draws of its place; "
+            "move the regions of its :init apart"
+        )
+
+    def _room(self, atom: Atom, poses: Mapping[str, Pose]) -> tuple[Sequence[Rectangle], Array]:
+        """Return the rectangles from which a thing's x and y are drawn, and an offset (3,): z is that of its underside.
+
+        A thing on a fixture's region keeps its radius off the edge of half of it; in a region or on a thing it is in
+        the middle.
+        """
+        name, where = atom.args
+        if where in self._assets:
+            return [POINT], poses[where][:3] + np.array([0.0, 0.0, self._files[where].top + OBJECT_GAP])
+        region = self._task.regions[where]
+        if region.target == TABLE:
+            gap = FIXTURE_GAP if self._assets[name].kind == "fixture" else OBJECT_GAP
+            return region.ranges, np.array([0.0, 0.0, TABLE_TOP + gap])
+        site, owner = self._model.site(where).id, poses[region.target]
+        base = owner[:3] + single_precision_matrix(owner[3:]) @ self._data.site_xpos[site]
+        if atom.predicate == "in":
+            return [POINT], base
+        x, y = self._model.site_size[site][:2] / 2 - self._files[name].radius
+        return [(-x, -y, x, y)], base + np.array([0.0, 0.0, self._files[region.target].top])
+
+    def _turn(self, name: str, where: str, rng: np.random.RandomState) -> Array:
+        """Draw how a thing or fixture is turned (4,)."""
+        if self._assets[name].kind == "fixture":
+            low, high = sorted(self._task.regions[where].yaw)
+            return quaternion("z", rng.uniform(low, high))
+        return thing_turn(self._files[name].turns, rng)
+
+
+def apart(thing: ClassFile, place: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
+    """Return whether a thing's disc is free of another's, or far enough above it."""
+    distance = np.hypot(place[0] - pose[0], place[1] - pose[1])
+    return bool(distance > other.radius + thing.radius or place[2] - pose[2] > other.top - thing.bottom)
+
+
+# --- turns ---
+
+
+def quaternion(axis: str, angle: float) -> Array:
+    """Return the quaternion wxyz (4,) of a turn about x, y or z by an angle, rad."""
+    q = np.zeros(4)
+    q[0], q[1 + "xyz".index(axis)] = np.cos(angle / 2), np.sin(angle / 2)
+    return q
+
+
+def thing_turn(turns: tuple[Turn, ...], rng: np.random.RandomState) -> Array:
+    """Draw a thing's turn (4,).
+
+    LIBERO's sampler writes (x, y, z, w) where its reader reads (w, x, y, z): a turn of 90° about x becomes one about z.
+    It multiplies several turns in single precision.
+    """
+    drawn = [np.roll(quaternion(axis, rng.uniform(angle, angle)), -1) for axis, angle in turns]
+    if len(drawn) == 1:
+        return drawn[0]
+    q = np.array([0.0, 0.0, 0.0, 1.0])
+    for x1, y1, z1, w1 in drawn:
+        x0, y0, z0, w0 = q
+        q = np.array(
+            (
+                x1 * w0 + y1 * z0 - z1 * y0 + w1 * x0,
+                -x1 * z0 + y1 * w0 + z1 * x0 + w1 * y0,
+                x1 * y0 - y1 * x0 + z1 * w0 + w1 * z0,
+                -x1 * x0 - y1 * y0 - z1 * z0 + w1 * w0,
+            ),
+            dtype=np.float32,
+        )
+    return q.astype(np.float64)
+
+
+def single_precision_matrix(q: Array) -> NDArray[np.float32]:
+    """Return the rotation (3, 3) of a quaternion wxyz as robosuite computes it, in single precision."""
+    q = np.asarray(q, dtype=np.float32)
+    q = q * np.float32(np.sqrt(2.0 / np.dot(q, q)))
+    product = np.outer(q, q)
+    (_, wx, wy, wz), (_, xx, xy, xz), (_, _, yy, yz), (_, _, _, zz) = product
+    one = np.float32(1.0)
+    rows = [one - yy - zz, xy - wz, xz + wy], [xy + wz, one - xx - zz, yz - wx], [xz - wy, yz + wx, one - xx - yy]
+    return np.array(rows)

