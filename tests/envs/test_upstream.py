@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs import episode as episodes
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import episode_record, read_protocol_file
@@ -79,7 +77,7 @@ def test_a_line_of_the_papers_world_names_world_and_stand_ins(monkeypatch: pytes
     episode.reset(7)
     assert not {"world", "stand_ins", "protocol"} & set(episode_record(episode, 0, None, 0.1))
     episode.task = episode.task.in_world(LIBERO)
-    monkeypatch.setattr(episodes, "get_scene", lambda task: SimpleNamespace(stand_ins=("cork__3",)))
+    monkeypatch.setattr(episode.sim, "stand_ins", ("cork__3",), raising=False)
     line = episode_record(episode, 0, None, 0.1)
     assert (line["world"], line["stand_ins"]) == ("libero", ["cork__3"])
 

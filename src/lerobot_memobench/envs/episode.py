@@ -39,7 +39,6 @@ from lerobot_memobench.protocol import (
 from lerobot_memobench.sim.gl.rasterizer import Image
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.evidence import Choice
@@ -253,7 +252,7 @@ class Episode:
     @property
     def stand_ins(self) -> tuple[str, ...]:
         """Classes whose scans are not on this machine, so that others stand in for them in this scene."""
-        return tuple(getattr(get_scene(self.published), "stand_ins", ()))
+        return tuple(getattr(self.sim, "stand_ins", ()))
 
     def step(self, action: ArrayLike) -> None:
         """Advance by one control step; during the prompt the given action has no effect, after a fault nothing has."""
