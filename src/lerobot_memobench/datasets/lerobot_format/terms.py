@@ -10,9 +10,9 @@ from lerobot_memobench.tasks.task import LIBERO
 
 OWN = "Apache-2.0: the demonstrations, and `lerobot_memobench`, which made them."
 _LIBERO = (
-    "The scenes are of LIBERO's assets (Liu et al., 2023). LIBERO has its code under MIT and its datasets under CC BY 4.0; "
-    "the packages of its assets say MIT. Name LIBERO where you show the pictures. What `lerobot_memobench` adds, such as "
-    "actions, labels and tables, is under Apache-2.0."
+    "The scenes are of LIBERO's assets (Liu et al., 2023). LIBERO has its code under MIT and its datasets under CC BY "
+    "4.0; the packages of its assets say MIT. Name LIBERO where you show the pictures. What `lerobot_memobench` adds, "
+    "such as actions, labels and tables, is under Apache-2.0."
 )
 _AUTHORS = (
     "{what} of MEMOBench's authors are under CC BY-NC 4.0 by the licence of their repository, "
