@@ -15,8 +15,10 @@ from lerobot_memobench.envs.episode_log import episode_record, read_protocol_fil
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION
-from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.formula import Atom, Formula, Then
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.failures import asks_order
+from lerobot_memobench.tasks.formula import Atom, Formula, Then, atoms
+from lerobot_memobench.tasks.progress import HOLD_STEPS, Progress
 from lerobot_memobench.tasks.task import LIBERO, STRICT, Task
 
 DRAWER = "check_the_top_drawer_of_the_cabinet"
@@ -105,3 +107,18 @@ def test_strict_tasks_are_not_of_the_papers_world() -> None:
         MemobenchEnv("check_the_top_drawer_a_given_number_of_times", world=LIBERO)
     with pytest.raises(MemobenchError, match=r"env.world is 'robosuite'"):
         MemobenchEnvConfig(world="robosuite")
+
+
+@pytest.mark.parametrize("name", [each for each in task_names() if asks_order(get_task(each).goal)])
+def test_goals_in_an_order_cannot_be_reached_there(name: str) -> None:
+    """When the last part of `Then` begins to hold all checkpoints have held: docs/benchmark/fidelity.md says so."""
+    task = get_task(name)
+    progress = Progress(task, evaluations=2)
+    world = [atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)]
+    for atom in world:  # one after the other, each for as long as it is asked for
+        for _ in range(HOLD_STEPS):
+            progress.step({atom}.__contains__)
+            if None not in progress.first_step:
+                break
+    assert None not in progress.first_step
+    assert not progress.success

@@ -20,7 +20,7 @@ from lerobot_memobench.tasks.task import PUBLISHED, REFERENTS
 DIFFERENCES = (
     "no demonstration prompt",
     "the published referents alone",
-    "an episode also ends when all memory checkpoints have held, in whatever order",
+    "an episode also ends when all memory checkpoints have held, in whatever order, before a goal of Then is reached",
     f"at most {UPSTREAM_HORIZON} execution steps",
     "two evaluations of the goal per control step: each part of Then holds for 5 of them, not 10",
     "the goal is evaluated in the 10 stabilisation steps too",
