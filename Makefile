@@ -16,7 +16,7 @@ demo: ## expert on four tasks, two policies on one; videos and report in outputs
 	@.venv/bin/memobench demo $(ARGS)
 
 test: ## run the tests; ARGS are passed to pytest (ARGS="-m slow")
-	@scripts/setup --browser
+	@scripts/setup --tests
 	@$(PYTHON) -m pytest -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 check: ## lint, formatting, types and declared dependencies

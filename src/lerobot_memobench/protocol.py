@@ -8,6 +8,12 @@ CONTROL_HZ = 20
 """Control steps, and therefore frames, per second."""
 HORIZON = 1200
 """Control steps of an execution before an episode is cut off."""
+PROTOCOLS = BY_PAPER, UPSTREAM = ("paper", "upstream")
+"""Whose evaluation it is: the paper's text, or the script that its authors published (`envs.upstream`)."""
+UPSTREAM_HORIZON = 990
+"""Control steps of an execution there: LIBERO's simulator ends after 1,000, of which 10 are the stabilisation's."""
+UPSTREAM_EVALUATIONS = 2
+"""Evaluations of the goal per control step there: for the reward, and for the end of the episode."""
 PROMPT_HORIZON = 1500
 """Control steps after which a demonstration prompt ends, whatever it still had to show. Hiding two things takes some
 750; with one of them grasped at the fifth try more than 1000."""

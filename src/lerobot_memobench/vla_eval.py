@@ -21,8 +21,8 @@ from lerobot_memobench.envs.observations import PIXEL_INPUT, RESET, STEPS, check
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, HORIZON, PROMPT, SEALED, SPLITS
-from lerobot_memobench.tasks.task import PUBLISHED
+from lerobot_memobench.protocol import ACTION_DIM, BY_PAPER, CAMERAS, EVALUATION_SEED, HORIZON, PROMPT, SEALED, SPLITS
+from lerobot_memobench.tasks.task import MEMOBENCH, PUBLISHED
 
 try:
     from vla_eval.benchmarks.base import StepBenchmark, StepResult
@@ -67,6 +67,8 @@ class MEMOBench(StepBenchmark):
     Args:
         tasks: `all`, memory types, task names or their numbers, separated by commas or as a list.
         suite: `published` or `strict`.
+        world: `memobench` or `libero`, as of `MemobenchEnvConfig`.
+        protocol: `paper` or `upstream`, as of `MemobenchEnvConfig`.
         referent: `fixed` or `random`.
         seed: of episode 0.
         horizon: control steps of an execution. A ``max_steps`` of the harness that is lower ends episodes unlogged.
@@ -99,6 +101,8 @@ class MEMOBench(StepBenchmark):
         self,
         tasks: str | int | Sequence[str | int] = "all",
         suite: str = PUBLISHED,
+        world: str = MEMOBENCH,
+        protocol: str = BY_PAPER,
         referent: str = "fixed",
         seed: int = EVALUATION_SEED,
         horizon: int = HORIZON,
@@ -128,6 +132,8 @@ class MEMOBench(StepBenchmark):
         self._config = MemobenchEnvConfig(
             tasks=str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks)),
             suite=suite,
+            world=world,
+            protocol=protocol,
             referent=referent,
             seed_base=seed,
             horizon=horizon,
@@ -148,7 +154,7 @@ class MEMOBench(StepBenchmark):
         self._prompt_in = STEPS if send_video_history else RESET
         if log_dir is not None:  # now, not when the first episode has been simulated
             check_protocol(
-                Path(log_dir), {**self._config.protocol, "prompt_in": self._prompt_in, **self._acting.protocol}
+                Path(log_dir), {**self._config.agreed_settings, "prompt_in": self._prompt_in, **self._acting.protocol}
             )
         self._env: MemobenchEnv | None = None
         self._history: dict[str, list[NDArray[Any]]] = {}
@@ -260,10 +266,10 @@ class MEMOBench(StepBenchmark):
         return dict.fromkeys((SUCCESS, *PROCESS_METRICS), "mean")
 
     def get_metadata(self) -> dict[str, Any]:
-        """Return the harness's bound of steps, the horizon with all pauses, and the suite."""
+        """Return the harness's bound of steps, the horizon with all pauses, and suite, world and protocol."""
         config = self._config
         most = longest(config.horizon, config.pause_steps, config.speed, self._n_action_steps)
-        return {"max_steps": most, "suite": config.suite}
+        return {"max_steps": most, "suite": config.suite, "world": config.world, "protocol": config.protocol}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """Return the conventions of an action."""

@@ -53,7 +53,7 @@ class FakeLeRobot:
         names = {"horizon": int, "seed_base": int, "referent": str, "tasks": str, "task": str, "log_dir": str}
         given = {name: flag_value(flags, f"env.{name}") for name in names}
         config = MemobenchEnvConfig(**{key: names[key](value) for key, value in given.items() if value is not None})
-        self.log = EpisodeLog(config.resolved_log_dir(), config.protocol)
+        self.log = EpisodeLog(config.resolved_log_dir(), config.agreed_settings)
         self.resume = flag_value(flags, "env.resume") == "true"
         self.base = config.seed_base
         self.batch = int(flag_value(flags, "eval.batch_size") or 1)

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH
 from tests.support.videos import encode_video
 
 SIZE = 64
@@ -325,6 +328,32 @@ def test_card(dataset):
     assert "5.0 in object tasks" in card.text
     assert "| 0–199 | 3 | 100.00 % | 50 | 3.33 % |" in card.text
     assert "| 1,500+ | 0 | 0.00 % | 25 | 1.67 % |" in card.text
+
+
+def test_the_papers_world_comes_back_and_has_terms_of_its_own(demos, make_task, tmp_path):
+    from huggingface_hub import DatasetCard
+
+    name = "put_the_artichoke_into_the_top_drawer_of_the_cabinet"
+    spatial = replace(demos[0], task=make_task("SU", name=name, memory_type="spatial").in_world(LIBERO))
+    classes = sorted({*get_task(name).objects.values()})
+    for folder, demo, licence in (
+        ("boxes", replace(spatial, stand_ins=tuple(classes)), "other"),
+        ("scans", replace(spatial, stand_ins=tuple(classes[1:])), "cc-by-nc-4.0"),
+        ("converted", replace(demos[0], task=demos[0].task.in_world(LIBERO), seed=-1), "cc-by-nc-4.0"),
+    ):
+        root = write_dataset([demo], tmp_path / folder)
+        assert read_episode(root, 0).world == LIBERO
+        (row,) = json.loads((root / "manifest.json").read_text())["episodes"]
+        assert (row["world"], row["stand_ins"]) == (LIBERO, list(demo.stand_ins))
+        card = DatasetCard.load(root / "README.md")
+        assert card.data.license == licence
+        assert ("boxes stand in for them: " in card.text) == bool(demo.stand_ins)
+    assert digest(spatial) != digest(replace(spatial, task=spatial.task.in_world(MEMOBENCH)))
+
+
+def test_the_own_world_is_not_written_down(dataset):
+    assert '"world"' not in (dataset.root / "manifest.json").read_text()
+    assert "world" not in dataset.meta.episodes.column_names
 
 
 def test_manifest(dataset, demos):

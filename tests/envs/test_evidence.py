@@ -81,7 +81,7 @@ def test_the_published_goal_alone_is_no_evidence() -> None:
         MemobenchEnvConfig(evidence=True)
     with pytest.raises(MemobenchError, match="say referent=random"):
         MemobenchEnv(str(get_task(MILK).derived_from), evidence=True)
-    assert MemobenchEnvConfig(evidence=True, suite="strict").protocol["evidence"] is True
+    assert MemobenchEnvConfig(evidence=True, suite="strict").agreed_settings["evidence"] is True
 
 
 def test_tasks_without_variants_are_left_out() -> None:

@@ -50,7 +50,7 @@ def test_every_episode_is_drawn_whatever_referent_is_asked_for(referent: str) ->
 @pytest.mark.parametrize("referent", ["fixed", "random", "drawn"])
 def test_a_configuration_tells_what_is_true_of_its_suite(referent: str) -> None:
     config = MemobenchEnvConfig(suite=STRICT, referent=referent)
-    assert config.referent == config.protocol["referent"] == config.gym_kwargs["referent"] == "drawn"
+    assert config.referent == config.agreed_settings["referent"] == config.gym_kwargs["referent"] == "drawn"
 
 
 def test_published_tasks_are_not_drawn() -> None:
@@ -214,9 +214,9 @@ def test_a_protocol_without_a_suite_is_the_published_ones() -> None:
 
 
 def test_strict_results_from_before_the_robot_idled_are_of_another_protocol() -> None:
-    now = MemobenchEnvConfig(suite=STRICT).protocol
+    now = MemobenchEnvConfig(suite=STRICT).agreed_settings
     before = {key: value for key, value in now.items() if key != IDLE}
     assert differences(before, now) == [f"idle: 0 and {IDLE_STEPS}"]
     assert differences(now, before) == [f"idle: {IDLE_STEPS} and 0"]
     assert differences(now, now) == []
-    assert IDLE not in MemobenchEnvConfig().protocol
+    assert IDLE not in MemobenchEnvConfig().agreed_settings

@@ -20,11 +20,12 @@ from lerobot_memobench.envs.episode_log import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare
+from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import failure_counts, summarise
 from lerobot_memobench.evaluation.records import CARD_FILE, read_protocol, read_rollouts, read_runs, sweeps
 from lerobot_memobench.evaluation.report import build, render, write_report
-from lerobot_memobench.evaluation.report_tables import failures_table
+from lerobot_memobench.evaluation.report_tables import departures, failures_table
 from lerobot_memobench.run.merging import merge
 from lerobot_memobench.tasks.failures import FAILURES
 from tests.support import logs
@@ -252,6 +253,25 @@ def published(tmp_path: Path) -> Path:
 
 
 REFUSED = "report each suite by itself"
+
+
+def test_reports_of_two_worlds_are_refused_and_stand_ins_are_told(published: Path, tmp_path: Path) -> None:
+    libero = evaluation(tmp_path / "libero", world="libero", stand_ins=["cork__3"])
+    with pytest.raises(MemobenchError, match=r"world=memobench and .* world=libero, .*report each world by itself"):
+        read_runs([published, libero])
+    with pytest.raises(MemobenchError, match="found --allow 'world'"):
+        compare(*read_runs([published]), *read_runs([libero]), allow=["world"])
+    with pytest.raises(MemobenchError, match=r"\(world: memobench and libero\); they are not one evaluation"):
+        merge(tmp_path / "joined", [published, libero])
+    (run,) = read_runs([libero])
+    assert "published suite, world libero, 1 stand-in, referent fixed" in headline([run])
+    assert any("boxes stood in for cork__3" in note for note in run.notes)
+
+
+def test_what_departs_from_the_papers_protocol_names_world_and_protocol(published: Path, tmp_path: Path) -> None:
+    upstream = evaluation(tmp_path / "upstream", world="libero", protocol="upstream")
+    (ours,), (theirs,) = (departures(*read_runs([folder]))[-1:] for folder in (published, upstream))
+    assert (ours, theirs) == ("world memobench instead of libero", "protocol upstream instead of paper")
 
 
 def test_reports_of_two_suites_are_refused(strict: Path, published: Path, tmp_path: Path) -> None:

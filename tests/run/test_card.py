@@ -91,6 +91,15 @@ def test_what_is_told_for_people() -> None:
         assert part in text, part
 
 
+def test_a_card_names_what_the_authors_evaluation_does_otherwise_and_stand_ins() -> None:
+    there = {"world": "libero", "protocol": "upstream"}
+    found = with_episodes(card(protocol=card()["protocol"] | there), [record("a", stand_ins=["cork__3"], **there)])
+    assert found["episodes"][0]["stand_ins"] == ["cork__3"]
+    text = markdown(found)
+    for part in ("| world | libero |", "at most 990 execution steps; two eval", "| stand-ins for missing scans | cork"):
+        assert part in text, part
+
+
 def test_an_outcome_leaves_out_the_clock() -> None:
     assert outcome(record()) == {k: v for k, v in record().items() if k not in ("wall_s", "replan_steps")}
 

@@ -88,7 +88,14 @@ def test_the_prompt_plays_where_the_policy_can_take_it(words: list[str], found: 
     plan = plan_line([*LINE[:-1], *words])
     assert "--env.prompt_in=" + found in plan.portable_flags
     assert plan.environment is not None
-    assert plan.environment.protocol["prompt_in"] == found
+    assert plan.environment.agreed_settings["prompt_in"] == found
+
+
+def test_the_authors_evaluation_is_planned_by_one_word() -> None:
+    plan = plan_line([*LINE, "protocol=upstream"])
+    agreed = plan.environment.agreed_settings
+    assert (agreed["protocol"], agreed["world"], agreed["horizon"]) == ("upstream", "memobench", 990)
+    assert agreed["demonstration_prompt"] is False
 
 
 @pytest.mark.parametrize("policy", [["policy=memobench_mem"], ["policy=memobench_remote", "policy.dialect=robomme"]])
@@ -124,7 +131,7 @@ def test_a_checkpoint_is_shown_what_it_was_trained_on(seen: tuple[str, ...], sho
     line = [*LINE[:-1], checkpoint(tmp_path / "act", *seen)]
     plan = plan_line(line)
     assert plan.environment is not None
-    assert plan.environment.protocol["obs_type"] == shown
+    assert plan.environment.agreed_settings["obs_type"] == shown
     other = OBJECTS if shown != OBJECTS else "pixels_agent_pos"
     with pytest.raises(MemobenchError, match=rf"env.obs_type is {other}, which lacks inputs of the policy"):
         plan_line([*line, f"obs_type={other}"])

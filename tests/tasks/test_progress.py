@@ -6,6 +6,7 @@ import itertools
 import random
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,26 @@ def test_then_takes_ten_steps_per_child_and_stays() -> None:
     both = [{A, B}] * (2 * HOLD_STEPS)
     assert run(Then((A, B)), *both, set(), set()) == [False] * 19 + [True, True, True]
     assert run(Then((A,)), *[{A}] * 10, set()) == [False] * 9 + [True, True]
+
+
+def test_then_takes_five_steps_where_they_are_evaluated_twice() -> None:
+    """And runs while the scene settles, where latches are set too; of that no step is counted."""
+    butter_then_plate = replace(get_task(ASSEMBLY), goal=Then((FIRST, SECOND)))
+    both = {FIRST, SECOND}.__contains__
+    progress = Progress(butter_then_plate, evaluations=2)
+    assert [progress.step(both) for _ in range(10)] == [False] * 9 + [True]
+    settled = Progress(butter_then_plate, evaluations=2)
+    for _ in range(7):
+        settled.settle(both)
+    assert (settled.steps, settled.first_step) == (0, [None, None])
+    assert [settled.step(both) for _ in range(3)] == [False, False, True]
+    assert (settled.steps, settled.first_step) == (3, [1, 1])
+
+
+def test_a_part_of_a_nested_then_begins_within_a_step_where_it_is_evaluated_twice() -> None:
+    """The inner one is true from evaluation 10 on, the outer counts from there: it is done with evaluation 19."""
+    progress = Progress(replace(get_task(ASSEMBLY), goal=Then((Then((FIRST,)),))), evaluations=2)
+    assert [progress.step({FIRST}.__contains__) for _ in range(10)] == [False] * 9 + [True]
 
 
 def test_then_hold_must_be_consecutive() -> None:

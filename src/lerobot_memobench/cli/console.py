@@ -1,4 +1,4 @@
-"""What the commands share: where they print, how far a run is, a failure in one sentence, the option ``--suite``."""
+"""What the commands share: where they print, how far a run is, a failure in one sentence, whose tasks and scenes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from lerobot_memobench.errors import MemobenchError, chain
 from lerobot_memobench.io import disk_refusal
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
-from lerobot_memobench.tasks.task import PUBLISHED, STRICT
+from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, PUBLISHED, STRICT
 
 USAGE_ERROR = 2
 
@@ -43,12 +43,23 @@ class Suite(StrEnum):
     STRICT = STRICT
 
 
+class World(StrEnum):
+    """Which scenes are meant."""
+
+    MEMOBENCH = MEMOBENCH
+    LIBERO = LIBERO
+
+
 WhichSuite = Annotated[
     Suite,
     typer.Option(
         help="published: the thirty tasks as published; strict: their memory-necessary variants, whose answer no "
         "picture shows."
     ),
+]
+WhichWorld = Annotated[
+    World,
+    typer.Option(help="memobench: the package's own scenes; libero: the paper's, of LIBERO's assets (extra libero)."),
 ]
 OfSuite = Annotated[
     Suite | None, typer.Option(help="Refuse a dataset that holds tasks of another suite; any when left out.")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting, say
+from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, WhichWorld, World, console, counting, say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
@@ -50,6 +50,7 @@ def generate(
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
     suite: WhichSuite = Suite.PUBLISHED,
+    world: WhichWorld = World.MEMOBENCH,
     episodes: Annotated[int, typer.Option(min=1, help="Demonstrations per task.")] = 50,
     prompted_episodes: Annotated[
         int | None, typer.Option(min=1, help="Demonstrations per task that begins with a prompt, if not --episodes.")
@@ -89,7 +90,7 @@ def generate(
     """Make a LeRobotDataset of expert demonstrations. The same command continues a killed run."""
     options = read_options(executor_option or [])
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
-    chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
+    chosen = [get_task(name).in_world(world.value) for name in resolve_tasks(tasks, suite)]
     from lerobot_memobench.datasets.generation import NEEDS, episodes_of
     from lerobot_memobench.datasets.generation import generate as run
 

@@ -28,7 +28,7 @@ from lerobot_memobench.protocol import (
     PROPRIO_DIM,
 )
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
-from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, Task
+from lerobot_memobench.tasks.task import LEVELS, MEMOBENCH, OPERATIONS, Task
 
 MAX_CHECKPOINTS = 6
 """Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
@@ -62,6 +62,7 @@ class Demonstration:
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
         model_xml: the scene as MJCF, or empty.
         scene_hash: hash of the initial scene, or empty.
+        stand_ins: classes of the scene whose scans were missing, so that others stood in for them.
         executed: (T, 7) float32, the actions really applied where the arm was moved off its way; None: ``actions``.
 
     Raises:
@@ -83,6 +84,7 @@ class Demonstration:
     fixture_poses: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     model_xml: str = ""
     scene_hash: str = ""
+    stand_ins: tuple[str, ...] = ()
     executed: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
@@ -315,6 +317,7 @@ def digest(demo: Demonstration) -> str:
         "variant": demo.variant,
         "exec_start": demo.exec_start,
         "success": bool(demo.success),
+        **({} if demo.task.world == MEMOBENCH else {"world": demo.task.world}),
     }
     columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
     if demo.executed is not None:

@@ -49,7 +49,7 @@ from lerobot_memobench.jobs.executors import Needs, check_executor, options_text
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
-from lerobot_memobench.tasks.task import Task, referent_text
+from lerobot_memobench.tasks.task import MEMOBENCH, Task, referent_text
 
 WEIGHTS = "model.safetensors"
 NEEDS = Needs(cores=1, memory_gb=4)
@@ -152,6 +152,13 @@ class _Plan:
         names = [task.name for task in self.tasks]
         if len(set(names)) < len(names):
             raise MemobenchError(f"a task was named twice among {', '.join(names)}; name each once")
+        if len({task.world for task in self.tasks}) > 1:
+            raise MemobenchError("tasks of two worlds were asked for; make a dataset of each world by itself")
+
+    @property
+    def world(self) -> str:
+        """Of all its scenes."""
+        return self.tasks[0].world
 
     @property
     def request(self) -> dict[str, Any]:
@@ -162,6 +169,7 @@ class _Plan:
             "episodes": self.episodes,
             "prompted_episodes": self.prompted_episodes,
             "seed_base": self.seed_base,
+            **({} if self.world == MEMOBENCH else {"world": self.world}),
             "hold_frames": HOLD_FRAMES,
             **asdict(self.settings),
             "policy": self.settings.policy and policy_text(self.settings.policy),
@@ -175,6 +183,7 @@ class _Plan:
         prompts = "" if self.settings.demonstration_prompt else ", demonstration prompts left out"
         more = "" if self.prompted_episodes is None else f" ({self.prompted_episodes} of those with a prompt)"
         seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
+        seeds += "" if self.world == MEMOBENCH else f", world {self.world}"
         moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""
         if self.settings.policy is not None:
             moved = f", the arm moved by the policy {policy_text(self.settings.policy)} for some steps at a time"

@@ -143,6 +143,7 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
         success=reached and episode.prompt_shown is not False,
         fixture_poses=fixture_poses,
         scene_hash=episode.scene_hash,
+        stand_ins=episode.stand_ins,
     )
 
 

@@ -72,7 +72,8 @@ def replay(
         task, start, wanted, executed = recorded.task, 0, recorded.actions, recorded.applied
         columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
     else:
-        task, start = (task or get_task(recorded.task_name)).variant(recorded.variant), recorded.start
+        published = (task or get_task(recorded.task_name)).in_world(recorded.world)
+        task, start = published.variant(recorded.variant), recorded.start
         columns, whole = recorded.columns, recorded.whole
         if "action" not in columns:
             raise MemobenchError(

@@ -51,6 +51,7 @@ from lerobot_memobench.io import (
 )
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.tasks.task import MEMOBENCH
 
 STAGING = ".staging"
 """Folder of a run within its destination."""
@@ -86,6 +87,8 @@ class Info(TypedDict):
     exec_start_index: Count
     key_frames: list[Whole]
     scene_hash: str
+    world: NotRequired[str]
+    stand_ins: NotRequired[list[str]]
     fixture_poses: dict[str, list[Number]]
     digest: str
 
@@ -328,6 +331,7 @@ def episode_info(demo: Demonstration) -> dict[str, Any]:
         "exec_start_index": int(demo.exec_start),
         "key_frames": found.key_frames.tolist(),
         "scene_hash": demo.scene_hash,
+        **({} if demo.task.world == MEMOBENCH else {"world": demo.task.world, "stand_ins": list(demo.stand_ins)}),
         "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
         "digest": digest(demo),
     }
@@ -441,9 +445,12 @@ def remove_staging(out: Path) -> None:
 
 def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
     """Raise with the first thing that was asked for differently."""
-    before = {"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None, FINISHED_EARLY: False}
+    before = {
+        **{"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None, FINISHED_EARLY: False},
+        "world": MEMOBENCH,
+    }
     earlier = {**before, **earlier}  # written before there was a choice
-    for key, value in request.items():
+    for key, value in {"world": MEMOBENCH, **request}.items():
         if earlier.get(key) != value:
             there = short(earlier.get(key))
             raise MemobenchError(f"{what} with {key}={there}, now {short(value)} was asked for; {advice}")

@@ -17,11 +17,13 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.doctor.probe import TOLERANCE, run_probe
+from lerobot_memobench.envs.world_assets import check_assets
 from lerobot_memobench.errors import MemobenchError, unsupported_system
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.rendering import BACKENDS, gl_backend
 from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
+from lerobot_memobench.tasks.task import LIBERO
 
 DISTRIBUTION = "lerobot_policy_memobench"
 PLUGIN = "LeRobot plugin"
@@ -67,6 +69,7 @@ def examine() -> list[Finding]:
         plugin(),
         *rendering(),
         golden_frame(),
+        paper_world(),
         ffmpeg(),
         torchcodec(),
         device(),
@@ -252,6 +255,17 @@ def golden_frame() -> Finding:
         fix = "the pictures here are not the benchmark's; try the other MUJOCO_GL backend or a newer driver"
         return Finding("golden frame", "failed", detail, fix)
     return Finding("golden frame", "ok", detail)
+
+
+def paper_world() -> Finding:
+    """Look for what scenes of ``world=libero`` are built of; the package's own world needs none of it."""
+    what = f"world {LIBERO}"
+    try:
+        folder = check_assets(LIBERO)
+    except MemobenchError as error:
+        detail, _, fix = str(error).partition("; ")
+        return Finding(what, "ok", f"not here, and only world={LIBERO} needs it: {detail}", fix)
+    return Finding(what, "ok", f"LIBERO's assets in {folder}")
 
 
 def ffmpeg() -> Finding:

@@ -40,12 +40,13 @@ from lerobot_memobench.envs.observations import (
     prompt_in,
 )
 from lerobot_memobench.envs.pacing import check_pacing, longest
+from lerobot_memobench.envs.upstream import upstream_settings
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
 from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
-from lerobot_memobench.protocol import CONTROL_HZ, EVALUATION_SEED, HORIZON
+from lerobot_memobench.protocol import BY_PAPER, CONTROL_HZ, EVALUATION_SEED, HORIZON, PROTOCOLS, UPSTREAM
 from lerobot_memobench.tasks.evidence import check_referent
-from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
+from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS, STRICT, SUITES, check_world
 
 PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[str, str]], None]
 """Called with a checkpoint's path and configuration, what is shown by its names at the policy, and LeRobot's
@@ -66,6 +67,10 @@ class MemobenchEnvConfig(EnvConfig):
 
     Args:
         suite: `published`, or `strict`: memory-necessary variants of the 30 tasks, not solvable without a memory.
+        world: `memobench`, the package's own scenes, or `libero`, the paper's: LIBERO's assets, placement, contacts and
+            predicates. Figures of two worlds do not compare.
+        protocol: `paper`, or `upstream`, the authors' evaluation: no demonstration prompt, fixed referents, an end when
+            all checkpoints have held, at most 990 steps (`envs.upstream`).
         tasks: `all`, memory types or task names, separated by commas.
         task: the same, for those used to LeRobot's field.
         task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them), all
@@ -103,6 +108,8 @@ class MemobenchEnvConfig(EnvConfig):
     """
 
     suite: str = PUBLISHED
+    world: str = MEMOBENCH
+    protocol: str = BY_PAPER
     task: str | None = None
     tasks: str = "all"
     task_dir: str | None = None
@@ -134,11 +141,13 @@ class MemobenchEnvConfig(EnvConfig):
         for name, value, known in (
             ("obs_type", self.obs_type, OBS_TYPES),
             ("suite", self.suite, SUITES),
+            ("protocol", self.protocol, PROTOCOLS),
             ("referent", self.referent, (*REFERENTS, DRAWN) if self.suite == STRICT else REFERENTS),
             ("prompt_in", self.prompt_in, PROMPT_IN),
             ("render", self.render, ("fast", "default", "high")),
         ):
             check_choice(f"env.{name}", value, known)
+        check_world("env.", self.world, self.suite)
         check_counts("env.", horizon=self.horizon, render_every=self.render_every)
         check_pacing("env.", self.pause_steps, self.speed)
         if self.replan_steps is not None:
@@ -156,6 +165,9 @@ class MemobenchEnvConfig(EnvConfig):
             )
         if self.suite == STRICT:
             self.referent = DRAWN  # each of its tasks draws its own
+        if self.protocol == UPSTREAM:
+            for name, value in upstream_settings("env.", vars(self)).items():
+                setattr(self, name, value)
         if self.evidence:
             check_referent("env.", self.referent)
         if self.obs_type != PIXELS:
@@ -177,7 +189,7 @@ class MemobenchEnvConfig(EnvConfig):
         return {name: getattr(self, name) for name in names if name not in ("suite", "prompt_in")}
 
     @property
-    def protocol(self) -> dict[str, Any]:
+    def agreed_settings(self) -> dict[str, Any]:
         """What must agree for two evaluations to be one, or to be compared; without what is still `auto`."""
         chosen = {name: getattr(self, name) for name in SETTINGS if getattr(self, name) != AUTO}
         return {**chosen, **revision(self.suite)}
@@ -233,7 +245,7 @@ class MemobenchEnvConfig(EnvConfig):
         replan_steps = self._replan_steps(policy)
         told = {"prompt_in": prompt, "replan_steps": replan_steps}
         settings = {**self.gym_kwargs, **told, "acting": by}
-        protocol = {**self.protocol, **told, **by.protocol}
+        protocol = {**self.agreed_settings, **told, **by.protocol}
         check_protocol(log_dir, protocol)  # now, not when the first episode has been simulated
         most = longest(self.horizon, self.pause_steps, self.speed, replan_steps)
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}

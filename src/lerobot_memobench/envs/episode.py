@@ -15,12 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.pacing import NOTHING, Pacing, steps_per_action
 from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
+from lerobot_memobench.envs.upstream import SettlingSimulation
 from lerobot_memobench.errors import check_choice
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import (
     ACTION_DIM,
+    BY_PAPER,
     CAMERAS,
     ENDED,
     EXECUTION,
@@ -30,6 +32,9 @@ from lerobot_memobench.protocol import (
     PROMPT,
     PROMPT_HORIZON,
     SPLITS,
+    UPSTREAM,
+    UPSTREAM_EVALUATIONS,
+    UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.gl.rasterizer import Image
 from lerobot_memobench.sim.object_slots import ObjectSlots
@@ -60,6 +65,8 @@ class Episode:
             one of the variants always, which is told as `drawn`.
         demonstration_prompt: whether tasks that have a prompt begin with it; what it hides is hidden unseen without.
         horizon: execution steps before truncation, of actions at full speed.
+        protocol: `paper`, or `upstream`, whose clock runs in the stabilisation steps too, and whose episodes end when
+            all checkpoints have held. What goes with it is set by whoever asks for it (`envs.upstream`).
         render: size and quality of frames.
         pause_steps, speed, replan_steps: see `pacing.Pacing`.
 
@@ -81,6 +88,7 @@ class Episode:
         referent: str = "fixed",
         demonstration_prompt: bool = True,
         horizon: int = HORIZON,
+        protocol: str = BY_PAPER,
         render: RenderSettings | None = None,
         pause_steps: int = 0,
         speed: float = 1.0,
@@ -88,11 +96,11 @@ class Episode:
     ) -> None:
         check_choice("referent", referent, (*REFERENTS, DRAWN) if task.drawn else REFERENTS)
         self.published = task
-        self.referent, self.horizon = referent_text(referent, task.drawn), horizon
+        self.referent, self.horizon, self.protocol = referent_text(referent, task.drawn), horizon, protocol
         self._limit = horizon * steps_per_action(speed)
         self._paced = pause_steps, speed, replan_steps
         self.demonstration_prompt = demonstration_prompt and task.prompt is not None
-        self.sim = Simulation(task, render)
+        self.sim = SettlingSimulation(task, render) if protocol == UPSTREAM else Simulation(task, render)
         self._slots: ObjectSlots | None = None
         self.task = task
         self.seed = -1
@@ -116,10 +124,12 @@ class Episode:
             task = self.published.variant(variant)
         self.task = task
         self.choice = None if variant is None else Choice(task)
+        self.progress = Progress(task, UPSTREAM_EVALUATIONS if self.protocol == UPSTREAM else 1)
+        if isinstance(self.sim, SettlingSimulation):
+            self.sim.follow(self.progress.settle)
         self.sim.reset(self.seed)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
-        self.progress = Progress(task)
         self.step_index = 0
         self.exec_start: int | None = None
         self.pacing = Pacing(*self._paced, self._rng(4))
@@ -171,7 +181,6 @@ class Episode:
             return
         self.sim.begin_execution()
         self.exec_start = self.step_index
-        self.progress.reset()
         # What holds already, such as a thing on the plate that it is to leave, is nobody's mistake.
         self._wrong = [atom for atom in _wrong_atoms(self.task) if not self.sim.holds(atom)]
 
@@ -225,12 +234,25 @@ class Episode:
     @property
     def cut_off(self) -> bool:
         """The horizon ended it, and is shorter than the protocol's: what was missing might have come."""
-        return self.horizon < HORIZON and self.exec_steps >= self._limit and not (self.success or self.lost)
+        whole = UPSTREAM_HORIZON if self.protocol == UPSTREAM else HORIZON
+        return self.horizon < whole and self.exec_steps >= self._limit and not (self.success or self.lost)
+
+    @property
+    def closed(self) -> bool:
+        """All checkpoints have held, in whatever order: in the authors' evaluation that is the end."""
+        first = self.progress.first_step
+        return self.protocol == UPSTREAM and bool(first) and None not in first
 
     @property
     def done(self) -> bool:
-        """Ended by success, horizon, loss or fault; satisfied checkpoints alone end nothing."""
-        return self.success or self.exec_steps >= self._limit or self.lost or self.fault is not None
+        """Ended by success, horizon, loss, fault or, in the authors' evaluation alone, satisfied checkpoints."""
+        ended = self.success or self.lost or self.closed
+        return ended or self.exec_steps >= self._limit or self.fault is not None
+
+    @property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Classes whose scans are not on this machine, so that others stand in for them in this scene."""
+        return tuple(getattr(self.sim, "stand_ins", ()))
 
     def step(self, action: ArrayLike) -> None:
         """Advance by one control step; during the prompt the given action has no effect, after a fault nothing has."""

@@ -35,10 +35,10 @@ from lerobot_memobench.io import (
     read_json,
     write_file,
 )
-from lerobot_memobench.protocol import IDLE_STEPS
+from lerobot_memobench.protocol import BY_PAPER, IDLE_STEPS
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
+from lerobot_memobench.tasks.task import MEMOBENCH, PUBLISHED, STRICT, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
@@ -86,6 +86,9 @@ class Outcome(TypedDict, total=False):
         chance: then, of the task: the rate of right choices without the past; None where the instruction tells.
         failure: class of the failure; None for a success.
         suite: of tasks that are not published: strict.
+        world: of scenes that are not the package's own: libero.
+        stand_ins: of that world: classes whose scans were missing, so that others stood in for them.
+        protocol: of the authors' evaluation: upstream.
         lost: of strict tasks: the goal could no longer be reached.
         fault: why the episode was broken off: an invalid action, unstable physics.
         scene_hash: hash of the initial scene.
@@ -104,6 +107,9 @@ class Outcome(TypedDict, total=False):
     chance: Number | None
     failure: Name | None
     suite: Name
+    world: Name
+    stand_ins: list[Name]
+    protocol: Name
     lost: bool
     fault: str
     scene_hash: Name | None
@@ -176,6 +182,8 @@ def episode_record(episode: Episode, number: int, replan_steps: int | None, wall
         "failure": failure if fault is None else fault.failure,
         **({} if fault is None else {"fault": fault.why}),
         **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
+        **({} if task.world == MEMOBENCH else {"world": task.world, "stand_ins": list(episode.stand_ins)}),
+        **({} if episode.protocol == BY_PAPER else {"protocol": episode.protocol}),
         "scene_hash": episode.scene_hash,
         "wall_s": round(wall_s, 3),
     }
@@ -205,6 +213,7 @@ def not_run_record(
         **({} if variants is None else {"variants": variants}),
         "checkpoints": [],
         **({} if task.suite == PUBLISHED else {"suite": task.suite}),
+        **({} if task.world == MEMOBENCH else {"world": task.world}),
         "not_run": why,
     }
 
@@ -422,6 +431,8 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 
 SETTINGS = (
     "suite",
+    "world",
+    "protocol",
     "seed_base",
     "obs_type",
     "referent",
@@ -442,7 +453,10 @@ IDLE = "idle"
 because the first strict evaluations were without."""
 GOALS, STRICT_GOALS = "goals", 2
 """Revision of the goals of strict tasks: 1 could be reached without a memory, by notes in the scene and a clock."""
-UNTOLD: dict[str, Any] = {"suite": PUBLISHED, "pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1}
+UNTOLD: dict[str, Any] = {
+    **{"suite": PUBLISHED, "world": MEMOBENCH, "protocol": BY_PAPER},
+    **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1},
+}
 """What a protocol means that leaves these out: there was nothing else when it was written."""
 INPUTS = "inputs"
 """Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote them down."""
@@ -462,6 +476,8 @@ class Settings(TypedDict, total=False):
 
     Attributes:
         suite: published or strict.
+        world: memobench, the package's own, or libero, the paper's.
+        protocol: paper, or upstream, the authors' evaluation.
         seed_base: seed of episode 0.
         obs_type: what the environment observes.
         referent: fixed, random or drawn.
@@ -478,6 +494,8 @@ class Settings(TypedDict, total=False):
     """
 
     suite: Name
+    world: Name
+    protocol: Name
     seed_base: Whole | list[Whole]
     obs_type: Name | None
     referent: Name | list[Name]

@@ -40,11 +40,13 @@ from lerobot_memobench.envs.observations import (
     observation_space,
 )
 from lerobot_memobench.envs.pacing import check_pacing, longest
+from lerobot_memobench.envs.upstream import upstream_settings
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
 from lerobot_memobench.protocol import (
     ACTION_DIM,
+    BY_PAPER,
     EVALUATION_SEED,
     EXECUTION,
     HORIZON,
@@ -52,13 +54,15 @@ from lerobot_memobench.protocol import (
     IMAGE_SIZE,
     PROMPT,
     PROMPT_HORIZON,
+    PROTOCOLS,
     UNSEEDED,
+    UPSTREAM,
 )
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
 from lerobot_memobench.tasks.evidence import check_referent, scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-from lerobot_memobench.tasks.task import referent_text
+from lerobot_memobench.tasks.task import MEMOBENCH, World, referent_text
 
 logger = logging.getLogger(__name__)
 
@@ -98,6 +102,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self,
         task: str,
         *,
+        world: World = MEMOBENCH,
+        protocol: str = BY_PAPER,
         log_dir: str | None = None,
         obs_type: str = PIXELS,
         referent: str = "fixed",
@@ -119,13 +125,14 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         acting: Acting = NOBODY,
         render_mode: str = "rgb_array",
     ) -> None:
+        check_choice("protocol", protocol, PROTOCOLS)
         check_choice("obs_type", obs_type, OBS_TYPES)
         check_choice("reward", reward, REWARDS)
         check_choice("prompt_in", prompt_in, (STEPS, RESET))
         check_counts(horizon=horizon, render_every=render_every)
         check_pacing("", pause_steps, speed)
         self.render_mode = render_mode
-        self._task = load_task(task) if suite_of(task) is None else get_task(task)
+        self._task = (load_task(task) if suite_of(task) is None else get_task(task)).in_world(world)
         self.task = self._task.name
         if log_dir is not None:  # now, not when the first episode has been simulated
             file_name(self.task, "the name of a task")
@@ -133,11 +140,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._oracle_memory = oracle_memory
         self._describe(0)
         self._reward = reward
-        self._longest = longest(horizon, pause_steps, speed, replan_steps)
-        self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action, self._longest)
-        self.action_space = action_space()
-        protocol = {
+        agreed = {
             "suite": self._task.suite,
+            "world": world,
+            "protocol": protocol,
             "seed_base": seed_base,
             "obs_type": obs_type,
             "referent": referent_text(referent, self._task.drawn),
@@ -154,19 +160,25 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "evidence": evidence,
             **acting.protocol,
         }
+        if protocol == UPSTREAM:
+            agreed |= upstream_settings("", agreed)
+        self._longest = longest(agreed["horizon"], pause_steps, speed, replan_steps)
+        self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action, self._longest)
+        self.action_space = action_space()
         self._acting = acting
-        self._log = EpisodeLog(log_dir, protocol) if log_dir is not None else None
+        self._log = EpisodeLog(log_dir, agreed) if log_dir is not None else None
         self._log_dir = Path(log_dir) if log_dir is not None else None
         self._recorded = videos or 0
         self._video: VideoRecorder | None = None
         self._observer = Observer(obs_type, render_every)
-        self._referent = str(protocol["referent"])
+        self._referent = str(agreed["referent"])
         if evidence:
             check_referent("", self._referent)
         self._settings: dict[str, Any] = {
             "referent": referent,
-            "demonstration_prompt": demonstration_prompt,
-            "horizon": horizon,
+            "demonstration_prompt": agreed["demonstration_prompt"],
+            "horizon": agreed["horizon"],
+            "protocol": protocol,
             "render": RenderSettings(IMAGE_SIZE, IMAGE_SIZE, render),
             "pause_steps": pause_steps,
             "speed": speed,
@@ -245,7 +257,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance by one control step of 50 ms; of ``reward`` see the class.
 
-        An episode terminates by success and, of a strict task, by the loss of its goal; the horizon truncates it.
+        An episode terminates by success, in the authors' evaluation when all checkpoints have held and, of a strict
+        task, by the loss of its goal; the horizon truncates it.
 
         Raises:
             gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: it has not begun, or is closed.
@@ -271,7 +284,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._observe()
         if episode.done:
             self._end()
-        ended = episode.success or episode.lost
+        ended = episode.success or episode.lost or episode.closed
         reward = self._rewarded(episode.progress.index - completed)
         return self._observation(), reward, ended, episode.done and not ended, self._info()
 

@@ -9,7 +9,7 @@ from lerobot_memobench.envs.episode_log import key_of
 
 OUTCOME = (
     *("success", "steps", "prompt_steps", "variant", "choice", "checkpoints", "failure", "fault", "not_run"),
-    "scene_hash",
+    *("stand_ins", "scene_hash"),
 )
 """What two runs of the same episode must agree in."""
 

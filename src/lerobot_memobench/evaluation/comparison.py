@@ -15,7 +15,7 @@ from lerobot_memobench.envs.episode_log import OF_THE_POLICY, SETTINGS, differen
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Record, by_task, operations, policy_inputs, value_of
-from lerobot_memobench.evaluation.records import Run, other_physics
+from lerobot_memobench.evaluation.records import APART, Run, other_physics
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
 from lerobot_memobench.evaluation.statistics import PERMUTATIONS, detectable, holm, mcnemar, sign_flip
 from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Report, Section, Table, csv_text, figure
@@ -23,7 +23,7 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 SCENES = "scene_hash"
-ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
+ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
 """What may differ between both when asked for by name."""
 
 Pair = tuple[Record, Record]

@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY, UNTOLD
 from lerobot_memobench.evaluation.metrics import Record, policy_inputs
-from lerobot_memobench.evaluation.records import Run, one_suite
+from lerobot_memobench.evaluation.records import Run, of_all, stand_ins_of
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
 
@@ -43,10 +43,12 @@ def whose(run: Run) -> str:
 
 
 def protocol_phrases(run: Run) -> list[str]:
-    """Return suite, referent, seeds, episodes per task, replan interval and controls of an evaluation's rollouts."""
+    """Return suite, world, referent, seeds, episodes per task, replan interval and controls of an evaluation."""
     records = run.records
     return [
-        f"{one_suite(records)} suite",
+        f"{of_all(records, 'suite')} suite",
+        *(f"{key} {value}" for key in ("world", "protocol") if (value := of_all(records, key)) != UNTOLD[key]),
+        *([count_of(len(missing), "stand-in")] if (missing := stand_ins_of(records)) else []),
         f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
         *_seeds(run),
         _extent(records),

@@ -36,7 +36,6 @@ from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.evidence_controls import FoundEvidence, evidence_of, ran_evidence
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, is_there, read_json
-from lerobot_memobench.tasks.task import PUBLISHED
 
 # --- types of the result card; what its parts mean, `run.card` says ---
 
@@ -112,6 +111,7 @@ class SealedStart(TypedDict):
     Attributes:
         started: when.
         suite: published or strict.
+        world: of scenes that are not the package's own: libero.
         referent: fixed, random or drawn.
         replan_steps: actions executed per prediction; None for the policy's own number.
         tasks: how many.
@@ -120,6 +120,7 @@ class SealedStart(TypedDict):
 
     started: str
     suite: Name
+    world: NotRequired[Name]
     referent: Name
     replan_steps: Count | None
     tasks: Count
@@ -222,7 +223,8 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     """Return the protocol of the evaluation in ``folder``.
 
     Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
-    as found in the log where nobody wrote down what was asked for; ``suite``; ``seed_base``, ``referent``,
+    as found in the log where nobody wrote down what was asked for; ``suite``, ``world``, ``protocol`` as far as they
+    are not the default; ``seed_base``, ``referent``,
     ``demonstration_prompt``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as
     far as known; ``inputs``, of the policy; ``policy``, what is known of the policy ({} where nobody wrote it down).
 
@@ -247,7 +249,7 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     seeded = all(record.get("seed") is not None for record in records)
     values: dict[str, set[Any]] = {
         "seed_base": {seed_base(record) for record in records if seeded},
-        "suite": {one_suite(records)} - {PUBLISHED},
+        **{key: {of_all(records, key)} - {UNTOLD[key]} for key in ("suite", "world", "protocol")},
         **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
     }
     for key, distinct in values.items():
@@ -256,19 +258,28 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def one_suite(records: Iterable[Mapping[str, Any]]) -> str:
-    """Return the suite of an evaluation's rollouts.
+APART = ("suite", "world")
+"""Settings of which figures of two values stand in no report together: other tasks, other scenes."""
+
+
+def of_all(records: Iterable[Mapping[str, Any]], key: str) -> str:
+    """Return the suite, the world or the protocol (``key``) of an evaluation's rollouts.
 
     Raises:
         MemobenchError: they are of several.
     """
-    there = {record.get("suite", PUBLISHED) for record in records} or {PUBLISHED}
+    there = {record.get(key, UNTOLD[key]) for record in records} or {UNTOLD[key]}
     if len(there) > 1:
         raise MemobenchError(
-            f"the rollouts are of the suites {' and '.join(sorted(there))}; report each suite by itself"
+            f"the rollouts are of the {key}s {' and '.join(sorted(there))}; report each {key} by itself"
         )
-    (suite,) = there
-    return str(suite)
+    (found,) = there
+    return str(found)
+
+
+def stand_ins_of(records: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Return the classes for which others stood in, in any of the rollouts, because their scans were missing."""
+    return sorted({name for record in records for name in record.get("stand_ins", ())})
 
 
 def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
@@ -349,7 +360,7 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
 
     Raises:
         MemobenchError: a folder holds no rollouts or is given twice, one method has two results at one interval, or
-            the suites differ.
+            the suites or worlds differ.
     """
     given = [_split(word) for word in words]
     if not given:
@@ -359,13 +370,14 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     for (label, folder), name in zip(given, names, strict=True):
         records, notes = read_rollouts(folder)
         runs.append(Run(name, label or "", folder, records, read_protocol(folder), notes))
-    suites = [one_suite(run.records) for run in runs]
-    for run, suite in zip(runs, suites, strict=True):
-        if suite != suites[0]:
-            raise MemobenchError(
-                f"{runs[0].folder} is an evaluation of the {suites[0]} suite and {run.folder} one of the {suite} "
-                "suite; report each suite by itself"
-            )
+    for key in APART:
+        values = [of_all(run.records, key) for run in runs]
+        for run, value in zip(runs, values, strict=True):
+            if value != values[0]:
+                raise MemobenchError(
+                    f"{runs[0].folder} is an evaluation of {key}={values[0]} and {run.folder} one of {key}={value}, "
+                    f"whose figures do not compare; report each {key} by itself"
+                )
     return _with_methods(runs)
 
 
@@ -409,6 +421,10 @@ def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
     if not records:
         told = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{told}; run an evaluation first")
+    if missing := stand_ins_of(records):
+        notes.append(
+            f"scans were missing, so boxes stood in for {', '.join(missing)}: figures with them do not compare"
+        )
     return records, notes + notes_on(records)
 
 

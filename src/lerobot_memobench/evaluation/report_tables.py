@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from lerobot_memobench.envs.episode_log import UNTOLD
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
@@ -20,7 +21,8 @@ from lerobot_memobench.evaluation.tables import (
 )
 from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
-from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
+from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
+from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES, PUBLISHED
 
 
 def inputs_phrase(words: str) -> str:
@@ -283,7 +285,10 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
 
 # --- beside the paper's tables ---
 
-PAPER_PROTOCOL = {"referent": "fixed", "demonstration_prompt": True, "horizon": 1200, "seed_base": 7}
+PAPER_PROTOCOL = {
+    **{"world": LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True, "horizon": HORIZON},
+    "seed_base": EVALUATION_SEED,
+}
 PAPER_INPUTS = "pixels"
 PAPER_TASKS, PAPER_EPISODES = 30, 50
 
@@ -374,7 +379,8 @@ def departures(run: Run) -> list[str]:
     if counts != {PAPER_EPISODES}:
         low, high = min(counts), max(counts)
         found.append(f"{low if low == high else f'{low} to {high}'} episodes of each instead of {PAPER_EPISODES}")
+    told = {**UNTOLD, **run.protocol}
     for key, value in PAPER_PROTOCOL.items():
-        if key in run.protocol and run.protocol[key] != value:
-            found.append(f"{key.replace('_', ' ')} {run.protocol[key]} instead of {value}")
+        if key in told and told[key] != value:
+            found.append(f"{key.replace('_', ' ')} {told[key]} instead of {value}")
     return found

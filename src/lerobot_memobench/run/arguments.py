@@ -42,7 +42,7 @@ DATASET = "dataset"
 
 COMMON: dict[str, tuple[str, ...]] = {
     **{key: (f"policy.{key}",) for key in ("align", "size", "perception", "detector", "visual_encoder", "device")},
-    **{key: (f"env.{key}",) for key in ("tasks", "obs_type", "suite", "referent")},
+    **{key: (f"env.{key}",) for key in ("tasks", "obs_type", "suite", "world", "referent")},
     "replan": ("policy.n_action_steps", "env.replan_steps"),
 }
 SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
@@ -51,7 +51,10 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         **{key: (f"policy.{key}",) for key in ("host", "port", "dialect")},
         **{
             key: (f"env.{key}",)
-            for key in ("demonstration_prompt", "prompt_in", "horizon", "pause_steps", "speed", "evidence", "videos")
+            for key in (
+                *("protocol", "demonstration_prompt", "prompt_in", "horizon"),
+                *("pause_steps", "speed", "evidence", "videos"),
+            )
         },
         "episodes": ("eval.n_episodes",),
         "batch_size": ("eval.batch_size",),

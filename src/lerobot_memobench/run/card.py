@@ -26,12 +26,14 @@ from typing import Any, NotRequired, TypedDict
 from lerobot_memobench.envs.acting import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.envs.episode_log import EXTENT, INPUTS, SETTINGS, key_of
 from lerobot_memobench.envs.observations import policy_inputs
+from lerobot_memobench.envs.upstream import DIFFERENCES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
-from lerobot_memobench.evaluation.records import CARD_FILE
+from lerobot_memobench.evaluation.records import CARD_FILE, stand_ins_of
 from lerobot_memobench.evaluation.tables import markdown_text
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
+from lerobot_memobench.protocol import UPSTREAM
 from lerobot_memobench.run.arguments import without_flags
 from lerobot_memobench.run.machine import gl_facts, run_facts
 from lerobot_memobench.run.plan import EvaluationPlan
@@ -74,7 +76,7 @@ def _flags_of(plan: EvaluationPlan) -> list[str]:
 def _protocol_of(plan: EvaluationPlan) -> dict[str, Any]:
     names = sorted(task.name for task in plan.grid.tasks)
     environment = plan.environment
-    found = {"tasks": names, "episodes": plan.grid.runs, **environment.protocol}
+    found = {"tasks": names, "episodes": plan.grid.runs, **environment.agreed_settings}
     if plan.policy is not None:
         found[INPUTS] = policy_inputs(plan.policy, environment.obs_type, environment.oracle_memory)
     return found
@@ -311,9 +313,19 @@ def _protocol_lines(card: Mapping[str, Any]) -> list[str]:
         _row("tasks", f"{len(tasks)}: {', '.join(tasks)}"),
         _row("episodes of each", protocol.get("episodes")),
         *(_row(name.replace("_", " "), value) for name, value in {**settings, **others}.items()),
+        *_differences(card),
         *_sealed_lines(card.get("sealed")),
         _row("episodes in the log", len(card["episodes"])),
     ]
+
+
+def _differences(card: Mapping[str, Any]) -> list[str]:
+    """Return rows on what makes figures others than the paper's protocol and scenes would give."""
+    found = {
+        "differs from the paper's": DIFFERENCES if card["protocol"].get("protocol") == UPSTREAM else (),
+        "stand-ins for missing scans": stand_ins_of(card["episodes"]),
+    }
+    return [_row(name, "; ".join(told)) for name, told in found.items() if told]
 
 
 def _sealed_lines(sealed: Mapping[str, Any] | None) -> list[str]:

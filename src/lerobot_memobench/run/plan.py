@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from lerobot.envs.configs import EnvConfig
 
     from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from lerobot_memobench.tasks.task import World
 
 ENVIRONMENT = "memobench"
 EXPERT = "memobench_expert"
@@ -219,7 +220,7 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     check_split(plan)
     check_scenes(plan)
     if options.executor not in ELSEWHERE:  # there, each part finds out
-        _check_simulator(plan.draws)
+        _check_simulator(plan)
     return plan
 
 
@@ -261,13 +262,15 @@ def check_scenes(plan: EvaluationPlan) -> None:
         )
 
 
-def _check_simulator(draws: bool) -> None:
-    """Refuse a machine on which every episode would fail: no arm, or nothing to draw with."""
+def _check_simulator(plan: EvaluationPlan) -> None:
+    """Refuse a machine on which every episode would fail: no arm, no assets, or nothing to draw with."""
+    from lerobot_memobench.envs.world_assets import check_assets
     from lerobot_memobench.sim.rendering import gl_backend
     from lerobot_memobench.sim.robot import robosuite_version
 
     robosuite_version()
-    if draws:
+    check_assets(cast("World", plan.environment.world))
+    if plan.draws:
         gl_backend()
 
 

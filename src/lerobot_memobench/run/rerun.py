@@ -54,7 +54,8 @@ REACHING_OUT = (
 )
 """Settings by which more than numbers changes. All other numbers and truth values are taken."""
 WORDS = (
-    *("job_name", "env.task", "env.tasks", "env.suite", "env.obs_type", "env.referent", "env.prompt_in", "env.render"),
+    *("job_name", "env.task", "env.tasks", "env.suite", "env.world", "env.protocol"),
+    *("env.obs_type", "env.referent", "env.prompt_in", "env.render"),
     *("policy.size", "policy.perception", "policy.align", "policy.subgoal_level", "policy.memory_fusion"),
     *("policy.memory_camera", "policy.detector"),
     *("policy.dtype", "policy.dialect", "policy.gripper"),

@@ -34,6 +34,7 @@ from lerobot_memobench.policies.checkpoint import (
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.machine import PACKAGES, versions
 from lerobot_memobench.run.plan import EvaluationPlan
+from lerobot_memobench.tasks.task import MEMOBENCH
 
 RUN_FILE = SEALED_RUN
 """Marks the folder of a counted evaluation; what counts is in the ledger."""
@@ -43,7 +44,7 @@ LOADED = (
 )
 """Files of a checkpoint that LeRobot opens by their name; they name the others."""
 REPEATED = ("suite", "referent", "replan_steps")
-"""Settings of the protocol that a ledger's line repeats."""
+"""Settings of the protocol that a ledger's line repeats; the world too, where it is not the package's own."""
 
 
 class LedgerLine(SealedStart):
@@ -92,6 +93,7 @@ def _start(plan: EvaluationPlan, card: Mapping[str, Any], folder: str) -> dict[s
     start = {
         "started": dt.datetime.now(dt.UTC).isoformat(timespec="microseconds"),
         **{name: card["protocol"].get(name) for name in REPEATED},
+        **_world(card["protocol"]),
         "tasks": len(card["protocol"]["tasks"]),
         "episodes": card["protocol"]["episodes"],
     }
@@ -107,7 +109,9 @@ def _start(plan: EvaluationPlan, card: Mapping[str, Any], folder: str) -> dict[s
         starts = {key: found for key, found in starts.items() if key < (joined, folder)}
     for place in places:
         _append(place, line)
-    earlier = [{key: starts[which][key] for key in start} for which in sorted(starts)]
+    earlier = [
+        {key: found[key] for key in SealedStart.__annotations__ if key in found} for _, found in sorted(starts.items())
+    ]
     kept = {key: line[key] for key in ("started", "policy", "scenes", "release")}
     return {**kept, "run": len(earlier) + 1, "earlier": earlier}
 
@@ -132,12 +136,17 @@ def _joined(line: Mapping[str, Any], lines: Iterable[Mapping[str, Any]]) -> str 
     return last if new else None
 
 
+def _world(protocol: Mapping[str, Any]) -> dict[str, str]:
+    """Return the world of the scenes, nothing where it is the package's own: lines of before hold none."""
+    return {} if protocol.get("world", MEMOBENCH) == MEMOBENCH else {"world": protocol["world"]}
+
+
 def scenes_hash(card: Mapping[str, Any]) -> str:
     """Return one hash for the scenes of an evaluation, of what its card says: task files, referent, seed, episodes."""
     protocol = card["protocol"]
     told = [
         *(card["task_files"], card["policy"].get("seed"), protocol["episodes"]),
-        *(protocol.get("referent"), protocol.get("evidence", False)),
+        *(protocol.get("referent"), protocol.get("evidence", False), *_world(protocol).values()),
     ]
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
@@ -198,8 +207,9 @@ def in_words(told: Mapping[str, Any]) -> str:
     if not told["earlier"]:
         return first
     last = told["earlier"][-1]
+    world = f"world {last['world']}, " if "world" in last else ""
     every = "" if last["replan_steps"] is None else f", replan interval {last['replan_steps']}"
     return (
-        f"{first}; the last before it on {last['started'][:10]}: {last['suite']} suite, referent {last['referent']}, "
-        f"{count_of(last['tasks'], 'task')}{every}"
+        f"{first}; the last before it on {last['started'][:10]}: {last['suite']} suite, {world}"
+        f"referent {last['referent']}, {count_of(last['tasks'], 'task')}{every}"
     )

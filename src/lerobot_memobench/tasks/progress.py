@@ -12,7 +12,8 @@ from lerobot_memobench.tasks.formula import LATCHES, Atom, Formula, atoms
 from lerobot_memobench.tasks.nodes import build
 from lerobot_memobench.tasks.task import Task
 
-#: Consecutive control steps for which a child of ``Then`` must hold before it counts as done.
+#: Consecutive evaluations, of which a control step has one, for which a child of ``Then`` must hold before it counts as
+#: done. The authors' evaluation has two per control step.
 HOLD_STEPS = 10
 
 
@@ -79,6 +80,10 @@ class Evaluator:
 class Progress:
     """Follows one episode's execution phase; call ``step`` exactly once per control step.
 
+    Args:
+        task: with goal and checkpoints.
+        evaluations: of the formulas per control step; with two, each part of `Then` has to hold for five steps.
+
     Attributes (steps are counted from 1; None until it happens; K checkpoints):
         steps: control steps taken since ``reset``.
         success: the goal holds now.
@@ -89,8 +94,8 @@ class Progress:
         index: number of checkpoints completed in order so far.
     """
 
-    def __init__(self, task: Task) -> None:
-        self.task = task
+    def __init__(self, task: Task, evaluations: int = 1) -> None:
+        self.task, self._evaluations = task, evaluations
         self._evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
         self.reset()
 
@@ -110,10 +115,16 @@ class Progress:
         """The goal can no longer be reached, whatever is done."""
         return self._evaluator.settled[0] is False
 
+    def settle(self, holds: Callable[[Atom], bool]) -> None:
+        """Take in the state after a control step before the execution: formulas see it, nothing is counted."""
+        for _ in range(self._evaluations):
+            self._evaluator.step(holds)
+
     def step(self, holds: Callable[[Atom], bool]) -> bool:
         """Take in the state after one control step, answered by ``holds``; return ``success``."""
         self.steps += 1
-        self.success, *satisfied = self._evaluator.step(holds)
+        for _ in range(self._evaluations):
+            self.success, *satisfied = self._evaluator.step(holds)
         self.satisfied = tuple(satisfied)
         for k, now in enumerate(satisfied):
             if now and self.first_step[k] is None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import Atom, Formula, rename
 
@@ -48,6 +48,20 @@ METADATA_FILE = "task_config.meta.json"
 def referent_text(asked: str, drawn: bool) -> str:
     """Return the referent of episodes for which one was asked: none can be chosen where each draws its own."""
     return DRAWN if drawn else asked
+
+
+def check_world(prefix: str, world: str, suite: str) -> None:
+    """Refuse an unknown world, and one in which a suite cannot take place; ``prefix`` stands before a setting's name.
+
+    Raises:
+        MemobenchError: it is refused.
+    """
+    check_choice(f"{prefix}world", world, WORLDS)
+    if (suite, world) == (STRICT, LIBERO):
+        raise MemobenchError(
+            f"{prefix}world={LIBERO} was asked for with {prefix}suite={STRICT}, whose detents and sealed drawers are "
+            f"those of world={MEMOBENCH} alone; leave one of the two out"
+        )
 
 
 @dataclass(frozen=True)
@@ -180,7 +194,12 @@ class Task:
         return hash((self.name, self.bddl_text, self.variant_index, self.world))
 
     def in_world(self, world: World) -> Task:
-        """Return the task in another world; scene, instruction, goal and checkpoints stay the same."""
+        """Return the task in another world; scene, instruction, goal and checkpoints stay the same.
+
+        Raises:
+            MemobenchError: it cannot take place there.
+        """
+        check_world("", world, self.suite)
         published = self.published and self.published.in_world(world)
         return dataclasses.replace(self, world=world, published=published)
 

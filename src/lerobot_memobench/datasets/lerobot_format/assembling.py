@@ -185,6 +185,7 @@ def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], bu
     rows, index = [], 0
     for episode in episodes:
         row = {key: episode.info.get(key) for key in keys}
+        row |= {key: episode.info[key] for key in ("world", "stand_ins") if key in episode.info}
         row |= {"episode_index": None if episode.failure else index, "failure": episode.failure}
         index += episode.failure is None
         rows.append(row)

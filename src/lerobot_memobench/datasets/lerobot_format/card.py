@@ -11,15 +11,16 @@ import numpy as np
 
 from lerobot_memobench.datasets.lerobot_format.layout import read_info, undamaged
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
+from lerobot_memobench.datasets.lerobot_format.terms import terms
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.paper import raw_tables
-from lerobot_memobench.tasks.task import MEMORY_TYPES
+from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES
 
 CARD_FILE = "README.md"
 FRONT_MATTER = """\
 ---
-license: apache-2.0
+license: {licence}
 task_categories:
 - robotics
 tags:
@@ -180,8 +181,9 @@ def _card(
     made: Sequence[str],
     loading: str,
 ) -> str:
+    licence, section = terms(infos)
     parts = [
-        FRONT_MATTER.format(bucket="n<1K" if len(infos) < 1000 else "1K<n<10K"),
+        FRONT_MATTER.format(licence=licence, bucket="n<1K" if len(infos) < 1000 else "1K<n<10K"),
         "# MEMOBench demonstrations",
         *_introduction(infos, loading),
         MADE_BY,
@@ -192,7 +194,7 @@ def _card(
         "## Limitations",
         LIMITATIONS,
         "## Licence",
-        "Apache-2.0: the demonstrations, and `lerobot_memobench`, which made them.",
+        section,
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -218,12 +220,21 @@ def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]
         "checkpoints a memory has to keep (Storage), revise (Update) or summarise (Compression); every frame says "
         "which of them are done, because the simulator wrote the labels. Benchmark and metrics: MEMOBench; generator, "
         "environment and policies: `lerobot_memobench`.",
+        *_world(infos),
         loading,
         "`execution` leaves out the frames of demonstration prompts, in which the policy does not act; `lerobot train` "
         "of `lerobot_memobench` leaves them out by itself. One memory type alone: `episode_filter=lambda episode: "
         'episode["memory_type"] == "spatial"`. Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to a '
         "DataLoader of your own: language rows differ in number between episodes. `lerobot-train` does so by itself.",
     ]
+
+
+def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a paragraph on the world of the scenes; nothing where it is the package's own."""
+    found = [info for info in infos if info.get("world") == LIBERO]
+    missing = sorted({name for info in found for name in info.get("stand_ins") or ()})
+    told = f" Scans were missing, and boxes stand in for them: {', '.join(missing)}." if missing else ""
+    return [f"The scenes are the paper's, of LIBERO's assets (`world={LIBERO}`).{told}"] if found else []
 
 
 def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:

@@ -34,6 +34,7 @@ from lerobot_memobench.io import (
     refusing,
 )
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
+from lerobot_memobench.tasks.task import World
 
 DEFAULT_REPO_ID = "memobench/memobench"
 HDF5_FOLDER = "hdf5"
@@ -224,6 +225,8 @@ class EpisodeRecord(BaseModel):
         key_frames: one per checkpoint, -1 where it was not completed.
         fixture_poses: fixture to position and quaternion wxyz.
         digest: sha256 of states, actions and labels; None in datasets from before there was one.
+        world: of its scene; None in the package's own.
+        stand_ins: classes whose scans were missing, so that others stood in for them; None in the package's own world.
         versions: of the packages on which the numbers depend, where they are known.
     """
 
@@ -242,6 +245,8 @@ class EpisodeRecord(BaseModel):
     scene_hash: str | None = None
     fixture_poses: dict[str, list[float]] | None = None
     digest: str | None = None
+    world: World | None = None
+    stand_ins: list[str] | None = None
     versions: dict[str, str] | None = None
 
     def in_frames(self) -> str:
@@ -250,9 +255,11 @@ class EpisodeRecord(BaseModel):
 
     def in_meta(self) -> dict[str, Any]:
         """Return the columns of ``meta/episodes``."""
-        return self.model_dump(exclude={"versions"}) | {
+        elsewhere = {} if self.world is None else {"world": self.world, "stand_ins": json.dumps(self.stand_ins or [])}
+        return self.model_dump(exclude={"versions", "world", "stand_ins"}) | {
             "key_frames": np.array(self.key_frames, dtype=np.int64),
             "fixture_poses": json.dumps(self.fixture_poses),
+            **elsewhere,
         }
 
 
@@ -279,7 +286,8 @@ def from_meta(row: Mapping[str, Any]) -> EpisodeRecord | None:
     """Return the record that a row of ``meta/episodes`` holds; None where it holds none, or a part of one."""
     values = {key: row[key] for key in EpisodeRecord.model_fields if row.get(key) is not None}
     try:
-        return EpisodeRecord.model_validate(values | {"fixture_poses": json.loads(values.get("fixture_poses", "null"))})
+        in_json = {key: json.loads(values.get(key, "null")) for key in ("fixture_poses", "stand_ins")}
+        return EpisodeRecord.model_validate(values | in_json)
     except (ValidationError, ValueError, TypeError):
         return None
 

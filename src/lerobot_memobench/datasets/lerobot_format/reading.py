@@ -27,7 +27,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, World
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -165,6 +165,7 @@ class RecordedEpisode:
     columns: Columns
     whole: dict[str, Any]
     start: int = 0
+    world: World = MEMOBENCH
 
 
 def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
@@ -202,6 +203,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
         columns,
         whole,
         place.start,
+        record.world or MEMOBENCH,
     )
 
 
