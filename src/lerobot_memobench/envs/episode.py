@@ -252,7 +252,7 @@ class Episode:
     @property
     def stand_ins(self) -> tuple[str, ...]:
         """Classes whose scans are not on this machine, so that others stand in for them in this scene."""
-        return tuple(getattr(self.sim, "stand_ins", ()))
+        return self.sim.stand_ins
 
     def step(self, action: ArrayLike) -> None:
         """Advance by one control step; during the prompt the given action has no effect, after a fault nothing has."""

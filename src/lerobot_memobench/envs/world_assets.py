@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
-from importlib.util import find_spec
-
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.libero import files
 from lerobot_memobench.tasks.task import LIBERO, World
-
-FILES = "lerobot_memobench.sim.libero.files"
 
 
 def check_assets(world: World) -> str:
@@ -19,9 +14,6 @@ def check_assets(world: World) -> str:
     """
     if world != LIBERO:
         return ""
-    if find_spec(FILES.rpartition(".")[0]) is None:
-        raise MemobenchError(f"this version cannot build scenes of world={LIBERO}; install a later one")
-    files = importlib.import_module(FILES)
     for name in files.known_hashes():
         files.asset(name)
     return str(files.assets_folder())

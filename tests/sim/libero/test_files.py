@@ -9,7 +9,6 @@ import pytest
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.libero import files, mjcf
 from lerobot_memobench.sim.libero.scene import build_scene
-from lerobot_memobench.sim.worlds import get_scene
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.libero import needs_assets
 
@@ -50,11 +49,6 @@ def test_every_known_file_is_the_installed_one(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.delenv(files.ASSETS_VARIABLE, raising=False)
     for name in files.known_hashes():
         assert files.asset(name).is_file()
-
-
-def test_a_strict_task_is_refused() -> None:
-    with pytest.raises(MemobenchError, match=r"strict suite.*take world=memobench"):
-        get_scene(get_task("check_the_top_drawer_a_given_number_of_times").in_world("libero"))
 
 
 def test_a_class_that_has_no_size(monkeypatch: pytest.MonkeyPatch) -> None:

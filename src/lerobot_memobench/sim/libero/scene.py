@@ -31,7 +31,7 @@ from lerobot_memobench.sim.scene import (
     scene_key,
 )
 from lerobot_memobench.tasks.bddl import Region
-from lerobot_memobench.tasks.task import STRICT, Task
+from lerobot_memobench.tasks.task import Task
 
 TABLE_HALF = (0.5, 0.6, 0.025)
 """Half the size of the table's board, m."""
@@ -46,14 +46,8 @@ def build_scene(task: Task) -> Scene:
     """Return the compiled scene of a task.
 
     Raises:
-        MemobenchError: LIBERO's assets are missing or other ones, the world lacks a class of the task, or the task is
-            a strict one.
+        MemobenchError: LIBERO's assets are missing or other ones, or the world lacks a class of the task.
     """
-    if task.suite == STRICT:
-        raise MemobenchError(
-            f"task {task.name} is of the strict suite, whose detents and hidden things the world 'libero' does not "
-            "have; take world=memobench"
-        )
     model = _compiled(task)
     assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
     boxes = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name).stand_in]
