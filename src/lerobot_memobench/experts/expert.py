@@ -198,10 +198,8 @@ class Expert:
 
     def _take(self, step: Step) -> Steps:
         """Bring an atom about, or rest at home."""
-        if isinstance(step, Hold):
-            rest = step.number
-        else:
-            rest = LINGER if step.predicate in _HOME and not self._holds(step) else 0
+        rest = step.number if isinstance(step, Hold) else LINGER * (step.predicate in _HOME and not self._holds(step))
+        if isinstance(step, Atom):
             for _ in range(TRIES):  # the count would be short of what is gone on without
                 yield from self.achieve(step)
                 if self._holds(step):
@@ -218,18 +216,17 @@ class Expert:
         """Bring one atom about, unless it is already so."""
         if self._holds(atom):
             return
-        hand = self.hand
         match atom.predicate, atom.args:
-            case ("handhome" | "asbegun"), ():
-                yield from come_home(hand, *self.sim.home)
+            case (("handhome" | "asbegun"), ()):
+                yield from come_home(self.hand, *self.sim.home)
             case (("open" | "wasopen"), (name,)):
                 yield from self._open(name)
             case "close", (name,):
                 yield from self._close(name)
             case (("turnon" | "wasturnedon"), (name,)):
-                yield from turn_knob(hand, name, on=True)
+                yield from turn_knob(self.hand, name, on=True)
             case "turnoff", (name,):
-                yield from turn_knob(hand, name, on=False)
+                yield from turn_knob(self.hand, name, on=False)
             case "in", (name, region):
                 yield from self._bring(atom, lambda: self._put_in(name, region))
             case "on", (name, support):

@@ -443,20 +443,15 @@ def _sweep_open(hand: Hand, name: str) -> Steps:
         door = door_now(hand, name, ahead)
         return door.handle + up, _turned(hand, door, door.handle + up, flip)
 
-    def at(back: float) -> Callable[[], Array]:
-        def target() -> Array:
-            place, turn = grip()
-            return place - back * turn[:, 2]
+    def over() -> Array:
+        return grip()[0] - HOVER * grip()[1][:, 2]
 
-        return target
-
-    yield from hand.move(at(HOVER), lambda: grip()[1], OPEN, tolerance=0.02, turn_tolerance=0.1)
-    yield from hand.move(at(0.0), lambda: grip()[1], OPEN, tolerance=0.006, speed=0.8, timeout=60)
+    yield from hand.move(over, lambda: grip()[1], OPEN, tolerance=0.02, turn_tolerance=0.1)
+    yield from hand.move(lambda: grip()[0], lambda: grip()[1], OPEN, tolerance=0.006, speed=0.8, timeout=60)
     yield from hand.close()
     way = np.sign(articulation.open_q - articulation.closed_q)
     for _ in range(STEPS):
-        _, q = hand.sim.world.articulation(name)
-        if wanted(q, articulation, True) or length(hand.position - grip()[0]) > LOST:
+        if wanted(door_now(hand, name).q, articulation, True) or length(hand.position - grip()[0]) > LOST:
             break
         yield hand.toward(*grip(way * LEAD), CLOSED)
 
