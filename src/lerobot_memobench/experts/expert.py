@@ -45,7 +45,7 @@ from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import STRICT, Task
 
 TRIES = 3
-"""How often a thing is picked up and placed before the plan goes on without it."""
+"""How often a thing is picked up and placed, or a step taken, before the plan goes on without it."""
 LINGER = 10
 """Control steps for which it stays at home between two events: who learns from a hand that turns there in a single step
 learns to turn short of it."""
@@ -198,11 +198,12 @@ class Expert:
 
     def _take(self, step: Step) -> Steps:
         """Bring an atom about, or rest at home."""
-        if isinstance(step, Hold):
-            rest = step.number
-        else:
-            rest = LINGER if step.predicate in _HOME and not self._holds(step) else 0
-            yield from self.achieve(step)
+        rest = step.number if isinstance(step, Hold) else LINGER * (step.predicate in _HOME and not self._holds(step))
+        if isinstance(step, Atom):
+            for _ in range(TRIES):  # the count would be short of what is gone on without
+                yield from self.achieve(step)
+                if self._holds(step):
+                    break
         for _ in range(rest):
             yield self.hand.toward(*self.sim.home, OPEN)
 
@@ -212,25 +213,20 @@ class Expert:
         return self.sim.holds(atom)
 
     def achieve(self, atom: Atom) -> Steps:
-        """Bring one atom about, unless it is already so; for home that is not near enough."""
-        hand = self.hand
-        if atom.predicate in _HOME:
-            for _ in range(TRIES):  # the arm may be pushed on the way
-                yield from come_home(hand, *self.sim.home)
-                if self._holds(atom):
-                    return
-            return
+        """Bring one atom about, unless it is already so."""
         if self._holds(atom):
             return
         match atom.predicate, atom.args:
+            case (("handhome" | "asbegun"), ()):
+                yield from come_home(self.hand, *self.sim.home)
             case (("open" | "wasopen"), (name,)):
                 yield from self._open(name)
             case "close", (name,):
                 yield from self._close(name)
             case (("turnon" | "wasturnedon"), (name,)):
-                yield from turn_knob(hand, name, on=True)
+                yield from turn_knob(self.hand, name, on=True)
             case "turnoff", (name,):
-                yield from turn_knob(hand, name, on=False)
+                yield from turn_knob(self.hand, name, on=False)
             case "in", (name, region):
                 yield from self._bring(atom, lambda: self._put_in(name, region))
             case "on", (name, support):

@@ -409,20 +409,22 @@ def _push_door(hand: Hand, name: str) -> Steps:
 
 
 def pull_open(hand: Hand, name: str) -> Steps:
-    """Take a door's handle and follow the arc until the door counts as open; a second way where that fails."""
-    articulation, _ = hand.sim.world.articulation(name)
-    yield from _sweep_open(hand, name)
-    yield from let_go(hand, 0.08)
-    if not wanted(hand.sim.world.articulation(name)[1], articulation, True):
-        yield from open_door(hand, name)
+    """Take a door's handle and follow the arc until the door counts as open."""
+    for _ in range(ATTEMPTS):
+        yield from _sweep_open(hand, name)
+        yield from let_go(hand, 0.08)
+        articulation, q = hand.sim.world.articulation(name)
+        if wanted(q, articulation, True):
+            return
 
 
 def push_shut(hand: Hand, name: str) -> Steps:
-    """Push a door's panel from outside until it is shut; a second way where that fails."""
-    articulation, _ = hand.sim.world.articulation(name)
-    yield from _sweep_shut(hand, name)
-    if not wanted(hand.sim.world.articulation(name)[1], articulation, False):
-        yield from close_door(hand, name)
+    """Push a door's panel from outside until it is shut."""
+    for _ in range(ATTEMPTS):
+        yield from _sweep_shut(hand, name)
+        articulation, q = hand.sim.world.articulation(name)
+        if wanted(q, articulation, False):
+            return
 
 
 def _turned(hand: Hand, door: Door, place: Array, flip: float) -> Array:
@@ -441,20 +443,15 @@ def _sweep_open(hand: Hand, name: str) -> Steps:
         door = door_now(hand, name, ahead)
         return door.handle + up, _turned(hand, door, door.handle + up, flip)
 
-    def at(back: float) -> Callable[[], Array]:
-        def target() -> Array:
-            place, turn = grip()
-            return place - back * turn[:, 2]
+    def over() -> Array:
+        return grip()[0] - HOVER * grip()[1][:, 2]
 
-        return target
-
-    yield from hand.move(at(HOVER), lambda: grip()[1], OPEN, tolerance=0.02, turn_tolerance=0.1)
-    yield from hand.move(at(0.0), lambda: grip()[1], OPEN, tolerance=0.006, speed=0.8, timeout=60)
+    yield from hand.move(over, lambda: grip()[1], OPEN, tolerance=0.02, turn_tolerance=0.1)
+    yield from hand.move(lambda: grip()[0], lambda: grip()[1], OPEN, tolerance=0.006, speed=0.8, timeout=60)
     yield from hand.close()
     way = np.sign(articulation.open_q - articulation.closed_q)
     for _ in range(STEPS):
-        _, q = hand.sim.world.articulation(name)
-        if wanted(q, articulation, True) or length(hand.position - grip()[0]) > LOST:
+        if wanted(door_now(hand, name).q, articulation, True) or length(hand.position - grip()[0]) > LOST:
             break
         yield hand.toward(*grip(way * LEAD), CLOSED)
 
@@ -469,11 +466,13 @@ def _sweep_shut(hand: Hand, name: str) -> Steps:
         place = door.edge - PUSH_IN * door.along + gap * door.outward + (height - PUSH_BELOW) * UP
         return place, _turned(hand, door, place, flip)
 
+    yield from rise(hand, CLOSED, 0.26)
     for height, tolerance in ((0.12, 0.03), (0.0, 0.02)):
         target, turn = pose(BEFORE, height)
         yield from hand.move(target, turn, CLOSED, tolerance=tolerance, turn_tolerance=0.15)
+    shut = pressed(lambda: wanted(hand.sim.world.articulation(name)[1], articulation, False))
     for _ in range(STEPS):
-        if wanted(hand.sim.world.articulation(name)[1], articulation, False):
+        if shut() or length(hand.position - pose(TOUCHING)[0]) > LOST + BEFORE:
             break
         yield hand.toward(*pose(TOUCHING, 0.0, way * LEAD), CLOSED)
     back = hand.position + 0.05 * door_now(hand, name).outward

@@ -80,6 +80,8 @@ STEEP = 0.7
 """How much of it there is for each metre that the finger then stands over the floor."""
 CLOSING_LEAD = 0.03
 """How much narrower than they are the fingers are taken to be while they close: the arm is slower than they, m."""
+ASTRAY = 0.025
+"""Distance from its place in a drawer, m, from which a held thing is not let go: it would come to lean on a wall."""
 TIPPED = 0.08
 """By how much less upright a bowl may be once it is grasped, as a cosine: it slips if its rim was pressed on."""
 SUNK = 0.002
@@ -457,5 +459,8 @@ def put_in_drawer(hand: Hand, held: Held, region: str, outward: Array) -> Steps:
         centre, _ = hand.sim.site_pose(region)
         return centre + 0.015 * outward + (half[2] - asset.bottom - 0.005) * UP - 0.02 * UP
 
-    yield from carry(hand, held, destination, turn, clearance=0.12, tolerance=0.012)
+    for _ in range(ATTEMPTS):
+        yield from carry(hand, held, destination, turn, clearance=0.12, tolerance=0.012)
+        if not holding(hand, held) or length(hand.sim.body_pose(held.name)[0] - destination()) < ASTRAY:
+            break
     yield from release(hand)
