@@ -40,6 +40,7 @@ from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.task import Task
 from research.command import run
+from research.necessity.demonstrations import rest_steps
 from research.necessity.notes import Motion, leave_ajar, loose_object, opened_to, pull, shift
 
 LEVELS = ("bottom", "middle", "top")
@@ -59,17 +60,29 @@ SHOWN = "the clock, if it were shown"
 def ceiling(task: Task) -> float:
     """Return the highest success rate without a memory, a clock or a look into drawers.
 
-    At home the scene is as it began, to the bit. So the same thing is begun there with the same probability each time:
-    of n events and a rest, at best n^n / (n + 1)^(n + 1); of two things in order 1/4, of three 1/27. In the other
-    families the first choice decides, and the observation is the same for all variants.
+    At home the scene is as it began, to the bit. So the same thing is begun there with the same probability at each
+    step: of two things in order at best 1/4, of three 1/27, and `counted` of events and a rest. In the other families
+    the first choice decides, and the observation is the same for all variants.
     """
     if task.family == "counting":
-        return float(np.mean([n**n / (n + 1) ** (n + 1) for n in (1, 2, 3)]))
+        return float(np.mean([counted(number, rest_steps(task.goal)) for number in (1, 2, 3)]))
     if task.family == "ordering":
         return 1 / 27 if "three" in task.name else 1 / 4
     found = chance(task)
     assert found is not None, task.name
     return found
+
+
+def counted(number: int, rest: int) -> float:
+    """Return the highest probability of exactly so many events before the first rest of ``rest`` control steps.
+
+    A policy stays at home in each step with the same probability. The first event begins before a rest, each later one
+    too, then the hand rests: nearly n^n / (n + 1)^(n + 1). The step in which a hand leaves home counts as rest, and the
+    one in which it comes home, which makes a rest after an event shorter than one at the start by a decision.
+    """
+    first = np.linspace(0.0, 1.0, 100_001)
+    later = first ** ((rest - 2) / (rest - 1))
+    return float(((1 - first) * (1 - later) ** (number - 1) * later).max())
 
 
 # --- what a strategy sees and can do ---
