@@ -9,7 +9,7 @@ from scipy.stats import binom
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.evaluation.metrics import wilson
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from research.necessity.adversaries import SHOWN, STRATEGIES, ceiling, counted, rollout
+from research.necessity.adversaries import SHOWN, STRATEGIES, UNBOUND, ceiling, counted, rollout
 
 FINDING = "find_the_artichoke_hidden_in_one_of_the_drawers"
 COUNTING = "check_the_middle_drawer_a_given_number_of_times"
@@ -48,6 +48,6 @@ def test_the_ceiling_of_counting_is_what_staying_by_chance_reaches() -> None:
 @pytest.mark.parametrize("name", task_names(suite="strict"))
 def test_no_strategy_exceeds_the_ceiling(name: str) -> None:
     task, scenes = get_task(name), 6
-    for strategy in STRATEGIES[str(task.family)].keys() - {SHOWN}:
+    for strategy in STRATEGIES[str(task.family)].keys() - UNBOUND:
         solved = sum(bool(rollout(name, strategy, 20_100 + scene)["success"]) for scene in range(scenes))
         assert solved <= binom.ppf(0.9999, scenes, ceiling(task)), strategy
