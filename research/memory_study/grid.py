@@ -40,7 +40,7 @@ class Suite:
         demonstrations: words of ``memobench generate``. evaluation: of ``lerobot eval env=memobench``.
         tasks: tasks or memory types that are learned and rolled out; none: all.
         whole: whether the demonstrations are of all tasks, others' frames not drawn, and count in normalisation alone.
-        ceilings: task -> best success found without a memory, per cent (``research.necessity``).
+        ceilings: task -> best success without a memory, per cent: found (``research.necessity``), or exact.
     """
 
     demonstrations: list[str]

@@ -24,7 +24,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, protocol_of_log, read_rollouts
 from lerobot_memobench.jobs.threads import BESIDE
 from lerobot_memobench.policies.memobench_mem.memory import OURS
-from lerobot_memobench.tasks.catalogue import resolve_tasks
+from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.learning import stages
 from research.learning.stages import Cost, ended
 from research.memory_study import cells, figure
@@ -34,6 +34,7 @@ from research.memory_study.cells import Cell, Demonstrations, choose_rates, chos
 from research.memory_study.figure import draw_all
 from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
+from research.necessity.adversaries import ceiling
 from research.pages import around
 from tests.support.logs import rollout
 
@@ -468,8 +469,11 @@ def test_the_sealed_test_is_asked_for_and_stays(grid: Grid, tmp_path: Path) -> N
 
 
 def test_ceilings_are_of_the_tasks_that_are_rolled_out() -> None:
-    for name, suite in read_grid(GRID).suites.items():
+    suites = read_grid(GRID).suites
+    for name, suite in suites.items():
         assert sorted(suite.ceilings) == sorted(resolve_tasks(suite.tasks, name))
+    for task, value in suites["strict"].ceilings.items():
+        assert value == pytest.approx(100 * ceiling(get_task(task)), abs=0.051)
 
 
 def test_the_average_of_ceilings_is_of_memory_types(grid: Grid, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.formula import SINCE_START, Atom, Formula, atoms, format_formula
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 from research.necessity.demonstrations import (
     REST,
     SETTLE,
@@ -42,9 +43,11 @@ from research.necessity.graph import (
     is_decided,
 )
 from research.necessity.memoryless import classes
+from research.necessity.notes import Motion, leave_ajar, loose_object, opened_to, shift
 from research.necessity.settings import Settings
 
 if TYPE_CHECKING:
+    from lerobot_memobench.experts.expert import Expert
     from lerobot_memobench.sim.simulation import Simulation, Snapshot
 
 
@@ -52,8 +55,15 @@ if TYPE_CHECKING:
 
 SAME_PLACE = 0.02
 """Distance up to which an object is where it was when states of the exploration are told apart, m."""
-SAME_JOINT = {"slide": 0.02, "hinge": 0.2}
+SAME_JOINT = {"slide": 0.02, "hinge": 0.1}
 """The same for drawers (m) and for doors and knobs (rad)."""
+LITTLE, AJAR = 0.25, 0.7
+"""How far a drawer, door or knob is pulled a little and left ajar, of its way from closed to open or on."""
+AT_HOME = frozenset({Atom("handhome", ()), Atom("asbegun", ())})
+"""What does not count while the world settles: the arm is at home at once, where a hand would be on its way. A rest
+would have begun before anything decides to rest."""
+ASIDE = 0.06
+"""How far an object is moved that serves as a note, m."""
 
 
 def answers_of(variants: Sequence[Task]) -> list[Atom]:
@@ -94,7 +104,8 @@ class Laboratory:
         seed: of the start.
 
     Attributes:
-        answers: what can be done: `REST` where a goal asks for rest, and what the expert does.
+        answers: what can be done: `REST` where a goal asks for rest, what the expert does, and in strict tasks what
+            makes a note of the scene or shows what is in a drawer: pull a little, leave ajar, move an object.
         starts: where each variant's execution begins; the same for all but those whose prompt changes the scene.
     """
 
@@ -103,7 +114,8 @@ class Laboratory:
         goals: list[Formula] = [task.goal for task in variants]
         self._deeds = {str(atom): atom for atom in answers_of(variants)}
         self._rest = max(rest_steps(goal) for goal in goals)
-        self.answers = (*self._deeds, REST) if self._rest else tuple(self._deeds)
+        self._notes = dict(_notes(variants[0], sim)) if variants[0].suite == STRICT else {}
+        self.answers = (*self._deeds, *((REST,) if self._rest else ()), *self._notes)
         self._atoms = sorted({answer_of(atom) for goal in goals for atom in atoms(goal)}, key=str)
         self.starts: list[Snapshot] = []
         for variant in variants:
@@ -129,9 +141,9 @@ class Laboratory:
             self.sim.step(np.clip(action, -1.0, 1.0))
             steps += 1
             listen(self.true())
-        for _ in self.home.settle():
+        for waited, _ in enumerate(self.home.settle(), 1):
             steps += 1
-            listen(self.true())
+            listen(self.true() if waited == SETTLE else self.true() - AT_HOME)
         return steps
 
     def _motion(self, answer: str) -> Iterator[NDArray[np.floating]]:
@@ -141,9 +153,13 @@ class Laboratory:
         if answer == REST:
             yield from (NO_OP for _ in range(self._rest))
             return
+        expert = expert_of(self.variants[0], self.sim, self.seed)
+        if answer in self._notes:
+            yield from self._notes[answer](expert)
+            return
         atom = self._deeds[answer]
         if not self.sim.holds(atom) and not self._shut_away(atom.args[0]):
-            yield from expert_of(self.variants[0], self.sim, self.seed).achieve(atom)
+            yield from expert.achieve(atom)
 
     def _shut_away(self, thing: str) -> bool:
         """Whether a thing lies in a closed drawer: an expert that looks into the simulator would know which."""
@@ -167,6 +183,22 @@ class Laboratory:
             np.array([q for _, q in articulations]),
             np.array([SAME_JOINT["slide" if a.kind == "drawer" else "hinge"] for a, _ in articulations]),
         )
+
+
+def _notes(task: Task, sim: Simulation) -> Iterator[tuple[str, Callable[[Expert], Motion]]]:
+    """Yield by name what uses the scene as a notebook, or looks into a drawer.
+
+    Published tasks are searched without: nothing in them keeps a scene from being used so.
+    """
+    for name in sim.world.joints:
+        yield f"pull {name} a little", partial(_open_by, name, LITTLE)
+        yield f"leave {name} ajar", partial(_open_by, name, AJAR)
+    name = loose_object(task)
+    yield f"move {name}", lambda expert: shift(expert, name, ASIDE)
+
+
+def _open_by(name: str, share: float, expert: Expert) -> Motion:
+    yield from leave_ajar(expert, name, opened_to(expert, name, share))
 
 
 # --- exploration ---
@@ -303,11 +335,11 @@ def walk(
     waiting = [Progress(task) for task in tasks]
     steps = reached = 0
 
-    def listen(_: frozenset[Atom]) -> None:
+    def listen(true: frozenset[Atom]) -> None:
         nonlocal steps, reached
         steps += 1
         if steps <= horizon:
-            reached += sum([progress.step(laboratory.sim.holds) for progress in waiting])
+            reached += sum([progress.step(true.__contains__) for progress in waiting])
             waiting[:] = [progress for progress in waiting if not progress.success and not progress.lost]
 
     while waiting and steps < horizon:

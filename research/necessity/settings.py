@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.task import DRAWN, REFERENTS, Task
 
-VERSION = 3
+VERSION = 4
 """Raised when results change, so that old ones are made again."""
 
 

@@ -1,6 +1,6 @@
 """Measure how far a drawer has to be pulled until a camera or the object observation shows what is in it.
 
-    python -m research.necessity.visibility --scenes 5 --poses 400
+    python -m research.necessity.visibility --scenes 5 --poses 400 --out outputs/visibility
 
 Every drawer that holds an object is pulled by the same distance, its content with it. The agent's camera is fixed; the
 wrist camera is tried from random poses of the arm near the cabinet. Per distance: the most pixels of a hidden object in
@@ -9,9 +9,11 @@ a picture, and in how many looks the object observation lists it.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
@@ -21,14 +23,16 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.object_slots import ObjectSlots
+from lerobot_memobench.sim.assets.registry import split_class
+from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.object_slots import classes
 from lerobot_memobench.sim.scene import DEAD_CENTRE
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from research.command import run
 
-DISTANCES = (0.0, DEAD_CENTRE["drawer"], 0.012, 0.015, 0.018, 0.020, 0.025, 0.030, 0.040)
-"""How far drawers are pulled, m."""
+DISTANCES = (DEAD_CENTRE["drawer"], 0.018, 0.020, 0.025, 0.030)
+"""How far drawers are pulled, m: as far as loses, as far as nothing shows, and beyond."""
 NEAR = 0.30
 """Distance of the hand from the front of the cabinet within which a pose counts, m."""
 
@@ -71,47 +75,66 @@ def poses(sim: Simulation, rng: np.random.Generator, count: int) -> Iterator[NDA
     sim.data.qpos[:] = kept
 
 
+def look(task: str, seed: int, count: int) -> dict[str, Any]:
+    """Return the most pixels of a hidden object by camera and distance, and how many looks list one by distance."""
+    episode = hidden(task, seed)
+    sim, places = episode.sim, episode.task.prompt.places if episode.task.prompt else ()
+    roots = [sim.model.body(thing).rootid[0] for thing, _ in places]
+    content = np.isin(sim.model.body_rootid[sim.model.geom_bodyid], roots)
+    kinds = {classes().index(split_class(sim.assets[thing].class_name)[0]) for thing, _ in places}
+    pixels = {camera: [0] * len(DISTANCES) for camera in MJCF_CAMERAS}
+    listed = [0] * len(DISTANCES)
+    start = sim.snapshot()
+    addresses = [int(sim.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
+    for angles in [robot.ARM_START, *poses(sim, np.random.default_rng(seed), count)]:
+        for level, distance in enumerate(DISTANCES):
+            sim.restore(start)
+            pull(sim, places, distance)
+            sim.data.qpos[addresses] = angles
+            mujoco.mj_step1(sim.model, sim.data)
+            for camera, most in pixels.items():
+                shown = sim.geoms(camera)
+                most[level] = max(most[level], int(content[shown[shown >= 0]].sum()))
+            seen = episode.objects().reshape(SLOTS, WIDTH)[:, STARTS["class"]].astype(int)
+            listed[level] += bool(kinds & set(seen.tolist()))
+    return {"task": task, "seed": seed, "poses": count, "pixels": pixels, "listed": listed}
+
+
+def table(looks: list[dict[str, Any]]) -> str:
+    """Return by distance the most pixels of a hidden object by camera, and the share of looks that list one."""
+    tried = sum(one["poses"] + 1 for one in looks)
+    lines = [
+        f"{tried} looks, {len(looks)} scenes\n",
+        f"| pulled, mm | {', pixels | '.join(MJCF_CAMERAS)}, pixels | object observation, looks |",
+        "|---:|" + "---:|" * (len(MJCF_CAMERAS) + 1),
+    ]
+    for level, distance in enumerate(DISTANCES):
+        most = " | ".join(str(max(one["pixels"][camera][level] for one in looks)) for camera in MJCF_CAMERAS)
+        share = sum(one["listed"][level] for one in looks) / tried
+        lines.append(f"| {1000 * distance:.0f} | {most} | {100 * share:.1f} % |")
+    return "\n".join(lines)
+
+
 def visibility(
+    out: Annotated[Path, typer.Option(help="Folder of the looks; the same command goes on.")],
     scenes: Annotated[int, typer.Option(min=1, help="Scenes of each of the ten finding tasks.")] = 5,
     looks: Annotated[int, typer.Option("--poses", min=1, help="Poses of the arm per scene.")] = 400,
     seed: Annotated[int, typer.Option(help="First seed of the scenes.")] = VALIDATION_SEED,
 ) -> None:
-    """Print a table: distance, most pixels by camera, looks in which the object observation lists the content."""
-    pixels = {camera: np.zeros(len(DISTANCES), int) for camera in MJCF_CAMERAS}
-    listed, tried = np.zeros(len(DISTANCES), int), 0
-    for task in (name for name in task_names(suite="strict") if name.startswith("find_")):
-        for number in range(scenes):
-            episode = hidden(task, seed + number)
-            sim, places = episode.sim, episode.task.prompt.places if episode.task.prompt else ()
-            slots, rng = ObjectSlots(sim), np.random.default_rng([seed, number])
-            roots = [sim.model.body(thing).rootid[0] for thing, _ in places]
-            content = np.isin(sim.model.body_rootid[sim.model.geom_bodyid], roots)
-            kinds = {slots.things[slots._owner[sim.model.body(thing).id]].kind for thing, _ in places}
-            start = sim.snapshot()
-            addresses = [int(sim.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
-            for angles in [robot.ARM_START, *poses(sim, rng, looks)]:
-                tried += 1
-                for level, distance in enumerate(DISTANCES):
-                    sim.restore(start)
-                    pull(sim, places, distance)
-                    sim.data.qpos[addresses] = angles
-                    mujoco.mj_step1(sim.model, sim.data)
-                    for camera in MJCF_CAMERAS:
-                        shown = sim.geoms(camera)
-                        seen = int((content[shown[shown >= 0]]).sum())
-                        pixels[camera][level] = max(pixels[camera][level], seen)
-                    listed[level] += any(
-                        seen and thing.kind in kinds for seen, thing in zip(slots._visible(), slots.things, strict=True)
-                    )
-    print(
-        f"{tried} looks\n\n| pulled, mm | "
-        + " | ".join(f"{camera}, pixels" for camera in pixels)
-        + " | objects, looks |"
-    )
-    print("|---:|" + "---:|" * (len(pixels) + 1))
-    for level, distance in enumerate(DISTANCES):
-        counts = " | ".join(str(found[level]) for found in pixels.values())
-        print(f"| {1000 * distance:.0f} | {counts} | {listed[level]} |")
+    """Print the table, after scene 1 of all tasks, scene 2 and so on."""
+    out.mkdir(parents=True, exist_ok=True)
+    log = out / "looks.jsonl"
+    found = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
+    done = {(one["task"], one["seed"], one["poses"]): one for one in found}
+    asked = []
+    for number in range(seed, seed + scenes):
+        for task in (name for name in task_names(suite="strict") if name.startswith("find_")):
+            if (one := done.get((task, number, looks))) is None:
+                one = look(task, number, looks)
+                with log.open("a") as file:
+                    file.write(json.dumps(one) + "\n")
+            asked.append(one)
+    print(table(asked))
 
 
 if __name__ == "__main__":
