@@ -212,7 +212,7 @@ def _plan(
                     try:
                         demo = file.read(group)
                         usable.append((path, group, demo.image_size, len(demo.states)))
-                        notes += _note(file, demo)
+                        notes += _notes(file, demo)
                     except Unusable as error:
                         problems.append(Problem(str(path), f"data/{group}", str(error)))
         except Unusable as error:
@@ -233,13 +233,18 @@ def _tell_of_the_run(jobs: Sequence[ConversionJob], out: Path, tell: Callable[[s
         check_room(out, size, size - left, tell, f"{len(missing)} demonstrations")
 
 
-def _note(file: PublishedFile, demo: PublishedDemo) -> list[Problem]:
-    """Return in what a demonstration's task is not the catalogue's of its name; nothing where it makes no task."""
+def _notes(file: PublishedFile, demo: PublishedDemo) -> list[Problem]:
+    """Return how a demonstration's task was found, where its file does not hold it, and in what it is not the
+    catalogue's of its name; nothing where it makes no task.
+    """
     try:
-        reason = unlike_the_catalogue(task_of(file, demo).variant(0))
+        task = task_of(file, demo).variant(0)
     except MemobenchError:  # named when it is converted
         return []
-    return [Problem(str(file.path), "", reason)] if reason else []
+    lacking = (
+        f"bddl_file_content is no text, so the task is the catalogue's {task.name}" if file.lacks_its_text else None
+    )
+    return [Problem(str(file.path), "", reason) for reason in (lacking, unlike_the_catalogue(task)) if reason]
 
 
 def _miscounted(file: PublishedFile) -> list[Problem]:
