@@ -94,9 +94,9 @@ def place(task: Task, sim: Simulation, scene: ModelFile, states: States) -> tupl
     Raises:
         Unusable: naming what the scene lacks, has beyond the task, or has of a class whose frame is not known.
     """
+    _check_joints(sim, scene)
     if states.shape[1] != scene.state_dim:
         raise Unusable(f"states have width {states.shape[1]}, expected {scene.state_dim} of the joints of model_file")
-    _check_joints(sim, scene)
     scene.body_of(BASE)
     _check_base(sim, scene)
     placed = np.zeros((len(states), sim.state_dim))

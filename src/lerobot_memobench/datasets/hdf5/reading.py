@@ -32,6 +32,7 @@ Image = NDArray[np.uint8]
 AS_JSON = ("fixture_poses", "satisfied_intervals")
 """Attributes that hold JSON text."""
 SUFFIX = "_demo.hdf5"
+SUFFIXES = (".hdf5", ".h5")
 SLICE = 32
 """Frames read at a time."""
 LARGEST = 1e10
@@ -82,9 +83,11 @@ def find_files(source: Path) -> list[Path]:
     """
     if source.is_file():
         return [source]
-    found = sorted(path for path in source.rglob("*") if path.suffix in (".hdf5", ".h5") and path.is_file())
+    found = sorted(path for path in source.rglob("*") if path.suffix in SUFFIXES and path.is_file())
     if not found:
-        raise MemobenchError(f"found no HDF5 file (.hdf5, .h5) at {source}; name a file or a folder of them")
+        raise MemobenchError(
+            f"found no HDF5 file ({', '.join(SUFFIXES)}) at {source}; name a file, a folder of them, or a zip archive"
+        )
     return found
 
 

@@ -117,6 +117,13 @@ def is_ours(demo: PublishedDemo) -> bool:
     return "success" in demo.extras
 
 
+def other_scene(demo: PublishedDemo) -> str | None:
+    """Return how a demonstration's scene is not of this package, None where it is."""
+    if is_ours(demo) or not demo.model_file.strip() or ModelFile(demo.model_file).name == OURS:
+        return None
+    return "its scenes are LIBERO's: pictures and actions are as they were, states are put into this package's scenes"
+
+
 def _known_or_read_off(frames: list[int], satisfied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the (T, K) truth: from its key frame on where that is known, else as the states show it."""
     known = np.arange(len(satisfied))[:, None] >= np.array(frames)
