@@ -172,13 +172,27 @@ def _tell_of_the_run(jobs: Sequence[ConversionJob], out: Path, tell: Callable[[s
 # --- a zip archive ---
 
 
-class FileRecord(TypedDict):
-    """What a file of an archive holds: of each demonstration that looks as it should its group, height and width of
-    all pictures, frames; of what cannot be used its group and why; notes.
-    """
+class Sound(TypedDict):
+    """A demonstration that looks as it should: its group, height and width of all pictures, its length."""
 
-    demonstrations: list[tuple[str, Count, Count, Count]]
-    problems: list[tuple[str, str]]
+    group: str
+    height: Count
+    width: Count
+    frames: Count
+
+
+class LeftOut(TypedDict):
+    """A group that cannot be used, "" for the file as a whole."""
+
+    group: str
+    reason: str
+
+
+class FileRecord(TypedDict):
+    """What a file of an archive holds."""
+
+    demonstrations: list[Sound]
+    problems: list[LeftOut]
     notes: list[str]
 
 
@@ -187,9 +201,7 @@ def _tell_of_the_archive(archive: Archive, folder: Path, out: Path, tell: Callab
     size = run_size(archive.size // UNPACKED_FRAME, (LEROBOT,), IMAGE_SIZE)
     there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     largest = max((member.size for member in archive.members), default=0)
-    what = (
-        f"{len(archive.members)} files of {in_words(archive.size)}, one at a time unpacked (up to {in_words(largest)})"
-    )
+    what = f"{len(archive.members)} files of {in_words(archive.size)}, unpacked one by one (up to {in_words(largest)})"
     check_room(out, size, min(there, size), tell, what, work=largest)
 
 
@@ -243,8 +255,14 @@ def _unpack_and_plan(archive: Archive, member: Member, unpacked: Path, plan: Pla
 def _write_down(record: Path, path: Path, plan: Plan) -> None:
     """Record what a file holds, so that it need not be unpacked to know it."""
     content: FileRecord = {
-        "demonstrations": [(job.group, *job.image_size, job.frames) for job in plan.jobs if job.file == path],
-        "problems": [(problem.group, problem.reason) for problem in plan.problems if problem.file == str(path)],
+        "demonstrations": [
+            {"group": job.group, "height": job.image_size[0], "width": job.image_size[1], "frames": job.frames}
+            for job in plan.jobs
+            if job.file == path
+        ],
+        "problems": [
+            {"group": problem.group, "reason": problem.reason} for problem in plan.problems if problem.file == str(path)
+        ],
         "notes": [note.reason for note in plan.notes if note.file == str(path)],
     }
     write_file(record, json.dumps(content), durable=True)
@@ -256,9 +274,9 @@ def _take_up(record: Path, path: Path, plan: Plan) -> bool:
         found = read_json(record, FileRecord, "delete it to look through the file again")
     except FileNotFoundError:
         return False
-    for group, height, width, frames in found["demonstrations"]:
-        plan.add_job(path, group, (height, width), frames)
-    plan.problems += [Problem(str(path), group, reason) for group, reason in found["problems"]]
+    for demo in found["demonstrations"]:
+        plan.add_job(path, demo["group"], (demo["height"], demo["width"]), demo["frames"])
+    plan.problems += [Problem(str(path), each["group"], each["reason"]) for each in found["problems"]]
     plan.notes += [Problem(str(path), "", reason) for reason in found["notes"]]
     return True
 
