@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from lerobot_memobench.datasets.hdf5.reading import Unusable, first_line
 
 LONGEST_TEXT = 8 * 2**20
-"""Characters of a model file; LIBERO's scenes have 70,000 to 400,000."""
+"""Characters of a model file; LIBERO's have some 70,000."""
 MOST_ELEMENTS, DEEPEST = 20_000, 60
-"""Elements of a model file, and how deep they may lie; LIBERO's have up to 1,500, 17 deep."""
+"""Elements of a model file, and how deep they may lie; LIBERO's have up to 500, 16 deep."""
+MOST_SHAPES = 3_000
+"""Shapes that can touch, of which each state asks for all pairs; LIBERO's have up to 130."""
 LONGEST_NAME = 200
 LARGEST_NUMBER = 1e6
 
@@ -148,6 +150,9 @@ class ModelFile:
                 if element.tag == "body":
                     ElementTree.SubElement(made, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
                     waiting.append((element, made, top or made.get("name", "")))
+        shapes = sum(1 for _ in copy.iter("geom"))
+        if shapes > MOST_SHAPES:
+            raise Unusable(f"model_file has {shapes:,} shapes that can touch, more than {MOST_SHAPES:,}")
         try:
             return mujoco.MjModel.from_xml_string(ElementTree.tostring(scene, encoding="unicode"))
         except (ValueError, mujoco.FatalError) as error:

@@ -85,7 +85,7 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
             ),
             success=bool(demo.extras.get("success", read_off.success or (bool(frames) and min(frames) >= 0))),
             fixture_poses=placed.fixture_poses,
-            model_xml=demo.model_file,
+            model_xml=demo.model_file if placed.scene is None else "",
             scene_hash=str(demo.extras.get("scene_hash", "")),
             objects=read_off.objects,
         )
