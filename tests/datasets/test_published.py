@@ -33,6 +33,7 @@ from tests.support import libero_layout
 from tests.support.short_demonstrations import drawn_steps, with_pictures
 
 DRAWER = "check_the_middle_drawer_of_the_cabinet"
+SCANS = "put_the_artichoke_into_the_top_drawer_of_the_cabinet"
 SHORT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 STOCK = Path("/work/shared/reference/published_layout/drawer.hdf5")
 
@@ -64,14 +65,14 @@ def first(path: Path) -> tuple[PublishedFile, PublishedDemo]:
         return file, file.read(file.groups()[0])
 
 
-def _assert_states(found: np.ndarray, demo: Demonstration) -> None:
+def _assert_states(found: np.ndarray, demo: Demonstration, apart: float = 1e-9) -> None:
     """Equal, but for the signs of quaternions, which turn nothing."""
     found = found.copy()
     for joint in joints_of(get_scene(demo.task).model).values():
         if joint.kind == "free":
             turned = slice(joint.position.start + 3, joint.position.stop)
             found[:, turned] *= np.sign((found[:, turned] * demo.states[:, turned]).sum(axis=1, keepdims=True))
-    np.testing.assert_allclose(found, demo.states, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found, demo.states, rtol=0, atol=apart)
 
 
 def test_a_file_as_the_authors_script_writes_it(drawer, tmp_path):
@@ -161,6 +162,18 @@ def test_what_cannot_be_placed_is_refused_by_name(tmp_path, monkeypatch):
     said("or some 60 deep", lambda xml: "<mujoco>" + "<body>" * DEEPEST + xml)
     monkeypatch.delitem(FRAMES, "milk")
     said("'milk_.*' cannot be placed: the frame of LIBERO's class 'milk' is not known", lambda xml: xml)
+
+
+def test_scans_are_placed_by_how_they_stand_on_the_table(tmp_path):
+    demo = with_pictures(drawn_steps(SCANS, 10_000, 6), 16)
+    file, found = first(libero_layout.write(tmp_path / "artichoke.hdf5", demo))
+    task = task_of(file, found)
+    _assert_states(restore(task, found).states, demo, apart=1e-3)  # they settle
+    scene = ModelFile(found.model_file)
+    lying = found.states.copy()
+    lying[:, scene.joints["artichoke_1_joint0"].position.start + 2] += 0.4
+    with pytest.raises(MemobenchError, match=r"'artichoke_1' cannot be placed: its origin begins 0\.\d+ m above"):
+        restore(task, replace(found, states=lying))
 
 
 def test_a_scene_before_its_fixtures_were_set_up_is_refused(drawer, tmp_path):

@@ -31,6 +31,8 @@ NEAR_TABLE = 0.1
 """How far above or below the table's top a fixture's origin may be, m; LIBERO's are up to 30 mm above it."""
 STILL_AT_START = 0.02
 """How far from above a thing may be from its first place and still stands on what it was set down on, m."""
+LARGEST_SCAN = 0.2
+"""How far above or below its underside the origin of a scan may be, m."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,10 @@ def _frame(task: Task, sim: Simulation, scene: ModelFile, instance: str, positio
         )
     there = np.hypot(*(positions[:, :2] - positions[0, :2]).T) < STILL_AT_START
     underside = TABLE_TOP - positions[there, 2].min()
+    if abs(underside) > LARGEST_SCAN:
+        raise Unusable(
+            f"{instance!r} cannot be placed: its origin begins {-underside:.3f} m above the table, which is of no scan"
+        )
     return Frame(QUARTER, (0.0, 0.0, float(underside - sim.assets[instance].bottom)))
 
 
