@@ -21,8 +21,9 @@ from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
+from lerobot_memobench.datasets.hdf5.model_file import ModelFile
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
-from lerobot_memobench.datasets.hdf5.restore import read_fixture_poses, restore, task_of
+from lerobot_memobench.datasets.hdf5.restore import restore, task_of
 from lerobot_memobench.datasets.hdf5.writing import model_file, write_task_file
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
@@ -81,8 +82,10 @@ def by_hand(folder: Path, demo: Demonstration, name: str, **metadata) -> Path:
         given.pop(key, None)  # the published metadata has none of them
     (folder / "meta.json").write_text(json.dumps(given | metadata))
     np.savez(folder / "arrays.npz", states=demo.states, actions=demo.actions.astype(np.float64), **demo.images)
+    (folder / "scene.xml").write_text(model_file(demo.task, demo.fixture_poses))
     out = folder / name
-    arguments = [out, folder / "arrays.npz", task_folder / "task_config.bddl", folder / "meta.json"]
+    arguments = [out, folder / "arrays.npz", task_folder / "task_config.bddl"]
+    arguments += [folder / "meta.json", folder / "scene.xml"]
     subprocess.run([sys.executable, str(HAND), *map(str, arguments)], check=True, cwd="/")
     return out
 
@@ -123,10 +126,7 @@ def test_files_by_hand_without_key_frames(stove, tmp_path):
         task = task_of(file, found)
         assert found.extras == {}
         assert (task.name, task.memory_type, task.family) == (STOVE, "temporal", stove.task.family)
-        # Nothing says where the stove stood, so it is taken to stand in the middle of its region.
-        assert not np.array_equal(
-            restore(task, found).fixture_poses["flat_stove_1"], stove.fixture_poses["flat_stove_1"]
-        )
+        np.testing.assert_array_equal(restore(task, found).states, stove.states)
     summary = convert(path, tmp_path / "ds")
     assert summary.exit_status == 0
     episode = read_episode(tmp_path / "ds", 0)
@@ -147,7 +147,8 @@ def test_files_by_hand_with_key_frames_and_a_model_file(stove, tmp_path):
     episode = read_episode(tmp_path / "ds", 0)
     assert episode.whole["key_frames"] == [30, 44]
     assert episode.exec_start == 5
-    assert episode.whole["fixture_poses"] == {k: v.tolist() for k, v in stove.fixture_poses.items()}
+    for name, pose in stove.fixture_poses.items():
+        np.testing.assert_allclose(episode.whole["fixture_poses"][name], pose, rtol=0, atol=1e-15)
     assert episode.columns["checkpoint.index"].tolist() == [0] * 31 + [1] * 14 + [2] * (len(stove) - 45)
 
 
@@ -184,11 +185,10 @@ def test_what_contradicts_itself_is_said(written, stove):
     said("expected 2 frames", metadata={"key_frame": [20]})
     said("expected a frame or -1", metadata={"timestep_exec_start_idx": "first"})
     said("execution starts at frame 9999", metadata={"timestep_exec_start_idx": 9999})
-    said("states have width 12, expected", states=found.states[:, :12])
+    said("states have width 12, expected 47 of the joints of model_file", states=found.states[:, :12])
     said("not in order: frame 1 is earlier", states=found.states[::-1])
     said("not in order: frame 21 is earlier", states=found.states[[*range(20), 21, 20, *range(22, len(stove))]])
-    said("model_file is no XML", model_file="<mujoco>")
-    said("pos='1 2'", model_file='<mujoco><body name="flat_stove_1" pos="1 2"/></mujoco>')
+    said("the attribute 'model_file' is missing", model_file=" ")
     with pytest.raises(MemobenchError, match="the digest differs"):
         restore(task, replace(found, actions=found.actions[::-1]))
 
@@ -206,9 +206,9 @@ def test_the_model_file_is_the_scene(stove):
     assert names == [sim.model.body(k).name for k in range(sim.model.nbody)]
     np.testing.assert_array_equal(model.body_pos, sim.model.body_pos)
     np.testing.assert_allclose(model.body_mass, sim.model.body_mass, rtol=1e-5)  # six digits
-    poses = read_fixture_poses(stove.model_xml, stove.fixture_poses)
+    scene = ModelFile(stove.model_xml)
     for name, pose in stove.fixture_poses.items():
-        np.testing.assert_array_equal(poses[name], pose)
+        np.testing.assert_allclose(scene.rest_pose(name), pose, rtol=0, atol=1e-15)
 
 
 def test_the_rest_converts(source, stove, tmp_path):

@@ -167,7 +167,9 @@ def _summary_table(summary: GenerationSummary) -> Table:
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(help="HDF5 file in the published layout, or a folder of them.")],
+    source: Annotated[
+        Path, typer.Argument(help="HDF5 file in the published layout, or a folder or a zip archive of them.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
     upside_down: Annotated[
         bool, typer.Option("--upside-down", help="The images are stored bottom row first: turn them up.")

@@ -2,33 +2,32 @@
 
 Groups that cannot be used are named with file, group and reason. Episodes go through the same staging as
 generated ones, so a killed conversion is continued by the same command, and a folder without ``meta/info.json`` is no
-dataset to anybody.
+dataset to anybody. Of a zip archive one file at a time is unpacked, looked through, converted and removed again.
+
+::
+
+    <staging>/episodes/                 finished episodes, see `staging`
+              files/00003.json          what the third file of an archive holds
+              unpacked/<its name>       the file at work
 """
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.conversion_jobs import ConversionJob, Plan
 from lerobot_memobench.datasets.generation import check_room, run_size
-from lerobot_memobench.datasets.hdf5.reading import (
-    Problem,
-    PublishedDemo,
-    PublishedFile,
-    Unusable,
-    find_files,
-    usable_or_named,
-)
-from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore, task_of, unlike_the_catalogue
+from lerobot_memobench.datasets.hdf5.archive import Archive, Member, is_archive
+from lerobot_memobench.datasets.hdf5.reading import Problem, Unusable, find_files
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
-    EpisodeRecord,
     check_destination,
     check_whole,
     is_dataset,
@@ -37,19 +36,19 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 from lerobot_memobench.datasets.staging import (
     LEROBOT,
     STAGING,
-    EpisodeStage,
-    StagedJob,
     compare_requests,
-    episode_info,
     episodes_folder,
     remove_staging,
-    stage_failure,
     staged,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import telling_of_the_disk
+from lerobot_memobench.io import Count, free_bytes, in_words, read_json, telling_of_the_disk, write_file
 from lerobot_memobench.jobs.executors import run_jobs
-from lerobot_memobench.jobs.processes import ProgressCallback
+from lerobot_memobench.jobs.processes import Advance, ProgressCallback
+from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
+
+UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
+"""Bytes of a frame's pictures in the published files, which do not pack them."""
 
 
 @dataclass(frozen=True)
@@ -74,56 +73,6 @@ class ConversionSummary:
         return 1 if self.problems or self.folder is None else 0
 
 
-@dataclass(frozen=True)
-class ConversionJob(StagedJob):
-    """One group of one file, to be staged in ``folder``. ``task_name`` is the file's name, for the progress."""
-
-    file: Path
-    group: str
-    folder: Path
-    image_size: tuple[int, int]
-    frames: int
-    upside_down: bool = False
-
-    @property
-    def task_name(self) -> str:
-        """The file's name."""
-        return self.file.name
-
-    @property
-    def seed(self) -> int:
-        """The group's number."""
-        return int(self.group.removeprefix("demo_"))
-
-    def run(self) -> None:
-        """Stage the episode, or why it cannot be used."""
-        try:
-            with PublishedFile(self.file) as file:
-                demo = self._restored(file)
-                with EpisodeStage(self.folder) as stage:
-                    for images in file.images(self.group, upside_down=self.upside_down):
-                        stage.add_images(images)
-                    stage.publish(demo)
-        except MemobenchError as error:
-            info = {"task_name": self.task_name, "seed": NO_SEED, "group": self.group}
-            stage_failure(info, " ".join(str(error).split()), self.folder)
-        except Exception as error:
-            error.add_note(f"while converting {self.file}, {self.group}")
-            raise
-
-    def _restored(self, file: PublishedFile) -> Demonstration:
-        with usable_or_named():
-            found = file.read(self.group)
-            if found.image_size != self.image_size:
-                raise Unusable(
-                    f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
-                    f"demonstration {self.image_size[0]}×{self.image_size[1]}"
-                )
-            demo = restore(task_of(file, found), found)
-            EpisodeRecord.model_validate(episode_info(demo))  # here it ends one episode, when the tables are made all
-            return demo
-
-
 def convert(
     source: Path | str,
     out: Path | str,
@@ -134,16 +83,17 @@ def convert(
     progress: ProgressCallback | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> ConversionSummary:
-    """Convert a file in the published layout, or all in a folder, to a LeRobotDataset in the folder ``out``.
+    """Convert a file in the published layout, or all in a folder or a zip archive, to a LeRobotDataset in ``out``.
 
     Args:
-        source: the file or folder.
+        source: the file, folder or archive.
         out: absent, empty, or a conversion of the same files that was not finished.
         repo_id: name of the dataset.
         upside_down: the images are stored as robosuite's renderer gives them, bottom row first: turn them up.
         workers: processes.
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number.
-        tell: told, before the first episode, about how large the dataset will be.
+            Of an archive its ``total`` is estimated from the files so far.
+        tell: told, before the first episode, about how large the dataset will be, and of each file of an archive.
 
     Raises:
         MemobenchError: there is nothing to convert, ``out`` holds something else, or its disk has no room (what is
@@ -151,10 +101,13 @@ def convert(
     """
     source, out = Path(source).absolute(), Path(out)
     if not source.exists():
-        raise MemobenchError(f"{source} does not exist; name an HDF5 file or a folder of them")
-    files = find_files(source)
+        raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")
+    archive = Archive(source) if is_archive(source) else None
+    files = find_files(source) if archive is None else []
     request = {
-        "files": [[_name(path, source), path.stat().st_size, path.stat().st_mtime_ns] for path in files],
+        "files": [[_name(path, source), path.stat().st_size, path.stat().st_mtime_ns] for path in files]
+        if archive is None
+        else [[member.name, member.size, member.checksum] for member in archive.members],
         "upside_down": upside_down,
     }
     if is_dataset(out):
@@ -165,9 +118,18 @@ def convert(
         telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
         episodes_folder(out, request) as folder,
     ):
-        jobs, problems, notes = _plan(files, folder, upside_down)
-        _tell_of_the_run(jobs, out, tell)
-        run_jobs(jobs, workers=workers, progress=progress, logs=staging / "logs")
+        plan = Plan(folder, upside_down)
+        if archive is None:
+            for path in files:
+                plan.add(path)
+            _tell_of_the_run(plan.jobs, out, tell)
+            run_jobs(plan.jobs, workers=workers, progress=progress, logs=staging / "logs")
+        else:
+            source = staging.absolute() / "unpacked"
+            files = [source / member.name for member in archive.members]
+            _tell_of_the_archive(archive, folder, out, tell)
+            _convert_archive(archive, plan, staging, workers, progress, tell)
+        jobs, problems, notes = plan.jobs, plan.problems, plan.notes
         episodes = [staged(job) for job in jobs]
         good = [episode for episode in episodes if episode.failure is None]
         problems += [
@@ -176,6 +138,7 @@ def convert(
             if episode.failure is not None
         ]
         problems, notes = _told(problems, files, source), _told(notes, files, source)
+        problems += [] if archive is None else archive.problems
         if good:
             assemble(
                 good,
@@ -197,33 +160,6 @@ def convert(
     return ConversionSummary(out if good else None, len(good), tuple(problems), tuple(notes))
 
 
-def _plan(
-    files: Sequence[Path], folder: Path, upside_down: bool
-) -> tuple[list[ConversionJob], list[Problem], list[Problem]]:
-    """Return a job per group that looks as it should, what does not, and which tasks are not the catalogue's."""
-    usable: list[tuple[Path, str, tuple[int, int], int]] = []
-    problems: list[Problem] = []
-    notes: list[Problem] = []
-    for path in files:
-        try:
-            with PublishedFile(path) as file, usable_or_named():
-                problems += _miscounted(file)
-                for group in file.groups():
-                    try:
-                        demo = file.read(group)
-                        usable.append((path, group, demo.image_size, len(demo.states)))
-                        notes += _note(file, demo)
-                    except Unusable as error:
-                        problems.append(Problem(str(path), f"data/{group}", str(error)))
-        except Unusable as error:
-            problems.append(Problem(str(path), "", str(error)))
-    jobs = [
-        ConversionJob(path, group, folder / f"{number:06d}", usable[0][2], frames, upside_down)
-        for number, (path, group, _, frames) in enumerate(usable)
-    ]
-    return jobs, problems, list({(note.file, note.reason): note for note in notes}.values())
-
-
 def _tell_of_the_run(jobs: Sequence[ConversionJob], out: Path, tell: Callable[[str], None]) -> None:
     """Tell the size of what is to be made, before it is."""
     missing = [job for job in jobs if not job.folder.exists()]
@@ -233,23 +169,141 @@ def _tell_of_the_run(jobs: Sequence[ConversionJob], out: Path, tell: Callable[[s
         check_room(out, size, size - left, tell, f"{len(missing)} demonstrations")
 
 
-def _note(file: PublishedFile, demo: PublishedDemo) -> list[Problem]:
-    """Return in what a demonstration's task is not the catalogue's of its name; nothing where it makes no task."""
+# --- a zip archive ---
+
+
+class Sound(TypedDict):
+    """A demonstration that looks as it should: its group, height and width of all pictures, its length."""
+
+    group: str
+    height: Count
+    width: Count
+    frames: Count
+
+
+class LeftOut(TypedDict):
+    """A group that cannot be used, "" for the file as a whole."""
+
+    group: str
+    reason: str
+
+
+class FileRecord(TypedDict):
+    """What a file of an archive holds."""
+
+    demonstrations: list[Sound]
+    problems: list[LeftOut]
+    notes: list[str]
+
+
+def _tell_of_the_archive(archive: Archive, folder: Path, out: Path, tell: Callable[[str], None]) -> None:
+    """Tell the size of what is to be made, and of the file that will lie unpacked, before anything is."""
+    size = run_size(archive.size // UNPACKED_FRAME, (LEROBOT,), IMAGE_SIZE)
+    there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    largest = max((member.size for member in archive.members), default=0)
+    what = f"{len(archive.members)} files of {in_words(archive.size)}, unpacked one by one (up to {in_words(largest)})"
+    check_room(out, size, min(there, size), tell, what, work=largest)
+
+
+def _convert_archive(
+    archive: Archive,
+    plan: Plan,
+    staging: Path,
+    workers: int,
+    progress: ProgressCallback | None,
+    tell: Callable[[str], None],
+) -> None:
+    """Unpack, look through, convert and remove one file after another; those that are finished stay packed."""
+    records, unpacked = staging / "files", staging.absolute() / "unpacked"
+    records.mkdir(exist_ok=True)
+    shutil.rmtree(unpacked, ignore_errors=True)  # a killed run may have left a part
+    ahead = _Ahead(archive.size, progress)
+    for number, member in enumerate(archive.members, 1):
+        path, record, first = unpacked / member.name, records / f"{number:05d}.json", len(plan.jobs)
+        known = _take_up(record, path, plan)
+        if not known or not all(job.finished() for job in plan.jobs[first:]):
+            _check_room_for(member, unpacked)
+            tell(f"file {number} of {len(archive.members)}: {member.name}, {in_words(member.size)}")
+            _unpack_and_plan(archive, member, unpacked, plan, known)
+            _write_down(record, path, plan)
+        jobs = plan.jobs[first:]
+        run_jobs(jobs, workers=workers, progress=ahead.through(member, first, len(jobs)), logs=staging / "logs")
+        path.unlink(missing_ok=True)
+
+
+def _check_room_for(member: Member, unpacked: Path) -> None:
+    free = free_bytes(unpacked)
+    if free < member.size:
+        raise MemobenchError(
+            f"{member.name} takes {in_words(member.size)} unpacked, but {in_words(free)} are free in "
+            f"{unpacked.parent}; make room, and the same command goes on from there"
+        )
+
+
+def _unpack_and_plan(archive: Archive, member: Member, unpacked: Path, plan: Plan, known: bool) -> None:
     try:
-        reason = unlike_the_catalogue(task_of(file, demo).variant(0))
-    except MemobenchError:  # named when it is converted
-        return []
-    return [Problem(str(file.path), "", reason)] if reason else []
+        path = archive.extract(member, unpacked)
+    except Unusable as error:
+        if known:
+            raise MemobenchError(f"{archive.path}, {member.name}: {error}") from None
+        plan.problems.append(Problem(str(unpacked / member.name), "", str(error)))
+    else:
+        if not known:
+            plan.add(path)
 
 
-def _miscounted(file: PublishedFile) -> list[Problem]:
-    announced, count = file.announced(), len(file.groups())
-    reasons = []
-    if announced is not None and announced != count:
-        reasons.append(f"it says that it has {announced} demonstrations, but there are {count}")
-    if not count:
-        reasons.append("it has no demonstrations")
-    return [Problem(str(file.path), "data", reason) for reason in reasons]
+def _write_down(record: Path, path: Path, plan: Plan) -> None:
+    """Record what a file holds, so that it need not be unpacked to know it."""
+    content: FileRecord = {
+        "demonstrations": [
+            {"group": job.group, "height": job.image_size[0], "width": job.image_size[1], "frames": job.frames}
+            for job in plan.jobs
+            if job.file == path
+        ],
+        "problems": [
+            {"group": problem.group, "reason": problem.reason} for problem in plan.problems if problem.file == str(path)
+        ],
+        "notes": [note.reason for note in plan.notes if note.file == str(path)],
+    }
+    write_file(record, json.dumps(content), durable=True)
+
+
+def _take_up(record: Path, path: Path, plan: Plan) -> bool:
+    """Add to the plan what an earlier run found in a file; return whether one did."""
+    try:
+        found = read_json(record, FileRecord, "delete it to look through the file again")
+    except FileNotFoundError:
+        return False
+    for demo in found["demonstrations"]:
+        plan.add_job(path, demo["group"], (demo["height"], demo["width"]), demo["frames"])
+    plan.problems += [Problem(str(path), each["group"], each["reason"]) for each in found["problems"]]
+    plan.notes += [Problem(str(path), "", reason) for reason in found["notes"]]
+    return True
+
+
+class _Ahead:
+    """Tells how far an archive is: how many episodes the files hold that are still packed, those before them say."""
+
+    def __init__(self, size: int, progress: ProgressCallback | None) -> None:
+        self._left, self._size, self._progress = size, size, progress
+        self._found = 0
+
+    def through(self, member: Member, before: int, here: int) -> ProgressCallback | None:
+        """Return the callback of a file's jobs: so many are ``before`` them, so many ``here``."""
+        self._left -= member.size
+        read, episodes = self._size - self._left, before + here
+        total = episodes + round(self._left * episodes / max(read, 1))
+        found = self._found
+
+        def tell(news: Advance) -> None:
+            self._found = found + news.found
+            if self._progress is not None:
+                self._progress(replace(news, done=before + news.done, total=total, found=self._found))
+
+        return tell
+
+
+# --- the outcome ---
 
 
 def _told(problems: Sequence[Problem], files: Sequence[Path], source: Path) -> list[Problem]:

@@ -387,7 +387,7 @@ def run_size(frames: int, formats: Collection[str], image_size: int | None) -> i
     return round(frames * (lerobot + HDF5_BYTES * area * (HDF5 in formats)))
 
 
-def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], what: str) -> None:
+def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], what: str, work: int = 0) -> None:
     """Tell what a run will take of the disk, and refuse one that cannot fit.
 
     Finished episodes stand beside the dataset that is made of them until it is whole, so at its end a run needs twice
@@ -395,14 +395,14 @@ def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], wh
 
     Args:
         out: its destination. size: of the dataset, about. there: bytes of it that are staged already.
-        what: begins the sentence: how much will be made.
+        what: begins the sentence: how much will be made. work: bytes that are needed beside it while it is made.
 
     Raises:
         MemobenchError: not even one copy has room.
     """
-    free, most = free_bytes(out), max(2 * size - there, 0)
+    free, most = free_bytes(out), max(2 * size - there, 0) + work
     told = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
-    if free < size - there:
+    if free < size - there + work:
         raise MemobenchError(f"{what} would take {told}: make room, name a folder on another disk, or ask for less")
     warning = "; THAT MAY NOT BE ENOUGH: a full disk ends the run, and the same command then goes on" * (free < most)
     tell(f"{what}: {told}{warning}")

@@ -12,6 +12,9 @@
 completed in order) and ``timestep_exec_start_idx`` (the frame at which execution starts) filled in. Frame t shows
 the observation before ``actions[t]``.
 
+The authors' files are of LIBERO's scenes, whose states have another order, other frames and other shapes than ours:
+``frames`` puts them into ours, ``libero_rules`` evaluates predicates in theirs, ``archive`` reads them out of a zip.
+
 What this package knows beyond the layout is in further attributes, so that every reader of the layout finds what
 it expects and nothing else among the arrays: of ``data`` ``task_metadata``; of a demonstration ``seed``,
 ``referent``, ``variant``, ``success``, ``fixture_poses``, ``scene_hash``, ``satisfied_intervals`` and ``digest``.

@@ -25,10 +25,14 @@ if TYPE_CHECKING:
 
 IMAGE_NAMES = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
 """Camera of this package -> dataset of the published layout."""
+LIBERO_NAMES = {"image": "agentview_rgb", "wrist_image": "eye_in_hand_rgb"}
+"""The same in LIBERO's own files, after which a file of the published layout may be named as well."""
+FILE_OBJECT = re.compile(r"<(_io\.\w+|open file) .*>")
 Image = NDArray[np.uint8]
 AS_JSON = ("fixture_poses", "satisfied_intervals")
 """Attributes that hold JSON text."""
 SUFFIX = "_demo.hdf5"
+SUFFIXES = (".hdf5", ".h5")
 SLICE = 32
 """Frames read at a time."""
 LARGEST = 1e10
@@ -79,9 +83,11 @@ def find_files(source: Path) -> list[Path]:
     """
     if source.is_file():
         return [source]
-    found = sorted(path for path in source.rglob("*") if path.suffix in (".hdf5", ".h5") and path.is_file())
+    found = sorted(path for path in source.rglob("*") if path.suffix in SUFFIXES and path.is_file())
     if not found:
-        raise MemobenchError(f"found no HDF5 file (.hdf5, .h5) at {source}; name a file or a folder of them")
+        raise MemobenchError(
+            f"found no HDF5 file ({', '.join(SUFFIXES)}) at {source}; name a file, a folder of them, or a zip archive"
+        )
     return found
 
 
@@ -152,6 +158,11 @@ class PublishedFile:
         stored = text_attribute(self._data, "task_metadata")
         return None if stored is None else json_object(stored, "task_metadata")
 
+    @property
+    def lacks_its_text(self) -> bool:
+        """Whether the name of an open file stands where the task's text should be."""
+        return names_a_file_object(self.bddl_text)
+
     def attribute(self, name: str) -> str | None:
         """Return a text attribute of ``data``, or None."""
         return text_attribute(self._data, name)
@@ -191,7 +202,8 @@ class PublishedFile:
         if not isinstance(group.get("obs"), h5py.Group):
             raise Unusable(f"the group {_missing(group, 'obs')}")
         images = {
-            image: array(group, f"obs/{image}", (None, None, None, 3), np.uint8) for image in IMAGE_NAMES.values()
+            image: array(group, f"obs/{image}", (None, None, None, 3), np.uint8)
+            for image in image_names(group["obs"]).values()
         }
         _check_length(group, {"states": states, "actions": actions, **images})
         image_size = _image_size(images.values())
@@ -213,10 +225,11 @@ class PublishedFile:
             upside_down: the file's images are stored as robosuite's renderer gives them: turn them up.
         """
         obs = self._data[group]["obs"]
-        length = len(obs[IMAGE_NAMES["image"]])
+        names = image_names(obs)
+        length = len(obs[names["image"]])
         for start in range(0, length, SLICE):
             try:
-                block = {camera: obs[name][start : start + SLICE] for camera, name in IMAGE_NAMES.items()}
+                block = {camera: obs[name][start : start + SLICE] for camera, name in names.items()}
             except Exception as error:
                 raise Unusable(f"its images cannot be read from frame {start} on ({first_line(error)})") from None
             for offset in range(len(block["image"])):
@@ -228,7 +241,7 @@ class PublishedFile:
     def pictures(self, group: str, frames: Sequence[int]) -> dict[str, Image]:
         """Return both cameras' pictures at ``frames``, ascending numbers (n,): (n, H, W, 3) uint8 each."""
         obs = self._data[group]["obs"]
-        return {camera: obs[name][list(frames)] for camera, name in IMAGE_NAMES.items()}
+        return {camera: obs[name][list(frames)] for camera, name in image_names(obs).items()}
 
 
 # --- parts of a file, each checked ---
@@ -300,6 +313,17 @@ def _image_size(images: Iterable[h5py.Dataset]) -> tuple[int, int]:
     return sizes.pop()
 
 
+def names_a_file_object(text: str) -> bool:
+    """Whether a text is what Python prints of an open file, which LIBERO's script stores in the place of its text."""
+    return FILE_OBJECT.fullmatch(text.strip()) is not None
+
+
+def image_names(obs: h5py.Group) -> dict[str, str]:
+    """Return the cameras' arrays in a group of observations: the published names, or LIBERO's where they are there."""
+    published = any(name in obs for name in IMAGE_NAMES.values())
+    return LIBERO_NAMES if not published and any(name in obs for name in LIBERO_NAMES.values()) else IMAGE_NAMES
+
+
 def demo_number(name: str) -> int | None:
     """Return k of a group demo_k, None for other names."""
     found = re.fullmatch(r"demo_(\d+)", name)
@@ -320,6 +344,8 @@ def text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
 
 def json_object(text: str, what: str) -> dict[str, Any]:
     """Return the JSON object that ``text`` holds; ``what`` it is goes into the message."""
+    if names_a_file_object(text):
+        raise Unusable(f"{what} holds {text[:60]!r}, the name of a Python object instead of its text")
     try:
         value = parsed(text)
     except Malformed as error:

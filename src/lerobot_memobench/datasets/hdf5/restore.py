@@ -1,18 +1,17 @@
 """Restore a demonstration from a group of the published layout: its task, its execution, its checkpoints.
 
-The layout holds states, not what the arm felt or which predicates held. Proprioception and visible objects are read off
-the states in the simulator; where a stranger's demonstration prompt highlights something is not known. Checkpoint
-columns come from the key frames where all are there; where one is missing (-1) the predicates are evaluated on the
-states, with the latches and orders that a rollout has.
+The layout holds states, not what the arm felt or which predicates held. States of LIBERO's scenes are put into ours
+first (`frames`). Proprioception and visible objects are read off them in the simulator; where a stranger's
+demonstration prompt highlights something is not known. Checkpoint columns come from the key frames; where one is
+missing (-1) its predicate is evaluated on the states, with the latches and orders that a rollout has, and in LIBERO's
+scenes by LIBERO's own shapes and rules (`libero_rules`).
 """
 
 from __future__ import annotations
 
 import json
 import tempfile
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
@@ -20,58 +19,75 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
+from lerobot_memobench.datasets.hdf5 import libero_rules
+from lerobot_memobench.datasets.hdf5.frames import OURS, place
+from lerobot_memobench.datasets.hdf5.libero_rules import LiberoRules
+from lerobot_memobench.datasets.hdf5.model_file import ModelFile, Pose
 from lerobot_memobench.datasets.hdf5.reading import SUFFIX, PublishedDemo, PublishedFile, Unusable, truth_from_intervals
-from lerobot_memobench.datasets.hdf5.writing import Pose
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.placement import GAP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
-from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, Task
 
 NO_SEED = -1
 """Seed of a demonstration that does not say it."""
 UNKNOWN = "tasks"
 """Folder of a task whose memory type nothing tells."""
-IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A demonstration in our scene.
+
+    Attributes:
+        states: (T, D) of our scene.
+        fixture_poses: where our fixtures stand.
+        scene: the scene that the states come from, where it is not ours: it answers ``in`` and ``on``.
+    """
+
+    states: NDArray[np.float64]
+    fixture_poses: dict[str, Pose]
+    scene: ModelFile | None = None
 
 
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     """Return the demonstration of a checked group, without images.
 
     Raises:
-        Unusable: what the group says contradicts itself or the task.
+        Unusable: what the group says contradicts itself or the task, or it is of a scene that cannot be placed in ours.
     """
     sim = _simulation(task)
-    if demo.states.shape[1] != sim.state_dim:
-        raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {task.name}")
+    placed = _placed(sim, task, demo)
     exec_start = execution_start(task, demo)
     _check_clock(demo.states, exec_start)
-    told = _told_truth(task, demo, exec_start)
-    poses = fixture_poses(sim, task, demo)
-    ours = "success" in demo.extras
-    proprio, objects, satisfied, success = _read_off(sim, task, demo.states, exec_start, poses, ours=ours)
+    frames = key_frames(task, demo, exec_start)
+    written = demo.extras.get("satisfied_intervals")
+    read_off = _read_off(sim, task, demo, placed, exec_start, asked=written is None and (not frames or min(frames) < 0))
     try:
         restored = Demonstration(
             task=task,
             seed=int(demo.extras.get("seed", NO_SEED)),
             referent=str(demo.extras.get("referent", "fixed")),
             variant=int(demo.extras.get("variant", 0)),
-            states=demo.states,
+            states=placed.states,
             actions=demo.actions,
-            proprio=proprio,
+            proprio=read_off.proprio,
             images=None,
             exec_start=exec_start,
-            satisfied=satisfied if told is None else told,
-            success=bool(demo.extras.get("success", success or (told is not None and told.shape[1] > 0))),
-            fixture_poses=poses,
-            model_xml=demo.model_file,
+            satisfied=(
+                truth_from_intervals(written, len(demo.states))
+                if written is not None
+                else _known_or_read_off(frames, read_off.satisfied)
+            ),
+            success=bool(demo.extras.get("success", read_off.success or (bool(frames) and min(frames) >= 0))),
+            fixture_poses=placed.fixture_poses,
+            model_xml=demo.model_file if placed.scene is None else "",
             scene_hash=str(demo.extras.get("scene_hash", "")),
-            objects=objects,
+            objects=read_off.objects,
         )
         found = digest(restored)
     except MemobenchError as error:
@@ -81,16 +97,37 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     return restored
 
 
-def _told_truth(task: Task, demo: PublishedDemo, exec_start: int) -> NDArray[np.bool_] | None:
-    """Return the (T, K) truth that the group tells; None where the states have to."""
-    frames = key_frames(task, demo, exec_start)
-    intervals = demo.extras.get("satisfied_intervals")
-    if intervals is not None:
-        return truth_from_intervals(intervals, len(demo.states))
-    if frames and min(frames) >= 0:
-        known: NDArray[np.bool_] = np.arange(len(demo.states))[:, None] >= np.array(frames)
-        return known
-    return None
+def _placed(sim: Simulation, task: Task, demo: PublishedDemo) -> Placed:
+    """Return states and fixtures in our scene; where this package wrote them, they are."""
+    if is_ours(demo) and "fixture_poses" in demo.extras:
+        if demo.states.shape[1] != sim.state_dim:
+            raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {task.name}")
+        return Placed(demo.states, {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()})
+    if not demo.model_file.strip():
+        raise Unusable(
+            "the attribute 'model_file' is missing, and nothing else says which joint a state's numbers are of"
+        )
+    scene = ModelFile(demo.model_file)
+    states, fixture_poses = place(task, sim, scene, demo.states)
+    return Placed(states, fixture_poses, None if scene.name == OURS else scene)
+
+
+def is_ours(demo: PublishedDemo) -> bool:
+    """Whether this package wrote a demonstration: of one its prompt is known, and truth and success are written."""
+    return "success" in demo.extras
+
+
+def other_scene(demo: PublishedDemo) -> str | None:
+    """Return how a demonstration's scene is not of this package, None where it is."""
+    if is_ours(demo) or not demo.model_file.strip() or ModelFile(demo.model_file).name == OURS:
+        return None
+    return "its scenes are LIBERO's: pictures and actions are as they were, states are put into this package's scenes"
+
+
+def _known_or_read_off(frames: list[int], satisfied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the (T, K) truth: from its key frame on where that is known, else as the states show it."""
+    known = np.arange(len(satisfied))[:, None] >= np.array(frames)
+    return np.where(np.array(frames, dtype=int) >= 0, known, satisfied)
 
 
 def execution_start(task: Task, demo: PublishedDemo) -> int:
@@ -136,91 +173,40 @@ def key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
     return frames
 
 
-def fixture_poses(sim: Simulation, task: Task, demo: PublishedDemo) -> dict[str, Pose]:
-    """Return where the fixtures stood: as this package wrote it, else by ``model_file``, else their regions' middle."""
-    names = list(sim.fixture_poses())
-    if "fixture_poses" in demo.extras:
-        return {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()}
-    found = read_fixture_poses(demo.model_file, names) if demo.model_file.strip() else {}
-    return {name: found[name] if name in found else _middle(sim, task, name) for name in names}
+@dataclass(frozen=True)
+class ReadOff:
+    """What states show: proprioception (T, 8), visible objects (T, SIZE), truth of the checkpoints (T, K), success."""
 
-
-def _middle(sim: Simulation, task: Task, name: str) -> Pose:
-    """The pose of a fixture in the middle of the table region that it starts in."""
-    places = {atom.args[0]: atom.args[1] for atom in task.init if len(atom.args) == 2}
-    region = task.regions.get(places.get(name, ""))
-    if region is None or not region.ranges:
-        return sim.fixture_poses()[name]
-    x1, y1, x2, y2 = region.ranges[0]
-    half = sum(region.yaw) / 4
-    height = TABLE_TOP - sim.assets[name].bottom + GAP
-    return np.array([(x1 + x2) / 2, (y1 + y2) / 2, height, np.cos(half), 0.0, 0.0, np.sin(half)])
-
-
-def read_fixture_poses(xml: str, names: Iterable[str]) -> dict[str, Pose]:
-    """Return where the named fixtures stand in an MJCF text; those it does not have are left out.
-
-    A fixture is the body of its name, or of its name with robosuite's suffix ``_main``.
-
-    Raises:
-        Unusable: the text is no XML, or a pose in it is no pose.
-    """
-    try:
-        root = ElementTree.fromstring(xml)
-    except ElementTree.ParseError as error:
-        raise Unusable(f"model_file is no XML ({error})") from None
-    bodies = {body.get("name"): body for body in root.iter("body")}
-    found: dict[str, Pose] = {}
-    for name in names:
-        body = bodies.get(name, bodies.get(f"{name}_main"))
-        if body is None:
-            continue
-        found[name] = np.concatenate([_numbers(body, "pos", (0.0, 0.0, 0.0)), _numbers(body, "quat", IDENTITY)])
-    return found
-
-
-def _numbers(body: ElementTree.Element, key: str, default: tuple[float, ...]) -> Pose:
-    text = body.get(key)
-    if text is None:
-        return np.array(default)
-    try:
-        values = np.array([float(word) for word in text.split()])
-    except ValueError:
-        values = np.array([])
-    if values.shape != (len(default),) or not np.isfinite(values).all():
-        raise Unusable(f"model_file gives the body {body.get('name')} {key}={text!r}, expected {len(default)} numbers")
-    return values
+    proprio: NDArray[np.float32]
+    objects: NDArray[np.float32]
+    satisfied: NDArray[np.bool_]
+    success: bool
 
 
 def _read_off(
-    sim: Simulation,
-    task: Task,
-    states: NDArray[np.float64],
-    exec_start: int,
-    poses: dict[str, Pose],
-    *,
-    ours: bool,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], bool]:
-    """Show the states to the simulator one after the other; return proprioception, visible objects, truth and success.
-
-    Of a demonstration of ``ours`` the prompt is known, and truth and success are written.
-    """
-    progress = Progress(task)
+    sim: Simulation, task: Task, demo: PublishedDemo, placed: Placed, exec_start: int, *, asked: bool
+) -> ReadOff:
+    """Show the states to the simulator one after the other; evaluate goals and checkpoints where they are ``asked``."""
+    hold_steps = HOLD_STEPS if placed.scene is None else libero_rules.HOLD_STEPS
+    evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)], hold_steps)
+    holds = sim.holds if placed.scene is None else LiberoRules(task, placed.scene, sim.holds).holds
     look = ObjectSlots(sim)
-    proprio, objects, satisfied = [], [], []
+    proprio, objects = [], []
+    satisfied = np.zeros((len(placed.states), len(task.checkpoints)), dtype=np.bool_)
     success = False
-    for frame, state in enumerate(states):
-        sim.set_state(state, poses)
+    for frame, state in enumerate(placed.states):
+        sim.set_state(state, placed.fixture_poses)
         proprio.append(sim.proprio())
-        sim.highlights = highlights_at(task, sim, frame) if ours and frame < exec_start else ()
+        sim.highlights = highlights_at(task, sim, frame) if is_ours(demo) and frame < exec_start else ()
         objects.append(look.observe())
         if frame == exec_start:
             sim.begin_execution()
-        if not ours and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
-            success = progress.step(sim.holds) or success
-        satisfied.append(progress.satisfied)
-    truth = np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints))
-    return np.array(proprio, dtype=np.float32), np.array(objects), truth, success
+        if asked and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
+            if placed.scene is not None:
+                placed.scene.show(demo.states[frame])
+            goal, *satisfied[frame] = evaluator.step(holds)
+            success = success or goal
+    return ReadOff(np.array(proprio, dtype=np.float32), np.array(objects), satisfied, success)
 
 
 def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
@@ -270,7 +256,7 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
         metadata["key_frame"] = [-1] * len(goals) if isinstance(goals, list) else []
         metadata["timestep_exec_start_idx"] = -1
     memory_type = _folder_name(file.attribute("memory_type") or _memory_type(name, file) or UNKNOWN, "memory_type")
-    task = _load(name, memory_type, file.bddl_text, json.dumps(metadata, sort_keys=True))
+    task = _load(name, memory_type, _bddl_text(file, name), json.dumps(metadata, sort_keys=True))
     if name in task_names(suite=None):
         known = get_task(name)
         if "family" not in metadata:
@@ -278,6 +264,18 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
         if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
             task = known
     return task.variant(int(demo.extras.get("variant", 0))) if ours is not None else task
+
+
+def _bddl_text(file: PublishedFile, name: str) -> str:
+    """Return the task's BDDL: the file's, or the catalogue's where the file has the name of an open file instead."""
+    if not file.lacks_its_text:
+        return file.bddl_text
+    if name not in task_names(suite=None):
+        raise Unusable(
+            f"bddl_file_content holds {file.bddl_text[:60]!r}, the name of a Python object instead of the task's text, "
+            f"and the catalogue has no task {name!r}; write the text into it"
+        )
+    return get_task(name).bddl_text
 
 
 def unlike_the_catalogue(task: Task) -> str | None:
