@@ -16,7 +16,7 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import rendering, robot
-from lerobot_memobench.sim.gl.rasterizer import HIGHLIGHTS, Highlight
+from lerobot_memobench.sim.raster.highlights import HIGHLIGHTS, Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
 from lerobot_memobench.sim.scene import scene_spec
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation

@@ -31,7 +31,7 @@ from lerobot_memobench.protocol import (
     PROMPT_HORIZON,
     SPLITS,
 )
-from lerobot_memobench.sim.gl.rasterizer import Image
+from lerobot_memobench.sim.raster.rasterizer import Image
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action

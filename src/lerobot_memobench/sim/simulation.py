@@ -17,9 +17,10 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING, make_controller
-from lerobot_memobench.sim.gl.rasterizer import Highlight, Image, Rasterizer
+from lerobot_memobench.sim.raster.highlights import Highlight
+from lerobot_memobench.sim.raster.rasterizer import Image
 from lerobot_memobench.sim.placement import Placer
-from lerobot_memobench.sim.rendering import RenderSettings, get_renderer
+from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS, get_scene
 from lerobot_memobench.sim.world import Start, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
@@ -293,16 +294,13 @@ class Simulation:
         for asset, geom in self._glow:
             lit = self.holds(Atom("turnon", (asset.name,)))
             self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
-        return self._renderer(camera).draw(self.model, self.data, MJCF_CAMERAS[camera], self.highlights)
+        renderer = get_renderer(self._scene.key, self._scene.model, self.render_settings)
+        return renderer.draw(self.model, self.data, _mjcf_camera(camera), self.highlights)
 
     def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
-        return self._renderer(camera).draw_geoms(self.model, self.data, MJCF_CAMERAS[camera])
-
-    def _renderer(self, camera: str) -> Rasterizer:
-        if camera not in MJCF_CAMERAS:
-            raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, MJCF_CAMERAS)}")
-        return get_renderer(self._scene.key, self._scene.model, self.render_settings)
+        rasterizer = get_rasterizer(self._scene.key, self._scene.model, self.render_settings)
+        return rasterizer.draw_geoms(self.model, self.data, _mjcf_camera(camera))
 
     def proprio(self) -> NDArray[np.float32]:
         """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""
@@ -349,6 +347,12 @@ class Simulation:
     def holds(self, atom: Atom) -> bool:
         """Return whether an atom of the task language is true now."""
         return (self._start if atom.predicate in SINCE_START else self.world).holds(atom)
+
+
+def _mjcf_camera(camera: str) -> str:
+    if camera not in MJCF_CAMERAS:
+        raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, MJCF_CAMERAS)}")
+    return MJCF_CAMERAS[camera]
 
 
 def axis_angle(quaternion: Array) -> Array:
