@@ -66,7 +66,10 @@ class DrawList:
 
 
 def build_draw_list(
-    model: mujoco.MjModel, shadowless: tuple[str, ...] = (), finer: mujoco.MjModel | None = None
+    model: mujoco.MjModel,
+    shadowless: tuple[str, ...] = (),
+    finer: mujoco.MjModel | None = None,
+    sharp: bool = False,
 ) -> DrawList:
     """Collect the visual geoms of a model.
 
@@ -74,6 +77,7 @@ def build_draw_list(
         model: a compiled scene.
         shadowless: bodies that cast no shadow.
         finer: a model whose meshes are drawn in place of the scene's of the same names.
+        sharp: whether edges of meshes are sharp, as MuJoCo's renderer draws them; those of ``finer`` always are.
 
     Raises:
         MemobenchError: for a visual geom of a shape that is not drawn here.
@@ -83,7 +87,7 @@ def build_draw_list(
     layers, layer_of = layers_of(model)
     geoms, materials, parts, indices, start = [], [], [], [], 0
     for geom in [*visual[~moves].tolist(), *visual[moves].tolist()]:
-        for layer, (positions, normals, uv, triangles) in _textured(model, geom, finer, layer_of):
+        for layer, (positions, normals, uv, triangles) in _textured(model, geom, finer, sharp, layer_of):
             part = np.zeros(len(positions), dtype=VERTEX)
             part["position"], part["normal"], part["uv"], part["row"] = positions, normals, uv, len(geoms)
             parts.append(part)
@@ -128,7 +132,11 @@ def _material(model: mujoco.MjModel, geom: int) -> tuple[float, float, float]:
 
 
 def _textured(
-    model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None, layer_of: dict[int, tuple[int, ...]]
+    model: mujoco.MjModel,
+    geom: int,
+    finer: mujoco.MjModel | None,
+    sharp: bool,
+    layer_of: dict[int, tuple[int, ...]],
 ) -> Iterator[tuple[int, Triangles]]:
     """Yield a geom's triangles with their texture coordinates, and the layer that they show."""
     material = int(model.geom_matid[geom])
@@ -138,7 +146,7 @@ def _textured(
     is_mesh = kind == mujoco.mjtGeom.mjGEOM_MESH.value
     # MuJoCo computes light at corners, and has several in a side of a box; only this light shows the difference.
     fine = kind == mujoco.mjtGeom.mjGEOM_BOX.value and (texture in layer_of or _has_spots(model))
-    shape = box_cells(model, geom) if fine else triangles_of(model, geom, finer)
+    shape = box_cells(model, geom) if fine else triangles_of(model, geom, finer, sharp)
     if texture not in layer_of or (is_mesh and model.mesh_texcoordadr[mesh] >= 0):
         yield layers[0], shape
     elif len(layers) == 1:

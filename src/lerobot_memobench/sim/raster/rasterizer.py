@@ -99,6 +99,7 @@ class Rasterizer:
             levels_of(draw_list.layers),
             LAYER_SIZE,
         )
+        self._rows = np.arange(rows, dtype=np.int32)
         self._clip = clip_space(len(vertices), len(self._table))
         self._work = scratch(len(vertices), len(triangles), width * height)
         self._target = Target(np.zeros((height, width), np.float32), np.zeros((height, width), np.int32))
@@ -129,8 +130,8 @@ class Rasterizer:
         fill_table(self._table, self._list, model, data, highlights)
         view = View(self, model, data, camera)
         still = self._bring_shadows_up_to_date(view)
-        rows = np.arange(len(self._list.geoms), dtype=np.int32)
-        opaque = self._table[rows, 3, 3] >= OPAQUE
+        rows = self._rows
+        opaque = self._table[: len(rows), 3, 3] >= OPAQUE
         moving = rows >= self._list.still
         if model.body_weldid[model.cam_bodyid[view.camera]] == 0:
             background = self._background(still, view, rows[opaque & ~moving])
@@ -152,7 +153,9 @@ class Rasterizer:
             self._clear()
             view.draw_triangles(rows[opaque])
         view.shade(PICTURE, image)
-        for row in [*self._far_to_near(view, rows[~opaque]), *(len(rows) + np.arange(len(highlights)))]:
+        translucent = self._near_to_far(view, rows[~opaque])
+        # MuJoCo's renderer draws them twice, in this order.
+        for row in [*translucent, *translucent[::-1], *(len(rows) + np.arange(len(highlights)))]:
             self._draw_over(view, int(row), image)
         return image
 
@@ -164,7 +167,7 @@ class Rasterizer:
         fill_table(self._table, self._list, model, data, ())
         view = View(self, model, data, camera)
         self._clear()
-        view.draw_triangles(np.arange(len(self._list.geoms), dtype=np.int32))
+        view.draw_triangles(self._rows)
         shown = self._target.triangle
         rows = self._surfaces.row[self._shapes.triangles[shown, 0]]
         # A row of a highlight is none of the list, and is not drawn here.
@@ -232,9 +235,9 @@ class Rasterizer:
 
     # --- what lets others through ---------------------------------------------------------------------------
 
-    def _far_to_near(self, view: View, rows: NDArray[np.int32]) -> NDArray[np.int32]:
+    def _near_to_far(self, view: View, rows: NDArray[np.int32]) -> NDArray[np.int32]:
         distance = np.linalg.norm(self._table[rows, :3, 3] - view.eye, axis=1)
-        return rows[np.argsort(-distance, kind="stable")]
+        return rows[np.argsort(distance, kind="stable")]
 
     def _draw_over(self, view: View, row: int, image: Image) -> None:
         """Draw a translucent row over a picture: it hides nothing of what is drawn after it."""

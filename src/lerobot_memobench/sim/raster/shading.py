@@ -430,10 +430,11 @@ def _colour(
     """Compute the colours of a batch into its first three rows; in the mode `BACKGROUND` without the shadow."""
     _divide(t, textured, shadows)
     if textured:
-        _begin_sampling(side, t, i)
+        mixed = _begin_sampling(side, t, i)
         _sample(texels, side, t, i)
-        _next_level(side, t, i)
-        _sample(texels, side, t, i)
+        if mixed:
+            _next_level(t, i)
+            _sample(texels, side, t, i)
     else:
         for x in range(_PAINT * STRIDE, (_PAINT + 3) * STRIDE):
             t[x] = _255
@@ -519,21 +520,24 @@ def _join(t: Any) -> None:
 
 
 @compiled
-def _begin_sampling(side: Any, t: Any, i: Any) -> None:
-    """Go to the lower of two levels, with nothing read of any."""
+def _begin_sampling(side: Any, t: Any, i: Any) -> Any:
+    """Go to the lower of two levels, with nothing read of any; return whether the upper one takes any share."""
     coarsest = np.float32(_log2(float(side))) - np.float32(0.001)
+    most = _0
     for x in range(BATCH):
         level = min(max(t[_LEVEL * STRIDE + x], _0), coarsest)
+        most = max(most, level)
         below = np.int32(level)
         i[_BELOW * STRIDE + x] = below
         t[_LEVEL * STRIDE + x] = level - np.float32(below)
         t[_SHARE * STRIDE + x] = _1
     for x in range(_PAINT * STRIDE, (_PAINT + 3) * STRIDE):
         t[x] = _0
+    return most > _0
 
 
 @compiled
-def _next_level(side: Any, t: Any, i: Any) -> None:
+def _next_level(t: Any, i: Any) -> None:
     """Go to the upper of two levels, which takes its share."""
     for x in range(BATCH):
         i[_BELOW * STRIDE + x] += np.int32(1)

@@ -21,13 +21,16 @@ Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floatin
 """Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
 
 
-def triangles_of(model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None = None) -> Triangles:
+def triangles_of(
+    model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None = None, sharp: bool = False
+) -> Triangles:
     """Return a geom's triangles in its own frame.
 
     Args:
         model: a compiled scene.
         geom: its id.
-        finer: a model whose mesh of the same name is taken, where it has one.
+        finer: a model whose mesh of the same name is taken, where it has one; its edges are sharp.
+        sharp: whether edges of other meshes are.
 
     Raises:
         MemobenchError: for a shape that is not drawn here.
@@ -36,7 +39,7 @@ def triangles_of(model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None 
     size = np.asarray(model.geom_size[geom])
     match kind:
         case mujoco.mjtGeom.mjGEOM_MESH:
-            return _named_mesh(model, int(model.geom_dataid[geom]), finer or model)
+            return _named_mesh(model, int(model.geom_dataid[geom]), finer or model, sharp)
         case mujoco.mjtGeom.mjGEOM_BOX:
             return _box(size)
         case mujoco.mjtGeom.mjGEOM_PLANE:
@@ -55,14 +58,14 @@ def triangles_of(model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None 
     )
 
 
-def _named_mesh(model: mujoco.MjModel, mesh: int, source: mujoco.MjModel) -> Triangles:
+def _named_mesh(model: mujoco.MjModel, mesh: int, source: mujoco.MjModel, sharp: bool) -> Triangles:
     """Return another model's mesh of the same name in the frame of this model's mesh, which is also its geom's.
 
     The compiler moves every mesh into its own centre and principal axes, and a mesh of more faces has others.
     """
     other = mujoco.mj_name2id(source, mujoco.mjtObj.mjOBJ_MESH, model.mesh(mesh).name)
     if source is model or other < 0:
-        return _mesh(model, mesh)
+        return _mesh(model, mesh, LEAST_AGREEMENT if sharp else -np.inf)
     here, there = _mesh_axes(model, mesh), _mesh_axes(source, other)
     points, normals, uv, triangles = _mesh(source, other, LEAST_AGREEMENT)
     in_file = points @ there.T + source.mesh_pos[other]

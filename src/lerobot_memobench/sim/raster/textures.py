@@ -33,8 +33,7 @@ def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple
         height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
         start = int(model.tex_adr[texture])
         pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
-        flat = model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D
-        for picture in [pixels] if flat else np.split(pixels, SIDES):
+        for picture in _pictures(model, texture, pixels):
             content = picture.tobytes()
             if content not in known:
                 known[content] = len(layers)
@@ -43,6 +42,13 @@ def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple
                 layers.append(np.asarray(resized))
             layer_of[texture] = (*layer_of.get(texture, ()), known[content])
     return np.stack(layers), layer_of
+
+
+def _pictures(model: mujoco.MjModel, texture: int, pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    """Return the picture of a flat texture, or the six of a cube, which may all be the one that there is."""
+    if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D:
+        return [pixels]
+    return [pixels] * SIDES if len(pixels) == pixels.shape[1] else np.split(pixels, SIDES)
 
 
 def levels_of(layers: NDArray[np.uint8]) -> NDArray[np.int32]:
