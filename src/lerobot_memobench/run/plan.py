@@ -219,7 +219,7 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     check_split(plan)
     check_scenes(plan)
     if options.executor not in ELSEWHERE:  # there, each part finds out
-        _check_simulator(plan.draws)
+        _check_simulator(environment)
     return plan
 
 
@@ -261,13 +261,14 @@ def check_scenes(plan: EvaluationPlan) -> None:
         )
 
 
-def _check_simulator(draws: bool) -> None:
+def _check_simulator(environment: MemobenchEnvConfig) -> None:
     """Refuse a machine on which every episode would fail: no arm, or nothing to draw with."""
-    from lerobot_memobench.sim.rendering import gl_backend
+    from lerobot_memobench.sim.gl.context import gl_backend
+    from lerobot_memobench.sim.rendering import RenderSettings
     from lerobot_memobench.sim.robot import robosuite_version
 
     robosuite_version()
-    if draws:
+    if environment.draws and RenderSettings(quality=environment.render).needs_gl:
         gl_backend()
 
 

@@ -96,6 +96,14 @@ def enter_context() -> None:
         _thread.context.make_current()
 
 
+def renderer_name() -> str:
+    """Return what the driver calls the device that draws in this thread (``llvmpipe …``); opens the GL context."""
+    enter_context()
+    from OpenGL import GL
+
+    return str(GL.glGetString(GL.GL_RENDERER).decode())
+
+
 def context_is_open() -> bool:
     """Return whether this thread has a context that this process opened."""
     return _thread.context is not None and _drawing_process == os.getpid()

@@ -60,15 +60,15 @@ def levels_of(layers: NDArray[np.uint8]) -> NDArray[np.int32]:
     Returns:
         The pixels, red + 256 green + 65536 blue.
     """
-    parts, level = [], layers.astype(np.int32)
+    parts, level = [], layers.astype(np.uint16)
     while True:
-        side = level.shape[1]
-        packed = level[..., 0] | (level[..., 1] << 8) | (level[..., 2] << 16)
-        parts.append(packed.reshape(len(layers), -1))
-        if side == 1:
-            return np.concatenate(parts, axis=1).astype(np.int32).ravel()
-        squares = level.reshape(len(level), side // 2, 2, side // 2, 2, 3).sum(axis=(2, 4))
-        level = (squares + 2) // 4
+        packed = np.zeros((*level.shape[:3], 4), np.uint8)
+        packed[..., :3] = level
+        parts.append(packed.view("<i4").reshape(len(layers), -1))
+        if level.shape[1] == 1:
+            return np.concatenate(parts, axis=1).astype(np.int32, copy=False).ravel()
+        rows = level[:, ::2] + level[:, 1::2]
+        level = (rows[:, :, ::2] + rows[:, :, 1::2] + 2) // 4
 
 
 def _full_size(model: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
