@@ -316,7 +316,7 @@ def test_sizes_below_one() -> None:
 def test_no_gl_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    with pytest.raises(MemobenchError, match=r"no GL library for render=high.*make setup") as caught:
+    with pytest.raises(MemobenchError, match=r"no GL library for env.render=high.*make setup") as caught:
         gl_backend()
     assert "\n" not in str(caught.value)
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
@@ -342,7 +342,7 @@ def test_backends_that_cannot_be(monkeypatch: pytest.MonkeyPatch, value: str, wo
 @pytest.mark.parametrize("system", ["win32", "darwin"])
 def test_high_on_a_system_without_the_backends(monkeypatch: pytest.MonkeyPatch, system: str) -> None:
     monkeypatch.setattr(sys, "platform", system)
-    with pytest.raises(MemobenchError, match=f"found {system}; use render=default"):
+    with pytest.raises(MemobenchError, match=f"found {system}; use env.render=default"):
         gl_backend()
 
 

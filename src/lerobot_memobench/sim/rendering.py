@@ -93,13 +93,14 @@ def get_renderer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> R
     full = (key, settings)
     if full not in renderers:
         while len(renderers) >= CACHED_RENDERERS:
-            _drop(renderers.popitem(last=False)[1])
+            free_renderer(renderers.popitem(last=False)[1])
         renderers[full] = make_renderer(model, settings)
     renderers.move_to_end(full)
     return renderers[full]
 
 
-def _drop(renderer: Renderer) -> None:
+def free_renderer(renderer: Renderer) -> None:
+    """Give back what a renderer holds of a GL driver's."""
     if isinstance(renderer, MultisampleRasterizer):
         renderer.free()
 
@@ -129,5 +130,5 @@ def close_renderers() -> None:
     A thread that has drawn with `high` calls this before it ends; for the main thread it happens at exit.
     """
     while _thread.renderers:
-        _drop(_thread.renderers.popitem()[1])
+        free_renderer(_thread.renderers.popitem()[1])
     close_context()

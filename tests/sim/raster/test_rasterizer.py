@@ -104,7 +104,9 @@ def textured_scene() -> mujoco.MjModel:
         (shapes.mjGEOM_SPHERE, [0.25, 0, 0], [0.8, 0.5, 0.4], "shiny"),
     ):
         world.add_geom(type=kind, size=size, pos=place, material=material, group=1, quat=[0.95, 0.1, 0.05, 0.3])
-    world.add_geom(type=shapes.mjGEOM_BOX, size=[0.3, 0.05, 0.3], pos=[-0.3, -0.9, 0.4], rgba=[0.2, 0.6, 1, 0.4], group=1)
+    world.add_geom(
+        type=shapes.mjGEOM_BOX, size=[0.3, 0.05, 0.3], pos=[-0.3, -0.9, 0.4], rgba=[0.2, 0.6, 1, 0.4], group=1
+    )
     world.add_camera(name="above", pos=[0, -2.2, 2.0], xyaxes=[1, 0, 0, 0, 0.7, 0.75], fovy=50)
     world.add_camera(name="inside", pos=[1.5, -1.2, 0.5], xyaxes=[0.6, 0.8, 0, -0.2, 0.15, 1], fovy=70)
     return spec.compile()

@@ -25,7 +25,9 @@ def gl_backend() -> str:
         MemobenchError: when no usable library is there, as on any system but Linux.
     """
     if sys.platform != "linux":
-        raise MemobenchError(f"render=high needs EGL or OSMesa on Linux, found {sys.platform}; use render=default")
+        raise MemobenchError(
+            f"env.render=high needs EGL or OSMesa on Linux, found {sys.platform}; use env.render=default"
+        )
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if wanted == "glfw":
         if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -41,8 +43,8 @@ def gl_backend() -> str:
             return name
     missing = BACKENDS[wanted] if wanted else "EGL and OSMesa"
     raise MemobenchError(
-        f"no GL library for render=high ({missing} not found): use render=default, run `make setup` as root, or install "
-        "the Debian packages libegl1, libgl1-mesa-dri and libosmesa6"
+        f"no GL library for env.render=high ({missing} not found): use env.render=default, run `make setup` as root, "
+        "or install the Debian packages libegl1, libgl1-mesa-dri and libosmesa6"
     )
 
 
@@ -57,8 +59,8 @@ def _gl_context() -> Any:
     except Exception as error:  # each backend fails in its own way: missing driver, no device, no display
         other = "osmesa" if backend == "egl" else "egl"
         raise MemobenchError(
-            f"the GL backend {backend!r} could not open a context ({error}); try render=default, which needs none, or "
-            f"MUJOCO_GL={other}, and see `memobench doctor`"
+            f"the GL backend {backend!r} could not open a context ({error}); try env.render=default, which needs none, "
+            f"or MUJOCO_GL={other}, and see `memobench doctor`"
         ) from error
 
 
@@ -84,7 +86,7 @@ def enter_context() -> None:
         # A fork copies neither the driver's threads nor its locks: the first frame would never come.
         raise MemobenchError(
             "this process was forked from one that had already rendered with GL, which drivers do not survive; start "
-            "workers with the spawn or forkserver method, or use render=default"
+            "workers with the spawn or forkserver method, or use env.render=default"
         )
     _drawing_process = os.getpid()
     if _thread.context is None:

@@ -212,9 +212,7 @@ class MultisampleRasterizer:
         GL.glDisable(GL.GL_BLEND)
 
     def _draw_elements(self, first: int, count: int) -> None:
-        self._gl.glDrawElements(
-            self._gl.GL_TRIANGLES, count, self._gl.GL_UNSIGNED_INT, ctypes.c_void_p(4 * first)
-        )
+        self._gl.glDrawElements(self._gl.GL_TRIANGLES, count, self._gl.GL_UNSIGNED_INT, ctypes.c_void_p(4 * first))
 
     def _read(self) -> Image:
         """Make one sample of a pixel's several, and return them."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 
+
 class Resources:
     """Buffers, textures and framebuffers of the context that is current when they are made.
 
@@ -94,7 +95,7 @@ class Resources:
         if status != GL.GL_FRAMEBUFFER_COMPLETE:
             raise MemobenchError(
                 f"the GL driver cannot draw {self.width}×{self.height} frames (framebuffer status {status}); try "
-                "render=default or another MUJOCO_GL, and see `memobench doctor`"
+                "env.render=default or another MUJOCO_GL, and see `memobench doctor`"
             )
 
     def free(self) -> None:

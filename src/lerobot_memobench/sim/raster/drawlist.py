@@ -85,7 +85,8 @@ def build_draw_list(
     visual = np.flatnonzero(model.geom_group == VISUAL_GROUP)
     moves = model.body_weldid[model.geom_bodyid[visual]] != 0
     layers, layer_of = layers_of(model)
-    geoms, materials, parts, indices, start = [], [], [], [], 0
+    geoms: list[int] = []
+    materials, parts, indices, start = [], [], [], 0
     for geom in [*visual[~moves].tolist(), *visual[moves].tolist()]:
         for layer, (positions, normals, uv, triangles) in _textured(model, geom, finer, sharp, layer_of):
             part = np.zeros(len(positions), dtype=VERTEX)

@@ -17,7 +17,6 @@ TILE = 16
 """Side of a tile of the shadow map, texels: what a moving caster touches is noted by tile."""
 
 
-
 class Shapes(NamedTuple):
     """The triangles of a scene by rows of the table; they are the same in every frame.
 
@@ -51,8 +50,8 @@ class Target(NamedTuple):
 
 def clip_space(vertices: int, rows: int) -> Clip:
     """Return memory for the vertices of a scene."""
-    empty = (np.zeros(vertices, np.float32) for _ in range(3))
-    return Clip(*empty, np.zeros(rows, np.bool_))
+    x, y, w = (np.zeros(vertices, np.float32) for _ in range(3))
+    return Clip(x, y, w, np.zeros(rows, np.bool_))
 
 
 @compiled
@@ -169,11 +168,11 @@ def draw_triangles(
                 low, high = min(u0, u1, u2) - 0.5, max(u0, u1, u2) - 0.5
                 if high < 0.0 or low > right:
                     continue
-                left, right = int(math.ceil(max(low, 0.0))), int(min(high, float(right)))
+                left, right = math.ceil(max(low, 0.0)), int(min(high, float(right)))
                 low, high = min(v0, v1, v2) - 0.5, max(v0, v1, v2) - 0.5
                 if high < 0.0 or low > bottom:
                     continue
-                top, bottom = int(math.ceil(max(low, 0.0))), int(min(high, float(bottom)))
+                top, bottom = math.ceil(max(low, 0.0)), int(min(high, float(bottom)))
                 if left > right or top > bottom:
                     continue
             a1, b1, c1 = y0 * w2 - y2 * w0, x2 * w0 - x0 * w2, x0 * y2 - x2 * y0
@@ -241,11 +240,11 @@ def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shad
             low, high = min(x0, x1, x2) - 0.5, max(x0, x1, x2) - 0.5
             if high < 0.0 or low > size - 1:
                 continue
-            left, right = int(math.ceil(max(low, 0.0))), int(min(high, size - 1.0))
+            left, right = math.ceil(max(low, 0.0)), int(min(high, size - 1.0))
             low, high = min(y0, y1, y2) - 0.5, max(y0, y1, y2) - 0.5
             if high < 0.0 or low > size - 1:
                 continue
-            top, bottom = int(math.ceil(max(low, 0.0))), int(min(high, size - 1.0))
+            top, bottom = math.ceil(max(low, 0.0)), int(min(high, size - 1.0))
             if left > right or top > bottom:
                 continue
             # A look-up takes a texel and those after it.

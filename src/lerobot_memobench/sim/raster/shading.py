@@ -24,7 +24,7 @@ CHUNK = 16
 unsigned there: numba looks whether others are negative, which no vector instruction does."""
 STRIDE = BATCH + CHUNK
 ATTRIBUTES = 11
-"""Of a vertex: steady light (3), light that a shadow may take (3), texture coordinates (2), place in the shadow map (3)."""
+"""Of a vertex: steady light (3), light that a shadow may take (3), texture coordinates (2), shadow map (3)."""
 KEPT = 9
 """Of a pixel of the background: steady colour (3), colour that a shadow may take (3), place in the shadow map (3)."""
 PICTURE, BACKGROUND, TRANSLUCENT = 0, 1, 2
@@ -32,8 +32,8 @@ PICTURE, BACKGROUND, TRANSLUCENT = 0, 1, 2
 
 # Rows of a batch: the attributes, and behind them
 _INVERSE, _LIT, _LEVEL, _SHARE, _PAINT, _ACROSS, _DOWN, _DEPTHS, _FLOAT_ROWS = 11, 12, 13, 14, 15, 18, 19, 20, 24
-# Rows of its integers: pixel, where its texture begins, level of it, where that begins, its side, four texels' addresses,
-# the texels.
+# Rows of its integers: pixel, where its texture begins, level of it, where that begins, its side, addresses of four
+# texels, the texels.
 _WHERE, _LAYER, _BELOW, _OFFSET, _SIDE, _ADDRESS, _TEXEL, _INTEGER_ROWS = 0, 1, 2, 3, 4, 5, 9, 13
 
 _0, _1, _HALF, _255 = np.float32(0), np.float32(1), np.float32(0.5), np.float32(255)
@@ -57,7 +57,7 @@ class Surfaces(NamedTuple):
 class Lights(NamedTuple):
     """The lights of a frame, the headlight first.
 
-    ``to``: (L, 3), the direction to a light of parallel rays, the place of another; ``placed``: (L,), whether it is one;
+    ``to``: (L, 3), direction to a light of parallel rays, place of another; ``placed``: (L,), whether it is the latter;
     ``axis``: (L, 3), where it shines; ``cone``: (L, 2), cosine of its cutoff and exponent; ``attenuation``: (L, 3);
     ``ambient``, ``diffuse``, ``specular``: (L, 3). ``caster``: which one casts shadows, −1 for none. ``clamped``:
     whether light is cut off at 1 before the texture takes its part.
@@ -424,9 +424,7 @@ def _rest(count: Any, side: Any, t: Any, i: Any) -> None:
 
 
 @compiled
-def _colour(
-    textured: Any, shadows: Any, texels: Any, side: Any, shadow_map: Any, mode: Any, t: Any, i: Any
-) -> None:
+def _colour(textured: Any, shadows: Any, texels: Any, side: Any, shadow_map: Any, mode: Any, t: Any, i: Any) -> None:
     """Compute the colours of a batch into its first three rows; in the mode `BACKGROUND` without the shadow."""
     _divide(t, textured, shadows)
     if textured:

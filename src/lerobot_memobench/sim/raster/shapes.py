@@ -144,7 +144,7 @@ def _box(size: NDArray[np.floating]) -> Triangles:
 
 def box_cells(model: mujoco.MjModel, geom: int) -> Triangles:
     """Return a box whose sides have as many cells as MuJoCo gives them: light is computed at corners."""
-    points, normals, uv, _ = _box(np.asarray(model.geom_size[geom]))
+    points, normals, *_ = _box(np.asarray(model.geom_size[geom]))
     sides = [_cells(points[k : k + 4], normals[k], model.vis.quality.numquads) for k in range(0, len(points), 4)]
     return _joined(sides)
 

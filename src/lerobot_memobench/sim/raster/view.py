@@ -6,11 +6,9 @@ import math
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_memobench.sim.raster.drawlist import Floats
 from lerobot_memobench.sim.raster.shading import Lights
-
 
 _PARALLEL = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
 _SPOT = mujoco.mjtLightType.mjLIGHT_SPOT.value
@@ -53,7 +51,7 @@ class Lamps:
             to=np.zeros((count, 3), np.float32),
             placed=np.concatenate([[False], model.light_type[ids] != _PARALLEL]),
             axis=np.zeros((count, 3), np.float32),
-            cone=np.tile(np.float32([-1.0, 0.0]), (count, 1)),
+            cone=np.tile(np.array([-1.0, 0.0], np.float32), (count, 1)),
             attenuation=np.vstack([[1.0, 0.0, 0.0], model.light_attenuation[ids]]).astype(np.float32),
             ambient=np.vstack([on * head.ambient, model.light_ambient[ids]]).astype(np.float32),
             diffuse=np.vstack([on * head.diffuse, model.light_diffuse[ids]]).astype(np.float32),
