@@ -46,7 +46,8 @@ def log_handlers_end_with_the_test() -> Iterator[None]:
 def gl() -> Iterator[str]:
     """Skip without a GL library; free what was opened afterwards."""
     from lerobot_memobench.errors import MemobenchError
-    from lerobot_memobench.sim.rendering import close_renderers, gl_backend
+    from lerobot_memobench.sim.gl.context import gl_backend
+    from lerobot_memobench.sim.rendering import close_renderers
 
     try:
         backend = gl_backend()

@@ -18,7 +18,7 @@ from lerobot_memobench.io import draft_of, read_json, write_file
 from lerobot_memobench.jobs.executors import run_jobs
 from lerobot_memobench.jobs.processes import Advance
 from lerobot_memobench.protocol import SPLITS
-from lerobot_memobench.sim.gl.rasterizer import Highlight
+from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 from research.detector.labels import PICTURE, Labeller, Rows, kinds

@@ -20,10 +20,10 @@ from lerobot_memobench.experts.demonstration_prompt import highlight_of
 from lerobot_memobench.experts.hand import downward
 from lerobot_memobench.sim.assets.asset import Asset, Grasp
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
-from lerobot_memobench.sim.gl.rasterizer import Highlight
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.placement import GAP, PENETRATION
+from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names

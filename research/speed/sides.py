@@ -30,7 +30,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
 from lerobot_memobench.sim.controller import MASS_BY_DATA
-from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
+from lerobot_memobench.sim.gl.context import gl_backend, renderer_name
+from lerobot_memobench.sim.rendering import RenderSettings, close_renderers
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
@@ -56,14 +57,9 @@ def _processor() -> str:
 
 
 def _gl_device() -> str:
-    sim = Simulation(get_task(TASK))
-    sim.reset(0)
-    sim.render()  # opens a context and chooses PyOpenGL's platform, which its import fixes
-    from OpenGL import GL
-
-    device = GL.glGetString(GL.GL_RENDERER).decode()
+    device = renderer_name()
     close_renderers()
-    return f"{gl_backend()} on {device}"
+    return f"stock drawn by {gl_backend()} on {device}"
 
 
 # --- the sides ---

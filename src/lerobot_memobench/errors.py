@@ -24,19 +24,11 @@ def chain(error: BaseException) -> Iterator[BaseException]:
         current = current.__cause__ or (None if current.__suppress_context__ else current.__context__)
 
 
-SYSTEMS = {"darwin": "macOS", "win32": "Windows", "cygwin": "Windows"}
-
-
 def unsupported_system() -> str:
-    """Return one sentence where the simulator cannot run, "" on Linux."""
-    if sys.platform == "linux":
+    """Return one sentence where nothing can be simulated, "" elsewhere."""
+    if sys.platform not in ("win32", "cygwin"):
         return ""
-    name = SYSTEMS.get(sys.platform, sys.platform)
-    place = "WSL2" if name == "Windows" else "a Linux machine, virtual machine or container"
-    return (
-        f"{name} cannot run the simulator, which draws with EGL or OSMesa on Linux: use {place}; "
-        "docs/start/install.md says what works without"
-    )
+    return "Windows locks no folders, as every run does: use WSL2; docs/start/install.md says what works without"
 
 
 def check_choice(name: str, value: object, known: Sequence[str]) -> None:

@@ -87,8 +87,8 @@ def test_without_pictures_nothing_to_draw_with_is_needed(fake_lerobot: Any, monk
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert lerobot([*COMMAND, "output_dir=pictures"]) == 2
-    assert lerobot([*COMMAND, "output_dir=out", "obs_type=environment_state_agent_pos"]) == 0
+    assert lerobot([*COMMAND, "output_dir=pictures", "env.render=high"]) == 2
+    assert lerobot([*COMMAND, "output_dir=out", "env.render=high", "obs_type=environment_state_agent_pos"]) == 0
     assert memobench(["rerun", "out", "--out", "again"]) == 0
 
 

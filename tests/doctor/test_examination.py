@@ -23,7 +23,7 @@ from lerobot_memobench.doctor import examination
 from lerobot_memobench.doctor.examination import Finding, exit_status
 from lerobot_memobench.doctor.probe import SIDE, TOLERANCE, difference, read_golden, render_golden, run_probe, shrink
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
-from lerobot_memobench.sim.rendering import BACKENDS
+from lerobot_memobench.sim.gl.context import BACKENDS
 
 
 def test_supported_versions_come_from_the_requirements() -> None:
@@ -130,21 +130,22 @@ SOFTWARE = {"renderer": "llvmpipe (LLVM 15)", "version": "4.5", "vendor": "Mesa"
 BROKEN = {"error": "the process was killed by SIGSEGV"}
 
 
-def test_the_backend_in_use_must_work_the_other_need_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_backend_that_does_not_work_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "egl")
     probes(monkeypatch, {"gl egl": SOFTWARE, "gl osmesa": BROKEN})
     assert [finding.status for finding in examination.rendering()] == ["ok", "ok", "warning"]
     probes(monkeypatch, {"gl egl": BROKEN, "gl osmesa": SOFTWARE})
     findings = list(examination.rendering())
-    assert [finding.status for finding in findings] == ["ok", "failed", "ok"]
+    assert [finding.status for finding in findings] == ["ok", "warning", "ok"]
     assert "SIGSEGV" in findings[1].detail
     assert "MUJOCO_GL=osmesa" in findings[1].fix
+    assert "only for env.render=high" in findings[1].fix
 
 
-def test_a_backend_that_draws_nonsense_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_backend_that_draws_nonsense_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "egl")
     probes(monkeypatch, {"gl egl": {**SOFTWARE, "sphere": False}, "gl osmesa": SOFTWARE})
-    assert [finding.status for finding in examination.rendering()] == ["ok", "failed", "ok"]
+    assert [finding.status for finding in examination.rendering()] == ["ok", "warning", "ok"]
 
 
 @pytest.mark.parametrize("used", ["egl", "osmesa"])
@@ -163,28 +164,18 @@ def test_a_setting_is_not_mended_by_packages(monkeypatch: pytest.MonkeyPatch, wa
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     probes(monkeypatch, {"gl egl": SOFTWARE, "gl osmesa": SOFTWARE})
     findings = list(examination.rendering())
-    assert [finding.status for finding in findings] == ["failed", "ok", "ok"]
+    assert [finding.status for finding in findings] == ["warning", "ok", "ok"]
     assert "apt-get" not in findings[0].fix
     assert "MUJOCO_GL" in findings[0].fix
 
 
-def test_a_platform_that_fits_no_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    probes(monkeypatch, {"golden": {"error": "the PYOPENGL_PLATFORM environment variable is set to 'glx'"}})
-    assert examination.golden_frame().fix == "unset PYOPENGL_PLATFORM"
-
-
-@pytest.mark.parametrize(
-    ("name", "called", "instead"), [("darwin", "macOS", "container"), ("win32", "Windows", "WSL2")]
-)
-def test_a_system_without_the_simulator_is_told(
-    monkeypatch: pytest.MonkeyPatch, name: str, called: str, instead: str
-) -> None:
+@pytest.mark.parametrize(("name", "status", "words"), [("darwin", "warning", ""), ("win32", "failed", "use WSL2")])
+def test_another_system_is_named(monkeypatch: pytest.MonkeyPatch, name: str, status: str, words: str) -> None:
     assert examination.system().status in ("ok", "warning")  # the tests' own
     monkeypatch.setattr(sys, "platform", name)
     finding = examination.system()
-    assert finding.status == "failed"
-    assert called in finding.fix
-    assert instead in finding.fix
+    assert finding.status == status
+    assert words in finding.fix
     assert list(examination.rendering()) == []  # no advice to install Debian's packages
 
 
@@ -198,7 +189,8 @@ def test_no_gl_library_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     probes(monkeypatch, {"gl egl": BROKEN, "gl osmesa": BROKEN})
     findings = list(examination.rendering())
-    assert findings[0].status == "failed"
+    assert findings[0].status == "warning"
+    assert exit_status(findings) == 0
     assert "libegl1" in findings[0].fix
 
 

@@ -13,9 +13,7 @@ from lerobot.scripts.lerobot_train import train
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.sim.rendering import gl_backend
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 HORIZON = 12
@@ -37,10 +35,6 @@ HORIZON = 12
 def test_a_trained_checkpoint_evaluates(
     fields: dict[str, Any], settings: list[str], dataset_root: Path, tmp_path: Path
 ) -> None:
-    try:
-        gl_backend()
-    except MemobenchError as error:
-        pytest.skip(str(error))
     train(
         TrainPipelineConfig(
             dataset=DatasetConfig(repo_id="memobench/synthetic", root=str(dataset_root)),

@@ -137,12 +137,13 @@ def test_a_checkpoint_is_shown_what_it_was_trained_on(seen: tuple[str, ...], sho
         plan_line([*line, f"obs_type={other}"])
 
 
-def test_objects_alone_need_nothing_to_draw_with(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unless films are asked for."""
+def test_only_high_needs_a_gl_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not where nothing is drawn: objects alone, without videos."""
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    plan = plan_line([*LINE, f"obs_type={OBJECTS}"])
+    assert plan_line([*LINE, "videos=1"]).draws
+    plan = plan_line([*LINE, f"obs_type={OBJECTS}", "env.render=high"])
     assert flag_value(plan.lerobot_flags, "env.videos") == "0"
     assert card_of(plan)["runs"][0]["gl"] == {}
     for words in (
@@ -152,7 +153,7 @@ def test_objects_alone_need_nothing_to_draw_with(monkeypatch: pytest.MonkeyPatch
         [f"obs_type={OBJECTS}", "env.videos=-1"],
     ):
         with pytest.raises(MemobenchError, match="MUJOCO_GL"):
-            plan_line([*LINE, *words])
+            plan_line([*LINE, "env.render=high", *words])
 
 
 def test_going_on_keeps_the_earlier_batch_size() -> None:
@@ -238,9 +239,10 @@ def test_a_login_node_needs_no_gl_library(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     slurm = ["executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
-    assert plan_line([*LINE, "output_dir=out", "shards=2", *slurm]).draws
+    line = [*LINE, "output_dir=out", "shards=2", "env.render=high"]
+    assert plan_line([*line, *slurm]).draws
     with pytest.raises(MemobenchError, match="libegl1"):
-        plan_line([*LINE, "output_dir=out", "shards=2"])
+        plan_line(line)
 
 
 def test_without_the_arm_nothing_begins(monkeypatch: pytest.MonkeyPatch) -> None:

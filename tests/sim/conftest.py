@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Callable
 
 import mujoco
@@ -38,3 +40,12 @@ def simulate() -> Callable[..., Simulation]:
         return sim
 
     return make
+
+
+@pytest.fixture
+def mujoco_renderer(gl: str, monkeypatch: pytest.MonkeyPatch) -> type[mujoco.Renderer]:
+    """MuJoCo's own renderer on the backend in use; by itself it takes the one of MUJOCO_GL at MuJoCo's import."""
+    backend = importlib.import_module(f"mujoco.{gl}")
+    contexts = sys.modules[mujoco.Renderer.__module__].gl_context
+    monkeypatch.setattr(contexts, "GLContext", backend.GLContext)
+    return mujoco.Renderer

@@ -14,9 +14,9 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import object_slots, simulation
-from lerobot_memobench.sim.gl.rasterizer import Highlight
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import POINTS, QUANTUM, ObjectSlots, classes, layout
+from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import ctypes.util
-import importlib
+import hashlib
 import os
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -16,8 +17,10 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import rendering, robot
-from lerobot_memobench.sim.gl.rasterizer import HIGHLIGHTS, Highlight
-from lerobot_memobench.sim.rendering import RenderSettings, close_renderers, gl_backend
+from lerobot_memobench.sim.gl import context
+from lerobot_memobench.sim.gl.context import BACKENDS, gl_backend
+from lerobot_memobench.sim.raster.highlights import HIGHLIGHTS, Highlight
+from lerobot_memobench.sim.rendering import RenderSettings, close_renderers
 from lerobot_memobench.sim.scene import scene_spec
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -37,67 +40,8 @@ def turn_knob(sim: Simulation, q: float) -> None:
     mujoco.mj_step1(sim.model, sim.data)
 
 
-@pytest.fixture
-def mujoco_renderer(gl: str, monkeypatch: pytest.MonkeyPatch) -> type[mujoco.Renderer]:
-    """MuJoCo's own renderer on the backend in use; by itself it takes the one of MUJOCO_GL at MuJoCo's import."""
-    backend = importlib.import_module(f"mujoco.{gl}")
-    contexts = sys.modules[mujoco.Renderer.__module__].gl_context
-    monkeypatch.setattr(contexts, "GLContext", backend.GLContext)
-    return mujoco.Renderer
-
-
-GPUS = {0: 2, 1: 0, 2: 3, 3: 1}
-"""CUDA's number of each GPU -> EGL's, whose order is its own."""
-
-
-@pytest.mark.parametrize(
-    ("environment", "number"),
-    [
-        ({}, None),  # one process, nothing said: as MuJoCo chooses
-        ({"CUDA_VISIBLE_DEVICES": "2"}, 3),
-        ({"CUDA_VISIBLE_DEVICES": "1,3"}, 0),
-        ({"CUDA_VISIBLE_DEVICES": "1,3", "LOCAL_RANK": "1"}, 1),
-        ({"CUDA_VISIBLE_DEVICES": "1,3", "SLURM_LOCALID": "2"}, 0),
-        ({"SLURM_LOCALID": "3"}, 1),
-        ({"SLURM_LOCALID": "5"}, 0),
-        ({"LOCAL_RANK": "2", "SLURM_LOCALID": "0"}, 3),
-        ({"MEMOBENCH_WORKER": "6", "CUDA_VISIBLE_DEVICES": "1,3,2"}, 0),  # the sixth of a pool
-        ({"CUDA_VISIBLE_DEVICES": "GPU-1f0c,GPU-2f0c", "LOCAL_RANK": "1"}, None),
-        ({"CUDA_VISIBLE_DEVICES": ""}, None),
-        ({"CUDA_VISIBLE_DEVICES": "7"}, None),
-    ],
-)
-def test_ranks_draw_on_their_own_gpus(
-    environment: dict[str, str], number: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("CUDA_VISIBLE_DEVICES", *rendering.RANKS):
-        monkeypatch.delenv(name, raising=False)
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-    assert rendering.egl_device(GPUS) == number
-    assert rendering.egl_device({}) is None  # no GPU that EGL could draw on
-
-
-@pytest.mark.parametrize("number", [0, 99])
-def test_a_device_that_cannot_be_opened_is_no_reason_not_to_draw(number: int) -> None:
-    """The one that the rank says is taken, if MuJoCo can; else another one. In a process without a context yet."""
-    if gl_backend() != "egl":
-        pytest.skip("MUJOCO_GL is not egl")
-    code = (
-        "import os\nfrom lerobot_memobench.sim import rendering\n"
-        f"rendering._cuda_devices = lambda egl: {{0: {number}}}\n"
-        "print(rendering.renderer_name(), 'MUJOCO_EGL_DEVICE_ID' in os.environ)\n"
-    )
-    environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_EGL_DEVICE_ID"}
-    environment |= {"CUDA_VISIBLE_DEVICES": "0"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, timeout=120
-    )
-    assert done.stdout.split()[-1] == "False"
-
-
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_frame(gl: str, simulate: Simulate, camera: str) -> None:
+def test_frame(simulate: Simulate, camera: str) -> None:
     frame = simulate().render(camera)
     assert frame.shape == (256, 256, 3)
     assert frame.dtype == np.uint8
@@ -105,13 +49,13 @@ def test_frame(gl: str, simulate: Simulate, camera: str) -> None:
     assert frame.std() > 10
 
 
-def test_frame_is_upright(gl: str, simulate: Simulate) -> None:
+def test_frame_is_upright(simulate: Simulate) -> None:
     """The agentview camera sees the light table in the lower half and the dark wall in the upper."""
     frame = simulate().render("agentview").astype(float).mean(axis=2)
     assert frame[180:, :].mean() > frame[:60, :60].mean() + 40
 
 
-def test_things_are_seen_where_the_camera_maths_says(gl: str, simulate: Simulate) -> None:
+def test_things_are_seen_where_the_camera_maths_says(simulate: Simulate) -> None:
     """The tomato's red pixels are around the projection of its origin, in both cameras."""
     sim = simulate()
     for name, camera in MJCF_CAMERAS.items():
@@ -129,7 +73,7 @@ def test_things_are_seen_where_the_camera_maths_says(gl: str, simulate: Simulate
         assert abs(columns[near].mean() - column) < 4, name
 
 
-def test_frame_depends_on_the_state_alone(gl: str, simulate: Simulate) -> None:
+def test_frame_depends_on_the_state_alone(simulate: Simulate) -> None:
     sim = simulate()
     first = {camera: sim.render(camera) for camera in MJCF_CAMERAS}
     other = simulate(BOWLS)
@@ -143,7 +87,7 @@ def test_frame_depends_on_the_state_alone(gl: str, simulate: Simulate) -> None:
         np.testing.assert_array_equal(first[camera], again[camera])
 
 
-def test_two_renderers_take_turns(gl: str, simulate: Simulate) -> None:
+def test_two_renderers_take_turns(simulate: Simulate) -> None:
     sims = [simulate(name) for name in (STOVE, BOWLS)]
     alone = []
     for sim in sims:
@@ -154,7 +98,7 @@ def test_two_renderers_take_turns(gl: str, simulate: Simulate) -> None:
             np.testing.assert_array_equal(sim.render(), expected)
 
 
-def test_more_scenes_than_renderers(gl: str) -> None:
+def test_more_scenes_than_renderers() -> None:
     names = [
         STOVE,
         BOWLS,
@@ -174,6 +118,7 @@ def test_more_scenes_than_renderers(gl: str) -> None:
 
 def test_other_gl_users_do_not_disturb(mujoco_renderer: type[mujoco.Renderer], simulate: Simulate) -> None:
     sim = simulate()
+    sim.render_settings = RenderSettings(quality="high")
     expected = sim.render()
     with mujoco_renderer(sim.model, 64, 64) as other:
         for _ in range(2):
@@ -186,22 +131,25 @@ def test_other_gl_users_do_not_disturb(mujoco_renderer: type[mujoco.Renderer], s
 
 def test_closing_frees_the_context(gl: str, simulate: Simulate) -> None:
     sim = simulate()
+    sim.render_settings = RenderSettings(quality="high")
     expected = sim.render()
-    assert rendering._thread.context is not None
+    assert context.context_is_open()
     close_renderers()
     close_renderers()
-    assert rendering._thread.context is None
+    assert not context.context_is_open()
     assert not rendering._thread.renderers
     np.testing.assert_array_equal(sim.render(), expected)
 
 
-def test_threads_have_their_own_contexts(gl: str, simulate: Simulate) -> None:
+@pytest.mark.parametrize("quality", ["default", "high"])
+def test_threads_have_renderers_of_their_own(gl: str, simulate: Simulate, quality: str) -> None:
     sim = simulate()
+    sim.render_settings = RenderSettings(quality=quality)
     expected = sim.render()
     frames: list[np.ndarray] = []
 
     def draw() -> None:
-        mine = Simulation(get_task("put_the_tomato_into_the_top_drawer_of_the_cabinet"))
+        mine = Simulation(get_task("put_the_tomato_into_the_top_drawer_of_the_cabinet"), sim.render_settings)
         mine.reset(7)
         frames.extend(mine.render() for _ in range(5))
         close_renderers()
@@ -221,12 +169,13 @@ def test_threads_have_their_own_contexts(gl: str, simulate: Simulate) -> None:
 _FORK = """
 import os, sys
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
-sim = Simulation(get_task(sys.argv[1]))
+sim = Simulation(get_task(sys.argv[1]), RenderSettings(quality=sys.argv[2]))
 sim.reset(7)
 child = os.fork()  # before anything is drawn: both may draw
-sim.render()
+expected = sim.render()
 if child:
     assert os.waitpid(child, 0)[1] == 0
     child = os.fork()
@@ -234,17 +183,18 @@ if child:
         assert os.waitpid(child, 0)[1] == 0
     else:
         try:
-            sim.render()
+            same = (sim.render() == expected).all()
         except MemobenchError as error:
             assert "forked" in str(error)
-            os._exit(0)
-        os._exit(1)
+            os._exit(0 if sys.argv[2] == "high" else 1)
+        os._exit(0 if same and sys.argv[2] == "default" else 1)
 """
 
 
-def test_fork_after_a_frame_is_told_and_does_not_hang(gl: str) -> None:
+@pytest.mark.parametrize("quality", ["default", "high"])
+def test_a_fork_after_a_frame_draws_or_says_why_not(gl: str, quality: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", _FORK, STOVE], capture_output=True, text=True, timeout=120
+        [sys.executable, "-W", "ignore", "-c", _FORK, STOVE, quality], capture_output=True, text=True, timeout=120
     )
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -262,7 +212,7 @@ def test_qualities(gl: str, simulate: Simulate) -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(64, 64), (101, 203), (480, 640)])
-def test_sizes(gl: str, height: int, width: int) -> None:
+def test_sizes(height: int, width: int) -> None:
     sim = Simulation(get_task(STOVE), RenderSettings(height, width))
     sim.reset(7)
     frame = sim.render()
@@ -270,7 +220,7 @@ def test_sizes(gl: str, height: int, width: int) -> None:
     assert frame.std() > 10
 
 
-def test_burner_glows_while_on(gl: str, simulate: Simulate) -> None:
+def test_burner_glows_while_on(simulate: Simulate) -> None:
     sim = simulate(STOVE)
 
     def redness() -> float:
@@ -285,7 +235,7 @@ def test_burner_glows_while_on(gl: str, simulate: Simulate) -> None:
     assert redness() == off
 
 
-def test_highlights_are_drawn_and_go_away(gl: str, simulate: Simulate) -> None:
+def test_highlights_are_drawn_and_go_away(simulate: Simulate) -> None:
     sim = simulate(BOWLS)
     plain = sim.render()
     sim.highlights = (Highlight((0.1, 0.0, 0.902), 0.12), Highlight((-0.2, 0.2, 0.902), 0.05, (0.1, 0.2, 1.0, 0.5)))
@@ -366,7 +316,7 @@ def test_sizes_below_one() -> None:
 def test_no_gl_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    with pytest.raises(MemobenchError, match=r"no GL library to render with.*make setup") as caught:
+    with pytest.raises(MemobenchError, match=r"no GL library for env.render=high.*make setup") as caught:
         gl_backend()
     assert "\n" not in str(caught.value)
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
@@ -389,34 +339,29 @@ def test_backends_that_cannot_be(monkeypatch: pytest.MonkeyPatch, value: str, wo
         gl_backend()
 
 
-@pytest.mark.parametrize(("name", "words"), [("win32", "Windows .* WSL2"), ("darwin", "macOS .* Linux machine")])
-def test_the_first_picture_on_a_system_without_the_backends(
-    monkeypatch: pytest.MonkeyPatch, name: str, words: str
-) -> None:
-    monkeypatch.setattr(sys, "platform", name)
-    with pytest.raises(MemobenchError, match=words):
+@pytest.mark.parametrize("system", ["win32", "darwin"])
+def test_high_on_a_system_without_the_backends(monkeypatch: pytest.MonkeyPatch, system: str) -> None:
+    monkeypatch.setattr(sys, "platform", system)
+    with pytest.raises(MemobenchError, match=f"found {system}; use env.render=default"):
         gl_backend()
 
 
 _FRAME = """
 import hashlib, sys
+from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
-sim = Simulation(get_task(sys.argv[1]))
+sim = Simulation(get_task(sys.argv[1]), RenderSettings(quality=sys.argv[2]))
 sim.reset(7)
-print(hashlib.sha256(sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest())
+print(hashlib.sha256(sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest(), "OpenGL.GL" in sys.modules)
 """
 
 
-def frame_hash(backend: str) -> tuple[str, str]:
-    environment = {**os.environ, "MUJOCO_GL": backend}
+def frame_hash(quality: str, **variables: str) -> tuple[str, str]:
+    environment = {**os.environ, **variables}
     environment.pop("PYOPENGL_PLATFORM", None)  # of the backend that this process has opened
     done = subprocess.run(
-        [sys.executable, "-c", _FRAME, STOVE],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
+        [sys.executable, "-c", _FRAME, STOVE, quality], env=environment, capture_output=True, text=True, timeout=500
     )
     assert done.returncode == 0, done.stderr
     return done.stdout, done.stderr
@@ -425,8 +370,26 @@ def frame_hash(backend: str) -> tuple[str, str]:
 @pytest.mark.parametrize("backend", [pytest.param("egl", marks=pytest.mark.slow), "osmesa"])
 def test_backends_in_processes_of_their_own(backend: str) -> None:
     """Two processes draw the same, and go without a word."""
-    if not ctypes.util.find_library(rendering.BACKENDS[backend]):
+    if not ctypes.util.find_library(BACKENDS[backend]):
         pytest.skip(f"no {backend} here")
-    first, second = frame_hash(backend), frame_hash(backend)
+    first, second = frame_hash("high", MUJOCO_GL=backend), frame_hash("high", MUJOCO_GL=backend)
     assert first == second
     assert first[1] == ""
+
+
+def own_hash(sim: Simulation) -> str:
+    return hashlib.sha256(sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest()
+
+
+def test_default_frames_are_equal_in_every_process_without_gl(simulate: Simulate) -> None:
+    """Whatever the number of threads; MUJOCO_GL names what is not there."""
+    variables = {"OMP_NUM_THREADS": "3", "NUMBA_NUM_THREADS": "2", "MUJOCO_GL": "glfw", "DISPLAY": ""}
+    assert frame_hash("default", **variables) == (f"{own_hash(simulate(STOVE))} False\n", "")
+
+
+@pytest.mark.slow
+def test_default_frames_are_equal_on_another_processor(tmp_path: Path, simulate: Simulate) -> None:
+    """Compiled for one without the vector instructions of this one, and without optimisation."""
+    for variables in ({"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, {"NUMBA_OPT": "0"}):
+        found, _ = frame_hash("default", NUMBA_CACHE_DIR=str(tmp_path / "_".join(variables)), **variables)
+        assert found == f"{own_hash(simulate(STOVE))} False\n"

@@ -21,7 +21,7 @@ from lerobot_memobench.envs.world_assets import check_assets
 from lerobot_memobench.errors import MemobenchError, unsupported_system
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
-from lerobot_memobench.sim.rendering import BACKENDS, gl_backend
+from lerobot_memobench.sim.gl.context import BACKENDS, gl_backend
 from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
 from lerobot_memobench.tasks.task import LIBERO
 
@@ -35,6 +35,9 @@ EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av
 """Parts of LeRobot that are installed with this project."""
 
 SYSTEM_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri libgles2 libopengl0 libosmesa6"
+
+GL_BACKEND = "GL backend"
+ONLY_HIGH = " (only for env.render=high: other pictures are drawn on the CPU)"
 
 #: GL renderers that run on the CPU.
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
@@ -86,7 +89,7 @@ def system() -> Finding:
     found = f"{platform.system()} {platform.machine()}"
     if problem := unsupported_system():
         return Finding("system", "failed", found, problem)
-    if platform.machine() != "x86_64":
+    if sys.platform != "linux" or platform.machine() != "x86_64":
         return Finding("system", "warning", f"{found}; tested is Linux x86_64", "expect slower or missing packages")
     return Finding("system", "ok", found)
 
@@ -198,8 +201,8 @@ def _installed(name: str) -> str | None:
 
 
 def rendering() -> Iterator[Finding]:
-    """Yield what each GL backend really does here; nothing where there can be none."""
-    if unsupported_system():
+    """Yield what each GL backend really does here: `env.render=high` draws with one, everything else without."""
+    if sys.platform != "linux":
         return
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     try:
@@ -207,27 +210,27 @@ def rendering() -> Iterator[Finding]:
     except MemobenchError as error:
         chosen = ""
         fix = SYSTEM_PACKAGES if wanted in ("", *BACKENDS) else "unset MUJOCO_GL, or set it to egl or osmesa"
-        yield Finding("GL backend", "failed", str(error), fix)
+        yield Finding(GL_BACKEND, "warning", str(error), fix + ONLY_HIGH)
     else:
         origin = "MUJOCO_GL" if wanted else "the first whose library is installed"
-        yield Finding("GL backend", "ok", f"{chosen} ({origin})")
+        yield Finding(GL_BACKEND, "ok", f"{chosen} ({origin})")
     for backend in BACKENDS:
         yield _backend(backend, used=backend == chosen)
 
 
 def _backend(backend: str, used: bool) -> Finding:
-    """Let a backend draw a sphere; only the one in use must be able to."""
+    """Let a backend draw a sphere."""
     answer = run_probe("gl", backend)
     what = f"GL {backend}" + (" (used)" if used else "")
     if "error" not in answer and answer["sphere"]:
         return _renderer(what, answer["renderer"], answer["version"])
     problem = answer["error"] if "error" in answer else f"{answer['renderer']} draws a wrong picture"
-    return Finding(what, "failed" if used else "warning", problem, _gl_fix(backend, used))
+    return Finding(what, "warning", problem, _gl_fix(backend, used) + ONLY_HIGH)
 
 
 def _gl_fix(backend: str, used: bool) -> str:
     other = next(name for name in BACKENDS if name != backend)
-    return SYSTEM_PACKAGES + (f", or set MUJOCO_GL={other}" if used else f" (only if {backend} is wanted)")
+    return SYSTEM_PACKAGES + (f", or set MUJOCO_GL={other}" if used else "")
 
 
 def _renderer(what: str, renderer: str, version: str) -> Finding:
@@ -244,15 +247,14 @@ def _renderer(what: str, renderer: str, version: str) -> Finding:
 
 
 def golden_frame() -> Finding:
-    """Compare a frame of the benchmark with the one that ships."""
+    """Compare a frame of the benchmark, which is drawn on the CPU, with the one that ships."""
     answer = run_probe("golden")
     if "error" in answer:
-        fix = "unset PYOPENGL_PLATFORM" if "PYOPENGL_PLATFORM" in answer["error"] else "mend what failed above first"
-        return Finding("golden frame", "failed", answer["error"], fix)
+        return Finding("golden frame", "failed", answer["error"], "mend what failed above first")
     off = answer["difference"]
-    detail = f"mean difference {off:.2f} of 255 (tolerance {TOLERANCE:g})"
+    detail = f"drawn on the CPU, mean difference {off:.2f} of 255 (tolerance {TOLERANCE:g})"
     if off > TOLERANCE:
-        fix = "the pictures here are not the benchmark's; try the other MUJOCO_GL backend or a newer driver"
+        fix = "the pictures here are not the benchmark's; remove numba's cache folders and install the package again"
         return Finding("golden frame", "failed", detail, fix)
     return Finding("golden frame", "ok", detail)
 

@@ -4,8 +4,8 @@ A driver that is broken ends the process with a signal, which only its parent ca
 ``python -m lerobot_memobench.doctor.probe gl egl`` and prints JSON.
 
 The golden frame is what the benchmark's scene looks like when it is rendered right; one small image ships with the
-package. A machine whose own frame differs by more than the tolerance draws something else: upside down, without
-textures or lights, in other colours. ``python -m lerobot_memobench.doctor.probe --write-golden`` makes it anew.
+package. Pictures are drawn to equal bits everywhere; a machine whose frame differs by more than the tolerance draws
+something else. ``python -m lerobot_memobench.doctor.probe --write-golden`` makes it anew.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ SEED = 7
 SIDE = 64
 """Side of the golden frame, pixels: the 256 of the benchmark, averaged 4 × 4, so that edges do not count."""
 
-TOLERANCE = 6.0
-"""Largest mean absolute difference, of 255. Drivers differ in shading and shadow edges by far less."""
+TOLERANCE = 2.0
+"""Largest mean absolute difference, of 255: versions of MuJoCo settle a scene in ways that differ by far less."""
 
 
 def run_probe(*words: str, timeout_s: float = 180.0) -> dict[str, Any]:

@@ -36,8 +36,8 @@ from lerobot_memobench.protocol import (
     UPSTREAM_EVALUATIONS,
     UPSTREAM_HORIZON,
 )
-from lerobot_memobench.sim.gl.rasterizer import Image
 from lerobot_memobench.sim.object_slots import ObjectSlots
+from lerobot_memobench.sim.raster.rasterizer import Image
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
 from lerobot_memobench.tasks.catalogue import get_task

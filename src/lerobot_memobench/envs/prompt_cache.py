@@ -24,7 +24,7 @@ from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.io import cache_folder, draft_of
 from lerobot_memobench.jobs.threads import cpu_model
 from lerobot_memobench.protocol import ACTION_DIM
-from lerobot_memobench.sim.gl.rasterizer import Highlight
+from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import Simulation, Snapshot
 from lerobot_memobench.tasks.task import Task
 

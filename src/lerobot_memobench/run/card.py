@@ -49,7 +49,7 @@ def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
     """Return the card of an evaluation that is about to begin. Hashes the checkpoint, opens a GL context if need be.
 
     Args:
-        here: whether it is run on this machine, whose GL then counts.
+        here: whether it is run on this machine, and what it draws with then counts.
     """
     shard = plan.options.shard
     card = new_card(
@@ -59,7 +59,7 @@ def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
         trained_on=None,
         task_files=_task_files(plan),
         flags=_flags_of(plan),
-        runs=[run_facts(plan.command, plan.batch, gl_facts() if plan.draws and here else {})],
+        runs=[run_facts(plan.command, plan.batch, gl_facts(plan.environment.render) if plan.draws and here else {})],
         shard=None if shard is None else str(shard),
     )
     return with_checkpoint(card, plan.policy_path)

@@ -70,8 +70,11 @@ def gpu_model() -> str | None:
     return str(torch.cuda.get_device_name(0)) if torch.cuda.is_available() else None
 
 
-def gl_facts() -> dict[str, str]:
-    """Return what draws the pictures here; opens a GL context."""
-    from lerobot_memobench.sim.rendering import gl_backend, renderer_name
+def gl_facts(render: str) -> dict[str, str]:
+    """Return what draws pictures of a quality here; opens a GL context where GL does."""
+    from lerobot_memobench.sim.gl.context import gl_backend, renderer_name
+    from lerobot_memobench.sim.rendering import RenderSettings
 
+    if not RenderSettings(quality=render).needs_gl:
+        return {"GL backend": "none, drawn on the CPU"}
     return {"GL backend": gl_backend(), "GL renderer": renderer_name()}

@@ -220,7 +220,7 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     check_split(plan)
     check_scenes(plan)
     if options.executor not in ELSEWHERE:  # there, each part finds out
-        _check_simulator(plan)
+        _check_simulator(environment)
     return plan
 
 
@@ -262,15 +262,16 @@ def check_scenes(plan: EvaluationPlan) -> None:
         )
 
 
-def _check_simulator(plan: EvaluationPlan) -> None:
+def _check_simulator(environment: MemobenchEnvConfig) -> None:
     """Refuse a machine on which every episode would fail: no arm, no assets, or nothing to draw with."""
     from lerobot_memobench.envs.world_assets import check_assets
-    from lerobot_memobench.sim.rendering import gl_backend
+    from lerobot_memobench.sim.gl.context import gl_backend
+    from lerobot_memobench.sim.rendering import RenderSettings
     from lerobot_memobench.sim.robot import robosuite_version
 
     robosuite_version()
-    check_assets(cast("World", plan.environment.world))
-    if plan.draws:
+    check_assets(cast("World", environment.world))
+    if environment.draws and RenderSettings(quality=environment.render).needs_gl:
         gl_backend()
 
 

@@ -218,7 +218,8 @@ def check_policy(card: Mapping[str, Any]) -> None:
 
 def differences_here(card: Mapping[str, Any]) -> list[str]:
     """Return in what this machine differs from those that a card's runs were made on."""
-    here = {**versions(), **(gl_facts() if any(run["gl"] for run in card["runs"]) else {})}
+    drawn = any(run["gl"] for run in card["runs"])
+    here = {**versions(), **(gl_facts(card["protocol"]["render"]) if drawn else {})}
     notes = []
     for run in card["runs"]:
         told = {**run["versions"], **run["gl"]}

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets.asset import Articulation
 from lerobot_memobench.sim.assets.registry import known_classes, split_class
-from lerobot_memobench.sim.gl.rasterizer import Highlight
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 
 POINTS = 24

@@ -16,8 +16,9 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING, make_controller
-from lerobot_memobench.sim.gl.rasterizer import Highlight, Image, Rasterizer
-from lerobot_memobench.sim.rendering import RenderSettings, get_renderer
+from lerobot_memobench.sim.raster.highlights import Highlight
+from lerobot_memobench.sim.raster.rasterizer import Image
+from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
 from lerobot_memobench.sim.world import Start
 from lerobot_memobench.sim.worlds import KINDS, get_scene
@@ -296,12 +297,14 @@ class Simulation:
             lit = self.holds(Atom("turnon", (asset.name,)))
             self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
         model, data = self._drawing()
-        return self._renderer(camera, model).draw(model, data, MJCF_CAMERAS[camera], self.highlights)
+        renderer = get_renderer(self._scene.key, model, self.render_settings)
+        return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
 
     def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
         model, data = self._drawing()
-        return self._renderer(camera, model).draw_geoms(model, data, MJCF_CAMERAS[camera])
+        rasterizer = get_rasterizer(self._scene.key, model, self.render_settings)
+        return rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
 
     def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Return the model to draw and its present state: those that move, or the scene's drawing in the same pose."""
@@ -318,11 +321,6 @@ class Simulation:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
         return model, data
-
-    def _renderer(self, camera: str, model: mujoco.MjModel) -> Rasterizer:
-        if camera not in MJCF_CAMERAS:
-            raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, MJCF_CAMERAS)}")
-        return get_renderer(self._scene.key, model, self.render_settings)
 
     def proprio(self) -> NDArray[np.float32]:
         """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""
@@ -369,6 +367,12 @@ class Simulation:
     def holds(self, atom: Atom) -> bool:
         """Return whether an atom of the task language is true now."""
         return (self._start if atom.predicate in SINCE_START else self.world).holds(atom)
+
+
+def _mjcf_camera(camera: str) -> str:
+    if camera not in MJCF_CAMERAS:
+        raise MemobenchError(f"there is no camera {camera!r}; {nearest(camera, MJCF_CAMERAS)}")
+    return MJCF_CAMERAS[camera]
 
 
 def axis_angle(quaternion: Array) -> Array:

@@ -1,9 +1,7 @@
-"""GL objects that are made together and freed together, and the GL functions of a frame."""
+"""GL objects that are made together and freed together."""
 
 from __future__ import annotations
 
-import ctypes
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,68 +9,17 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 
-_TYPES = {
-    "b": ctypes.c_ubyte,
-    "f": ctypes.c_float,
-    "i": ctypes.c_int,
-    "n": ctypes.c_ssize_t,
-    "p": ctypes.c_void_p,
-    "u": ctypes.c_uint,
-}
-_ARGUMENTS = {
-    "glActiveTexture": "u",
-    "glBindBuffer": "uu",
-    "glBindBufferBase": "uuu",
-    "glBindFramebuffer": "uu",
-    "glBindTexture": "uu",
-    "glBindVertexArray": "u",
-    "glBlendFunc": "uu",
-    "glBlitFramebuffer": "iiiiiiiiuu",
-    "glBufferData": "unpu",
-    "glClear": "u",
-    "glClearColor": "ffff",
-    "glDepthMask": "b",
-    "glDisable": "u",
-    "glDrawElements": "uiup",
-    "glEnable": "u",
-    "glFrontFace": "u",
-    "glPixelStorei": "ui",
-    "glPolygonOffset": "ff",
-    "glReadPixels": "iiiiuup",
-    "glUseProgram": "u",
-    "glViewport": "iiii",
-}
-
-
-def frame_calls() -> SimpleNamespace:
-    """Return the GL functions of a frame by their names, without PyOpenGL around them; a context has been opened.
-
-    PyOpenGL converts arguments and asks for errors at every call, a tenth of the time of a frame. Here arrays are given
-    by their address, and one question for errors per frame is the caller's. Set-up calls stay with PyOpenGL.
-    ``glGetError`` gives a number, the others nothing.
-    """
-    from OpenGL.platform import PLATFORM
-
-    library = PLATFORM.GL
-    make = PLATFORM.functionTypeFor(library)
-    calls = {
-        name: make(None, *(_TYPES[letter] for letter in letters))((name, library))
-        for name, letters in _ARGUMENTS.items()
-    }
-    return SimpleNamespace(glGetError=make(ctypes.c_uint)(("glGetError", library)), **calls)
-
 
 class Resources:
     """Buffers, textures and framebuffers of the context that is current when they are made.
 
     Args:
         GL: PyOpenGL's module: it fixes its platform on import, so only who has a context imports it.
-        call: the functions of a frame.
         width, height: size of the frames, pixels.
     """
 
-    def __init__(self, GL: Any, call: SimpleNamespace, width: int, height: int) -> None:
-        self._gl, self._call, self.width, self.height = GL, call, width, height
+    def __init__(self, GL: Any, width: int, height: int) -> None:
+        self._gl, self.width, self.height = GL, width, height
         self._arrays: list[int] = []
         self._buffers: list[int] = []
         self._textures: list[tuple[int, Any, int]] = []
@@ -122,8 +69,8 @@ class Resources:
             self._bind(unit, target, name)
 
     def _bind(self, unit: int, target: Any, name: int) -> None:
-        self._call.glActiveTexture(self._gl.GL_TEXTURE0 + unit)
-        self._call.glBindTexture(target, name)
+        self._gl.glActiveTexture(self._gl.GL_TEXTURE0 + unit)
+        self._gl.glBindTexture(target, name)
 
     def framebuffer(self) -> int:
         """Make a framebuffer and bind it."""
@@ -148,7 +95,7 @@ class Resources:
         if status != GL.GL_FRAMEBUFFER_COMPLETE:
             raise MemobenchError(
                 f"the GL driver cannot draw {self.width}×{self.height} frames (framebuffer status {status}); try "
-                "render=fast or another MUJOCO_GL, and see `memobench doctor`"
+                "env.render=default or another MUJOCO_GL, and see `memobench doctor`"
             )
 
     def free(self) -> None:

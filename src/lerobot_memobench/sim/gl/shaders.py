@@ -1,4 +1,4 @@
-"""The GLSL programs: a scene in MuJoCo's light, the shadow map of one light, and which geom a pixel shows."""
+"""The GLSL programs: a scene in MuJoCo's light, and the shadow map of one light."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lerobot_memobench.errors import MemobenchError
 _VERTEX_SHADER = """#version 140
 const int LIGHTS = %(lights)d;
 const int CASTER = %(caster)d;
-uniform samplerBuffer geoms;
+uniform samplerBuffer rows;
 layout(std140) uniform Frame {
     mat4 light;
     mat4 projection;
@@ -24,15 +24,15 @@ layout(std140) uniform Frame {
 in vec3 position;
 in vec3 normal;
 in vec2 uv;
-in float geom;
+in float row;
 out vec3 texel;
 out vec4 steady;
 out vec3 shadowed;
 out vec3 shade;
 void main() {
-    int row = 5 * int(geom + 0.5);
-    vec4 x = texelFetch(geoms, row), y = texelFetch(geoms, row + 1), z = texelFetch(geoms, row + 2);
-    vec4 colour = texelFetch(geoms, row + 3), material = texelFetch(geoms, row + 4);
+    int first = 5 * int(row + 0.5);
+    vec4 x = texelFetch(rows, first), y = texelFetch(rows, first + 1), z = texelFetch(rows, first + 2);
+    vec4 colour = texelFetch(rows, first + 3), material = texelFetch(rows, first + 4);
     vec4 local = vec4(position, 1.0);
     vec3 world = vec3(dot(x, local), dot(y, local), dot(z, local));
     vec3 n = normalize(vec3(dot(x.xyz, normal), dot(y.xyz, normal), dot(z.xyz, normal)));
@@ -67,56 +67,28 @@ void main() {
 }
 """
 
-_PLACE = """\
-uniform samplerBuffer geoms;
+_SHADOW_VERTEX_SHADER = """#version 140
+uniform samplerBuffer rows;
+layout(std140) uniform Frame { mat4 light; };
 in vec3 position;
-in float geom;
-vec3 place() {
-    int row = 5 * int(geom + 0.5);
+in float row;
+void main() {
+    int first = 5 * int(row + 0.5);
     vec4 local = vec4(position, 1.0);
-    return vec3(
-        dot(texelFetch(geoms, row), local),
-        dot(texelFetch(geoms, row + 1), local),
-        dot(texelFetch(geoms, row + 2), local));
-}"""
-"""Where in the world a vertex is, by its geom's row of the table."""
-
-_SHADOW_VERTEX_SHADER = f"""#version 140
-{_PLACE}
-layout(std140) uniform Frame {{ mat4 light; }};
-void main() {{
-    gl_Position = light * vec4(place(), 1.0);
-}}
+    vec4 x = texelFetch(rows, first), y = texelFetch(rows, first + 1), z = texelFetch(rows, first + 2);
+    gl_Position = light * vec4(dot(x, local), dot(y, local), dot(z, local), 1.0);
+}
 """
 
 _SHADOW_FRAGMENT_SHADER = """#version 140
 void main() {}
 """
 
-_GEOM_VERTEX_SHADER = f"""#version 140
-{_PLACE}
-layout(std140) uniform Frame {{ mat4 light; mat4 projection; }};
-out float code;
-void main() {{
-    code = geom + 1.0;
-    gl_Position = projection * vec4(place(), 1.0);
-}}
-"""
-
-_GEOM_FRAGMENT_SHADER = """#version 140
-in float code;
-out vec4 pixel;
-void main() {
-    float whole = floor(code + 0.5);
-    pixel = vec4(mod(whole, 256.0), floor(whole / 256.0), 0.0, 255.0) / 255.0;
-}
-"""
-
-ATTRIBUTES = ("position", "normal", "uv", "geom")
+ATTRIBUTES = ("position", "normal", "uv", "row")
 """What a vertex has, by location."""
 
-TEXTURE_UNITS = {"geoms": 0, "textures": 1, "shadows": 2}
-"""Unit of each sampler: the table of geoms, their textures, the shadow map."""
+TEXTURE_UNITS = {"rows": 0, "textures": 1, "shadows": 2}
+"""Unit of each sampler: the table of rows, their textures, the shadow map."""
 
 
 def frame_block(lights: int) -> np.dtype[np.void]:
@@ -140,27 +112,22 @@ def frame_block(lights: int) -> np.dtype[np.void]:
     )
 
 
-def scene_program(GL: Any, lights: int, caster: int | None) -> int:
+def scene_program(GL: Any, lights: int, caster: int) -> int:
     """Compile the program that draws a scene and leave it in use.
 
     Args:
         GL: PyOpenGL's module; a context is current.
         lights: how many there are.
-        caster: which of them casts shadows, None for none.
+        caster: which of them casts shadows, −1 for none.
     """
-    vertex = _VERTEX_SHADER % {"lights": lights, "caster": -1 if caster is None else caster}
-    fragment = _FRAGMENT_SHADER % {"lit": "1.0" if caster is None else "texture(shadows, shade)"}
+    vertex = _VERTEX_SHADER % {"lights": lights, "caster": caster}
+    fragment = _FRAGMENT_SHADER % {"lit": "1.0" if caster < 0 else "texture(shadows, shade)"}
     return _program(GL, vertex, fragment)
 
 
 def shadow_program(GL: Any) -> int:
     """Compile the program that draws depths as a light sees them, and leave it in use."""
     return _program(GL, _SHADOW_VERTEX_SHADER, _SHADOW_FRAGMENT_SHADER)
-
-
-def geom_program(GL: Any) -> int:
-    """Compile the program that draws each geom in the colour of its row + 1, low byte red, high byte green."""
-    return _program(GL, _GEOM_VERTEX_SHADER, _GEOM_FRAGMENT_SHADER)
 
 
 def _program(GL: Any, vertex: str, fragment: str) -> int:

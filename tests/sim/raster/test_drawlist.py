@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.gl.drawlist import DrawList, build_draw_list, disc
+from lerobot_memobench.sim.raster.drawlist import DrawList, build_draw_list
+from lerobot_memobench.sim.raster.shapes import disc
+from lerobot_memobench.sim.rendering import ROOM
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
 
 
 def test_draw_list_has_outward_faces() -> None:
@@ -25,9 +29,9 @@ def test_draw_list_has_outward_faces() -> None:
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 1], group=0)  # not seen
     draw_list = build_draw_list(spec.compile())
     assert len(draw_list.geoms) == len(kinds)
-    faces = draw_list.indices.reshape(-1, 3)
+    faces = draw_list.triangles
     for row, (_, expected) in enumerate(kinds.values()):
-        mine = faces[draw_list.vertices["geom"][faces[:, 0]] == row]
+        mine = faces[draw_list.vertices["row"][faces[:, 0]] == row]
         a, b, c = (draw_list.vertices["position"][mine[:, k]].astype(float) for k in range(3))
         assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(expected, rel=0.03)
         normals = draw_list.vertices["normal"][mine[:, 0]]
@@ -37,8 +41,9 @@ def test_draw_list_has_outward_faces() -> None:
 
 def test_shape_that_is_not_drawn() -> None:
     spec = mujoco.MjSpec()
-    spec.worldbody.add_geom(name="endless", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], group=1)
-    with pytest.raises(MemobenchError, match="'endless' is a plane, which is not drawn"):
+    spec.add_hfield(name="hills", size=[1, 1, 1, 0.1], nrow=2, ncol=2, userdata=[0.0, 1.0, 1.0, 0.0])
+    spec.worldbody.add_geom(name="land", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="hills", group=1)
+    with pytest.raises(MemobenchError, match="'land' is a hfield, which is not drawn"):
         build_draw_list(spec.compile())
 
 
@@ -75,21 +80,35 @@ def test_a_finer_mesh_stands_where_the_scenes_does() -> None:
     fine = wedge(np.vstack([WEDGE, HORN]), np.vstack([WEDGE_FACES[:3], (1, 2, 4), (2, 3, 4), (3, 1, 4)]))
     assert np.abs(coarse.mesh_quat - fine.mesh_quat).max() > 0.05
     ours, theirs = build_draw_list(coarse, finer=fine), build_draw_list(fine)
-    assert len(ours.indices) == 6 * 3
+    assert len(ours.triangles) == 6
     for place in in_world(theirs, fine, "position"):
         distance = np.linalg.norm(in_world(ours, coarse, "position") - place, axis=1)
         assert distance.min() < 1e-6
-    assert len(build_draw_list(coarse, finer=mujoco.MjSpec().compile()).indices) == 4 * 3  # it has none of that name
+    assert len(build_draw_list(coarse, finer=mujoco.MjSpec().compile()).triangles) == 4  # it has none of that name
 
 
 def test_edges_of_a_finer_mesh_are_sharp() -> None:
     """Each corner of a wedge has its faces' normals, as MuJoCo's renderer draws it, not their mean."""
     model = wedge(WEDGE, WEDGE_FACES)
     sharp = build_draw_list(model, finer=wedge(WEDGE, WEDGE_FACES))
-    faces = sharp.indices.reshape(-1, 3)
+    np.testing.assert_array_equal(build_draw_list(model, sharp=True).vertices, sharp.vertices)
+    faces = sharp.triangles
     a, b, c = (sharp.vertices["position"][faces[:, k]] for k in range(3))
     flat = np.cross(b - a, c - a)
     flat /= np.linalg.norm(flat, axis=1, keepdims=True)
     for corner in range(3):
         agreement = np.einsum("ij,ij->i", sharp.vertices["normal"][faces[:, corner]], flat)
         assert agreement.min() > 0.8 - 1e-5
+
+
+def test_what_stands_still_comes_first() -> None:
+    """A door, the hand and what stands on the table move; the microwave's body and the arm's foot do not."""
+    sim = Simulation(get_task("open_and_close_the_microwave"))
+    listed = build_draw_list(sim.model, ROOM)
+    names = np.array([sim.model.body(sim.model.geom_bodyid[geom]).name for geom in listed.geoms])
+    still, moving = set(names[: listed.still]), set(names[listed.still :])
+    assert {"microwave_1", "robot0_link0", "mount0_pedestal", *ROOM} <= still
+    assert {"robot0_link1", "white_bowl_1", "plate_1"} <= moving
+    assert {body for body in moving if body.startswith("microwave_1_")}, "its door"
+    assert set(names[~listed.casting]) == set(ROOM)
+    np.testing.assert_array_equal(np.unique(listed.vertices["row"]), np.arange(len(listed.geoms)))

@@ -1,13 +1,6 @@
-"""What a camera can see of a model, as one list of triangles.
-
-MuJoCo draws geom by geom, each with its own state changes, and a shadow makes it draw everything three times. Here
-all visual geoms of a scene become one vertex array; where each stands and what it is made of is a small table that
-is sent anew for every frame. A frame is then three draw calls, whatever the number of geoms.
-"""
+"""The triangles of MuJoCo's shapes, each in its geom's frame: meshes, planes, boxes, cylinders, spheres, capsules."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -15,166 +8,29 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 
-VISUAL_GROUP = 1
-"""Geoms of this group are seen; the others are for contacts."""
-LAYER_SIZE = 512
-"""Side to which textures are brought, pixels: the largest of the project's own."""
-ROWS = 5
-"""Texels per geom in the table: three rows of the pose, colour, material."""
 ROUND = 32
 """Sides of cylinders and spheres."""
 LEAST_AGREEMENT = 0.8
 """Cosine below which MuJoCo's renderer draws a corner of a mesh with its face's normal: there is an edge."""
+ENDLESS = 1.05
+"""Half of the side of a plane without end, in distances of the far clipping plane."""
+PLANE_CELLS = 40
+"""Most cells in the side of a plane."""
 
-_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
-"""A geom of this colour shows its material's, as in MuJoCo."""
-
-VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("uv", "<f4", 2), ("geom", "<f4")])
-
-Floats = NDArray[np.float32]
 Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
 """Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
 
 
-@dataclass(frozen=True)
-class DrawList:
-    """The triangles of a scene.
-
-    ``vertices``: structured array of `VERTEX`, in the frames of their geoms. ``indices``: three per triangle, in the
-    order of ``geoms``, the model ids of the rows of the table. ``still`` and ``moving``: the indices again of geoms
-    that cast shadows, without and with a joint between them and the world; ``still_rows``: rows of the former.
-    ``layers``: (L, LAYER_SIZE, LAYER_SIZE, 3) textures, the first one white.
-    """
-
-    vertices: NDArray[np.void]
-    indices: NDArray[np.uint32]
-    geoms: NDArray[np.int64]
-    still: NDArray[np.uint32]
-    moving: NDArray[np.uint32]
-    still_rows: NDArray[np.int64]
-    layers: NDArray[np.uint8]
-    materials: Floats
-
-    def fill(self, table: Floats, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Write poses, colours and materials of the present state into a table, (geoms, ROWS, 4)."""
-        table[:, :3, :3] = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
-        table[:, :3, 3] = data.geom_xpos[self.geoms]
-        table[:, 3] = colours(model, self.geoms)
-        table[:, 4] = self.materials
-
-
-def build_draw_list(
-    model: mujoco.MjModel,
-    background: tuple[str, ...] = (),
-    shadowless: tuple[str, ...] = (),
-    finer: mujoco.MjModel | None = None,
-) -> DrawList:
-    """Collect the visual geoms of a model.
-
-    Args:
-        model: a compiled scene.
-        background: bodies to draw last, in this order, since they fill what the others leave free.
-        shadowless: bodies that cast no shadow.
-        finer: a model whose meshes are drawn in place of the scene's of the same names.
-
-    Raises:
-        MemobenchError: for a visual geom of a shape that is not drawn here.
-    """
-    geoms = np.array(_visual_geoms(model, background), dtype=np.int64)
-    parts, indices, start = [], [np.zeros(0, np.uint32)], 0
-    for row, geom in enumerate(geoms.tolist()):
-        positions, normals, uv, triangles = triangles_of(model, geom, finer)
-        part = np.zeros(len(positions), dtype=VERTEX)
-        part["position"], part["normal"], part["uv"], part["geom"] = positions, normals, uv, row
-        parts.append(part)
-        indices.append((triangles + start).astype(np.uint32).ravel())
-        start += len(part)
-    bodies = model.geom_bodyid[geoms]
-    casting = ~np.isin(bodies, _bodies(model, shadowless))
-    still = model.body_weldid[bodies] == 0
-    layers, layer_of = _layers(model)
-
-    def indices_of(rows: NDArray[np.bool_]) -> NDArray[np.uint32]:
-        return np.concatenate([indices[0], *(indices[1 + row] for row in np.flatnonzero(rows))])
-
-    return DrawList(
-        np.concatenate(parts) if parts else np.zeros(0, VERTEX),
-        np.concatenate(indices),
-        geoms,
-        indices_of(casting & still),
-        indices_of(casting & ~still),
-        np.flatnonzero(casting & still),
-        layers,
-        _materials(model, geoms, layer_of),
-    )
-
-
-def _visual_geoms(model: mujoco.MjModel, background: tuple[str, ...]) -> list[int]:
-    """Return the ids of visual geoms in the order in which they are drawn."""
-    place = {body: k for k, body in enumerate(_bodies(model, background))}
-    visual = [geom for geom in range(model.ngeom) if model.geom_group[geom] == VISUAL_GROUP]
-    return sorted(visual, key=lambda geom: place.get(int(model.geom_bodyid[geom]), -1))
-
-
-def _bodies(model: mujoco.MjModel, names: tuple[str, ...]) -> list[int]:
-    """Return the ids of those bodies that the model has."""
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names]
-    return [body for body in ids if body >= 0]
-
-
-def colours(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Floats:
-    """Return the colours (N, 4) of geoms: their own where set, else their material's."""
-    rgba = model.geom_rgba[geoms]
-    material = model.geom_matid[geoms]
-    plain = (material >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=1)
-    return np.where(plain[:, None], model.mat_rgba[np.maximum(material, 0)], rgba) if model.nmat else rgba
-
-
-def _materials(model: mujoco.MjModel, geoms: NDArray[np.int64], layer_of: dict[int, int]) -> Floats:
-    """Return specular, shininess exponent, emission and texture layer (N, 4); MuJoCo's defaults without material."""
-    rows = np.tile(np.array([0.5, 64.0, 0.0, 0.0], dtype=np.float32), (len(geoms), 1))
-    for row, geom in zip(rows, geoms, strict=True):
-        material = int(model.geom_matid[geom])
-        if material >= 0:
-            texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value])
-            row[:] = (
-                model.mat_specular[material],
-                128.0 * model.mat_shininess[material],
-                model.mat_emission[material],
-                layer_of.get(texture, 0),
-            )
-    return rows
-
-
-def _layers(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, int]]:
-    """Return the two-dimensional textures at one size, and texture id → layer; layer 0 is white."""
-    from PIL import Image
-
-    layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
-    layer_of: dict[int, int] = {}
-    for texture in range(model.ntex):
-        if model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D or model.tex_nchannel[texture] != 3:
-            continue
-        height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
-        start = int(model.tex_adr[texture])
-        pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
-        layer_of[texture] = len(layers)
-        # At its own size this leaves every pixel as it is.
-        resized = Image.fromarray(pixels).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC)
-        layers.append(np.asarray(resized))
-    return np.stack(layers), layer_of
-
-
-# --- the triangles of MuJoCo's shapes: meshes, boxes, cylinders, spheres, ellipsoids, capsules ---
-
-
-def triangles_of(model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None = None) -> Triangles:
+def triangles_of(
+    model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None = None, sharp: bool = False
+) -> Triangles:
     """Return a geom's triangles in its own frame.
 
     Args:
         model: a compiled scene.
         geom: its id.
-        finer: a model whose mesh of the same name is taken, where it has one.
+        finer: a model whose mesh of the same name is taken, where it has one; its edges are sharp.
+        sharp: whether edges of other meshes are.
 
     Raises:
         MemobenchError: for a shape that is not drawn here.
@@ -183,9 +39,11 @@ def triangles_of(model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None 
     size = np.asarray(model.geom_size[geom])
     match kind:
         case mujoco.mjtGeom.mjGEOM_MESH:
-            return _named_mesh(model, int(model.geom_dataid[geom]), finer or model)
+            return _named_mesh(model, int(model.geom_dataid[geom]), finer or model, sharp)
         case mujoco.mjtGeom.mjGEOM_BOX:
             return _box(size)
+        case mujoco.mjtGeom.mjGEOM_PLANE:
+            return _plane(size, ENDLESS * float(model.vis.map.zfar * model.stat.extent))
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
             return _revolve([(0, 1), (1, 1), (1, 1), (1, -1), (1, -1), (0, -1)], [2, 2, 0, 0, -2, -2], size[[0, 0, 1]])
         case mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -196,18 +54,18 @@ def triangles_of(model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None 
             return _capsule(float(size[0]), float(size[1]))
     raise MemobenchError(
         f"geom {model.geom(geom).name!r} is a {kind.name.removeprefix('mjGEOM_').lower()}, which is not drawn; make "
-        "what is seen of boxes, cylinders, spheres, ellipsoids, capsules and meshes"
+        "what is seen of planes, boxes, cylinders, spheres, ellipsoids, capsules and meshes"
     )
 
 
-def _named_mesh(model: mujoco.MjModel, mesh: int, source: mujoco.MjModel) -> Triangles:
+def _named_mesh(model: mujoco.MjModel, mesh: int, source: mujoco.MjModel, sharp: bool) -> Triangles:
     """Return another model's mesh of the same name in the frame of this model's mesh, which is also its geom's.
 
     The compiler moves every mesh into its own centre and principal axes, and a mesh of more faces has others.
     """
     other = mujoco.mj_name2id(source, mujoco.mjtObj.mjOBJ_MESH, model.mesh(mesh).name)
     if source is model or other < 0:
-        return _mesh(model, mesh)
+        return _mesh(model, mesh, LEAST_AGREEMENT if sharp else -np.inf)
     here, there = _mesh_axes(model, mesh), _mesh_axes(source, other)
     points, normals, uv, triangles = _mesh(source, other, LEAST_AGREEMENT)
     in_file = points @ there.T + source.mesh_pos[other]
@@ -282,6 +140,42 @@ def _box(size: NDArray[np.floating]) -> Triangles:
             triangles += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
     points = np.concatenate(positions)
     return points, np.concatenate(normals), np.zeros((len(points), 2)), np.array(triangles)
+
+
+def box_cells(model: mujoco.MjModel, geom: int) -> Triangles:
+    """Return a box whose sides have as many cells as MuJoCo gives them: light is computed at corners."""
+    points, normals, *_ = _box(np.asarray(model.geom_size[geom]))
+    sides = [_cells(points[k : k + 4], normals[k], model.vis.quality.numquads) for k in range(0, len(points), 4)]
+    return _joined(sides)
+
+
+def _plane(size: NDArray[np.floating], endless: float) -> Triangles:
+    """Return a plane of half sides and cells of a size; a half side of 0 stands for one without end."""
+    x, y = np.where(size[:2] > 0, size[:2], endless)
+    corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)])
+    cells = int(np.ceil(max(x, y) / max(float(size[2]), 1e-9))) + 1
+    return _cells(corners, np.array([0.0, 0.0, 1.0]), min(cells, PLANE_CELLS))
+
+
+def _cells(corners: NDArray[np.floating], normal: NDArray[np.floating], cells: int) -> Triangles:
+    """Cut a rectangle of four corners (4, 3) into cells × cells rectangles of two triangles."""
+    steps = np.linspace(0, 1, cells + 1)
+    across, along = (grid.ravel()[:, None] for grid in np.meshgrid(steps, steps, indexing="ij"))
+    points = corners[0] + across * (corners[1] - corners[0]) + along * (corners[3] - corners[0])
+    k = np.arange(cells * cells)
+    first = k // cells * (cells + 1) + k % cells
+    triangles = [
+        np.column_stack([first, first + cells + 1, first + cells + 2]),
+        np.column_stack([first, first + cells + 2, first + 1]),
+    ]
+    return points, np.tile(normal, (len(points), 1)), np.zeros((len(points), 2)), np.concatenate(triangles)
+
+
+def _joined(shapes: list[Triangles]) -> Triangles:
+    starts = np.cumsum([0, *(len(points) for points, *_ in shapes)])
+    points, normals, uv = (np.concatenate([shape[k] for shape in shapes]) for k in range(3))
+    triangles = np.concatenate([shape[3] + start for shape, start in zip(shapes, starts, strict=False)])
+    return points, normals, uv, triangles
 
 
 def _revolve(profile: list[tuple[float, float]], slopes: list[float], size: NDArray[np.floating]) -> Triangles:

@@ -1,0 +1,161 @@
+"""What a camera can see of a model, as one list of triangles.
+
+All visual geoms of a scene become rows of one list; where each stands and what it is made of is a small table that is
+filled for every frame. The list is made once per scene; drawing it needs no model, but for the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.sim.raster.shapes import Triangles, box_cells, triangles_of
+from lerobot_memobench.sim.raster.textures import LAYER_SIZE, cube_coordinates, flat_coordinates, layers_of
+
+VISUAL_GROUP = 1
+"""Geoms of this group are seen; the others are for contacts."""
+ROWS = 5
+"""Lines of four numbers per row in the table: three of the pose, colour, material."""
+
+_DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+"""A geom of this colour shows its material's, as in MuJoCo."""
+_NO_MATERIAL = (0.5, 64.0, 0.0, 0.0)
+"""MuJoCo's specular, shininess exponent and emission of a geom without a material, and no texture."""
+
+VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("uv", "<f4", 2), ("row", "<f4")])
+
+Floats = NDArray[np.float32]
+
+__all__ = ["LAYER_SIZE", "ROWS", "VERTEX", "VISUAL_GROUP", "DrawList", "Floats", "build_draw_list", "colours"]
+
+
+@dataclass(frozen=True)
+class DrawList:
+    """The triangles of a scene, row by row.
+
+    A row is a geom; one with a cube texture has a row for each side of the cube.
+
+    Attributes:
+        vertices: structured array of `VERTEX`, in the frames of their rows, in the order of rows.
+        triangles: (M, 3) vertices, counter-clockwise from outside, in the order of rows.
+        geoms: (rows,) the model's ids.
+        still: how many rows have no joint between them and the world; they are the first.
+        casting: (rows,) whether a row casts shadows.
+        layers: (L, LAYER_SIZE, LAYER_SIZE, 3) uint8 textures, the first one white.
+        materials: (rows, 4) specular, shininess exponent, emission, layer.
+    """
+
+    vertices: NDArray[np.void]
+    triangles: NDArray[np.int32]
+    geoms: NDArray[np.int64]
+    still: int
+    casting: NDArray[np.bool_]
+    layers: NDArray[np.uint8]
+    materials: Floats
+
+    def fill(self, table: Floats, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Write poses, colours and materials of the present state into a table, (rows, ROWS, 4)."""
+        table[:, :3, :3] = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
+        table[:, :3, 3] = data.geom_xpos[self.geoms]
+        table[:, 3] = colours(model, self.geoms)
+        table[:, 4] = self.materials
+
+
+def build_draw_list(
+    model: mujoco.MjModel,
+    shadowless: tuple[str, ...] = (),
+    finer: mujoco.MjModel | None = None,
+    sharp: bool = False,
+) -> DrawList:
+    """Collect the visual geoms of a model.
+
+    Args:
+        model: a compiled scene.
+        shadowless: bodies that cast no shadow.
+        finer: a model whose meshes are drawn in place of the scene's of the same names.
+        sharp: whether edges of meshes are sharp, as MuJoCo's renderer draws them; those of ``finer`` always are.
+
+    Raises:
+        MemobenchError: for a visual geom of a shape that is not drawn here.
+    """
+    visual = np.flatnonzero(model.geom_group == VISUAL_GROUP)
+    moves = model.body_weldid[model.geom_bodyid[visual]] != 0
+    layers, layer_of = layers_of(model)
+    geoms: list[int] = []
+    materials, parts, indices, start = [], [], [], 0
+    for geom in [*visual[~moves].tolist(), *visual[moves].tolist()]:
+        for layer, (positions, normals, uv, triangles) in _textured(model, geom, finer, sharp, layer_of):
+            part = np.zeros(len(positions), dtype=VERTEX)
+            part["position"], part["normal"], part["uv"], part["row"] = positions, normals, uv, len(geoms)
+            parts.append(part)
+            indices.append(triangles + start)
+            start += len(part)
+            geoms.append(geom)
+            materials.append((*_material(model, geom), layer))
+    rows = np.array(geoms, dtype=np.int64)
+    bodies = model.geom_bodyid[rows]
+    return DrawList(
+        np.concatenate(parts) if parts else np.zeros(0, VERTEX),
+        np.concatenate([np.zeros((0, 3), np.int32), *indices]).astype(np.int32),
+        rows,
+        int((model.body_weldid[bodies] == 0).sum()),
+        ~np.isin(bodies, _bodies(model, shadowless)),
+        layers,
+        np.array(materials, dtype=np.float32).reshape(-1, 4),
+    )
+
+
+def _bodies(model: mujoco.MjModel, names: tuple[str, ...]) -> list[int]:
+    """Return the ids of those bodies that the model has."""
+    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names]
+    return [body for body in ids if body >= 0]
+
+
+def colours(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Floats:
+    """Return the colours (N, 4) of geoms: their own where set, else their material's."""
+    rgba = model.geom_rgba[geoms]
+    material = model.geom_matid[geoms]
+    plain = (material >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=1)
+    return np.where(plain[:, None], model.mat_rgba[np.maximum(material, 0)], rgba) if model.nmat else rgba
+
+
+def _material(model: mujoco.MjModel, geom: int) -> tuple[float, float, float]:
+    """Return specular, shininess exponent and emission; MuJoCo's defaults without material."""
+    material = int(model.geom_matid[geom])
+    if material < 0:
+        return _NO_MATERIAL[:3]
+    exponent = 128.0 * float(model.mat_shininess[material])
+    return float(model.mat_specular[material]), exponent, float(model.mat_emission[material])
+
+
+def _textured(
+    model: mujoco.MjModel,
+    geom: int,
+    finer: mujoco.MjModel | None,
+    sharp: bool,
+    layer_of: dict[int, tuple[int, ...]],
+) -> Iterator[tuple[int, Triangles]]:
+    """Yield a geom's triangles with their texture coordinates, and the layer that they show."""
+    material = int(model.geom_matid[geom])
+    texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value]) if material >= 0 else -1
+    layers = layer_of.get(texture, (0,))
+    kind, mesh = int(model.geom_type[geom]), int(model.geom_dataid[geom])
+    is_mesh = kind == mujoco.mjtGeom.mjGEOM_MESH.value
+    # MuJoCo computes light at corners, and has several in a side of a box; only this light shows the difference.
+    fine = kind == mujoco.mjtGeom.mjGEOM_BOX.value and (texture in layer_of or _has_spots(model))
+    shape = box_cells(model, geom) if fine else triangles_of(model, geom, finer, sharp)
+    if texture not in layer_of or (is_mesh and model.mesh_texcoordadr[mesh] >= 0):
+        yield layers[0], shape
+    elif len(layers) == 1:
+        yield layers[0], flat_coordinates(model, geom, shape)
+    else:
+        for side, part in cube_coordinates(model, geom, shape):
+            yield layers[side], part
+
+
+def _has_spots(model: mujoco.MjModel) -> bool:
+    return bool(np.any(model.light_type[model.light_active != 0] != mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value))

@@ -1,0 +1,291 @@
+"""From triangles to pixels: which rows a camera can see, which triangle is nearest in a pixel, depths from a light."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.sim.raster.compiled import compiled
+
+Floats = NDArray[np.float32]
+Integers = NDArray[np.int32]
+
+TILE = 16
+"""Side of a tile of the shadow map, texels: what a moving caster touches is noted by tile."""
+
+
+class Shapes(NamedTuple):
+    """The triangles of a scene by rows of the table; they are the same in every frame.
+
+    ``position``: (N, 3) in the frames of the rows; ``first_vertex``: (rows + 1,), and ``first_triangle`` likewise;
+    ``triangles``: (T, 3); ``centre`` and ``half``: (rows, 3), the boxes around the rows in their frames.
+    """
+
+    position: Floats
+    first_vertex: Integers
+    triangles: Integers
+    first_triangle: Integers
+    centre: Floats
+    half: Floats
+
+
+class Clip(NamedTuple):
+    """Vertices as a camera or a light sees them: (N,) each, in clip space; ``visible``: (rows,)."""
+
+    x: Floats
+    y: Floats
+    w: Floats
+    visible: NDArray[np.bool_]
+
+
+class Target(NamedTuple):
+    """What is drawn into: ``depth`` (H, W), the inverse distance, 0 at infinity; ``triangle`` (H, W), −1 for none."""
+
+    depth: Floats
+    triangle: Integers
+
+
+def clip_space(vertices: int, rows: int) -> Clip:
+    """Return memory for the vertices of a scene."""
+    x, y, w = (np.zeros(vertices, np.float32) for _ in range(3))
+    return Clip(x, y, w, np.zeros(rows, np.bool_))
+
+
+@compiled
+def _project(shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, clip: Any) -> None:
+    """Move the vertices of rows to clip space, but of those that lie outside of the picture as a whole.
+
+    Args:
+        shapes: `Shapes`.
+        rows: which ones.
+        table: poses, (all rows, ROWS, 4).
+        matrix: from the world to clip space, (4, 4).
+        near: distance in front of which nothing is seen, m.
+        clip: `Clip`, overwritten.
+    """
+    m = np.empty((3, 4), np.float32)
+    for row in rows:
+        for k in range(3):
+            line = k if k < 2 else 3  # depths are taken from w
+            for j in range(4):
+                total = matrix[line, 0] * table[row, 0, j] + matrix[line, 1] * table[row, 1, j]
+                total += matrix[line, 2] * table[row, 2, j]
+                m[k, j] = total + matrix[line, 3] if j == 3 else total
+        clip.visible[row] = _in_picture(m, shapes.centre[row], shapes.half[row], near)
+        if not clip.visible[row]:
+            continue
+        a, b, c, d = m[0, 0], m[0, 1], m[0, 2], m[0, 3]
+        e, f, g, h = m[1, 0], m[1, 1], m[1, 2], m[1, 3]
+        p, q, r, s = m[2, 0], m[2, 1], m[2, 2], m[2, 3]
+        for i in range(shapes.first_vertex[row], shapes.first_vertex[row + 1]):
+            x, y, z = shapes.position[i, 0], shapes.position[i, 1], shapes.position[i, 2]
+            clip.x[i] = a * x + b * y + c * z + d
+            clip.y[i] = e * x + f * y + g * z + h
+            clip.w[i] = p * x + q * y + r * z + s
+
+
+@compiled
+def _in_picture(m: Any, centre: Any, half: Any, near: Any) -> Any:
+    """Return whether a box may be in the picture; it is not where all of it is beyond one side."""
+    for side in range(5):
+        axis = side // 2
+        sign = np.float32(1 - 2 * (side % 2))
+        inside = np.float32(0)
+        for k in range(4):
+            factor = m[2, k] + sign * m[axis, k] if side < 4 else m[2, k]
+            inside += factor if k == 3 else factor * centre[k] + abs(factor) * half[k]
+        if inside < (near if side == 4 else np.float32(0)):
+            return False
+    return True
+
+
+@compiled
+def _bounds(a: Any, b: Any, c: Any) -> Any:
+    """Return how an edge, a x + b y + c ≥ 0 inside, bounds x in row y: from below p y + q on, up to r y + s.
+
+    A level edge bounds none: all rows that a triangle is in lie within it.
+    """
+    if abs(a) <= 1e-9 * abs(b):
+        return 0.0, -1e30, 0.0, 1e30
+    slope, start = -b / a, -c / a
+    return (slope, start, 0.0, 1e30) if a > 0.0 else (0.0, -1e30, slope, start)
+
+
+@compiled
+def _span(left: Any, right: Any, y: Any, edge0: Any, edge1: Any, edge2: Any) -> Any:
+    """Return the first and the last pixel of a row within three edges; the last is before the first for none."""
+    start = max(edge0[0] * y + edge0[1], edge1[0] * y + edge1[1], edge2[0] * y + edge2[1], float(left))
+    end = min(edge0[2] * y + edge0[3], edge1[2] * y + edge1[3], edge2[2] * y + edge2[3], float(right))
+    if start > end:
+        return 0, -1
+    first = int(start)
+    return first + 1 if first < start else first, int(end)
+
+
+@compiled
+def draw_triangles(
+    shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, far: Any, clip: Any, target: Any
+) -> None:
+    """Note in each pixel the nearest triangle of some rows, if it is nearer than what is there.
+
+    Triangles are set up in homogeneous coordinates, so those that reach behind the camera need no clipping. The
+    middle of a pixel decides. Faces are seen from the side on which their corners go clockwise: pictures are drawn
+    upside down. Of triangles that are equally near the first one stays.
+
+    Args:
+        shapes: `Shapes`.
+        rows: which ones, in the order in which they are drawn.
+        table, matrix, near, clip: see `_project`.
+        far: distance beyond which nothing is seen, m.
+        target: `Target`, brought up to date.
+    """
+    _project(shapes, rows, table, matrix, near, clip)
+    height, width = target.depth.shape
+    nearest, farthest = np.float32(1) / near, np.float32(1) / far
+    half_width, half_height = 0.5 * width, 0.5 * height
+    depths, shown = target.depth.reshape(-1), target.triangle.reshape(-1)
+    for row in rows:
+        if not clip.visible[row]:
+            continue
+        for t in range(shapes.first_triangle[row], shapes.first_triangle[row + 1]):
+            i, j, k = shapes.triangles[t, 0], shapes.triangles[t, 1], shapes.triangles[t, 2]
+            w0, w1, w2 = float(clip.w[i]), float(clip.w[j]), float(clip.w[k])
+            x0, y0 = (clip.x[i] + w0) * half_width, (clip.y[i] + w0) * half_height
+            x1, y1 = (clip.x[j] + w1) * half_width, (clip.y[j] + w1) * half_height
+            x2, y2 = (clip.x[k] + w2) * half_width, (clip.y[k] + w2) * half_height
+            # Each corner's share of a point (x, y, 1), not yet divided by the volume that the corners span.
+            a0, b0, c0 = y2 * w1 - y1 * w2, x1 * w2 - x2 * w1, x2 * y1 - x1 * y2
+            volume = a0 * x0 + b0 * y0 + c0 * w0
+            if volume <= 1e-12:
+                continue
+            left, right, top, bottom = 0, width - 1, 0, height - 1
+            if w0 > 1e-6 and w1 > 1e-6 and w2 > 1e-6:
+                u0, u1, u2 = x0 / w0, x1 / w1, x2 / w2
+                v0, v1, v2 = y0 / w0, y1 / w1, y2 / w2
+                low, high = min(u0, u1, u2) - 0.5, max(u0, u1, u2) - 0.5
+                if high < 0.0 or low > right:
+                    continue
+                left, right = math.ceil(max(low, 0.0)), int(min(high, float(right)))
+                low, high = min(v0, v1, v2) - 0.5, max(v0, v1, v2) - 0.5
+                if high < 0.0 or low > bottom:
+                    continue
+                top, bottom = math.ceil(max(low, 0.0)), int(min(high, float(bottom)))
+                if left > right or top > bottom:
+                    continue
+            a1, b1, c1 = y0 * w2 - y2 * w0, x2 * w0 - x0 * w2, x0 * y2 - x2 * y0
+            a2, b2, c2 = y1 * w0 - y0 * w1, x0 * w1 - x1 * w0, x1 * y0 - x0 * y1
+            # Pixels are counted by their middles.
+            c0, c1, c2 = c0 + 0.5 * (a0 + b0), c1 + 0.5 * (a1 + b1), c2 + 0.5 * (a2 + b2)
+            edge0, edge1, edge2 = _bounds(a0, b0, c0), _bounds(a1, b1, c1), _bounds(a2, b2, c2)
+            scale = 0.0
+            across, down, at_origin, slope = 0.0, 0.0, 0.0, np.float32(0)
+            for y in range(top, bottom + 1):
+                first, last = _span(left, right, y, edge0, edge1, edge2)
+                if first > last:
+                    continue
+                if scale == 0.0:
+                    scale = 1.0 / volume
+                    across, down = (a0 + a1 + a2) * scale, (b0 + b1 + b2) * scale
+                    at_origin, slope = (c0 + c1 + c2) * scale, np.float32(across)
+                depth = np.float32(across * first + (down * y + at_origin))
+                before = np.uint64(y * width + first)  # numba looks whether other indices are negative
+                for step in range(last + 1 - first):
+                    inverse = depth + slope * np.float32(step)
+                    if depths[before + np.uint64(step)] < inverse <= nearest and inverse > farthest:
+                        depths[before + np.uint64(step)] = inverse
+                        shown[before + np.uint64(step)] = t
+
+
+@compiled
+def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shadow_map: Any, touched: Any) -> None:
+    """Note in each texel the depth of what is nearest to a light of parallel rays.
+
+    Depths are moved away from the light by more than a texel's slope, or surfaces would speckle themselves.
+
+    Args:
+        shapes: `Shapes`.
+        rows: which ones.
+        table: poses, (all rows, ROWS, 4).
+        matrix: from the world to the light's clip space, (4, 4).
+        clip: `Clip`, overwritten; its w are the depths.
+        shadow_map: (size, size), from 0 to 1, brought up to date.
+        touched: (tiles, tiles), 1 where it was.
+    """
+    size = shadow_map.shape[0]
+    half = 0.5 * size
+    depths = shadow_map.reshape(-1)
+    m = np.empty((3, 4), np.float32)
+    for row in rows:
+        for k in range(3):
+            for j in range(4):
+                total = matrix[k, 0] * table[row, 0, j] + matrix[k, 1] * table[row, 1, j]
+                total += matrix[k, 2] * table[row, 2, j]
+                m[k, j] = total + matrix[k, 3] if j == 3 else total
+        for i in range(shapes.first_vertex[row], shapes.first_vertex[row + 1]):
+            x, y, z = shapes.position[i, 0], shapes.position[i, 1], shapes.position[i, 2]
+            clip.x[i] = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+            clip.y[i] = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+            clip.w[i] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        for t in range(shapes.first_triangle[row], shapes.first_triangle[row + 1]):
+            i, j, k = shapes.triangles[t, 0], shapes.triangles[t, 1], shapes.triangles[t, 2]
+            x0, y0 = (clip.x[i] + 1.0) * half, (clip.y[i] + 1.0) * half
+            x1, y1 = (clip.x[j] + 1.0) * half, (clip.y[j] + 1.0) * half
+            x2, y2 = (clip.x[k] + 1.0) * half, (clip.y[k] + 1.0) * half
+            area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+            if area <= 1e-9:
+                continue
+            low, high = min(x0, x1, x2) - 0.5, max(x0, x1, x2) - 0.5
+            if high < 0.0 or low > size - 1:
+                continue
+            left, right = math.ceil(max(low, 0.0)), int(min(high, size - 1.0))
+            low, high = min(y0, y1, y2) - 0.5, max(y0, y1, y2) - 0.5
+            if high < 0.0 or low > size - 1:
+                continue
+            top, bottom = math.ceil(max(low, 0.0)), int(min(high, size - 1.0))
+            if left > right or top > bottom:
+                continue
+            # A look-up takes a texel and those after it.
+            for tile_y in range(max(top - 1, 0) // TILE, bottom // TILE + 1):
+                for tile_x in range(max(left - 1, 0) // TILE, right // TILE + 1):
+                    touched[tile_y, tile_x] = 1
+            a0, b0, a1, b1, a2, b2 = y1 - y2, x2 - x1, y2 - y0, x0 - x2, y0 - y1, x1 - x0
+            c0 = x1 * y2 - x2 * y1 + 0.5 * (a0 + b0)
+            c1 = x2 * y0 - x0 * y2 + 0.5 * (a1 + b1)
+            c2 = x0 * y1 - x1 * y0 + 0.5 * (a2 + b2)
+            edge0, edge1, edge2 = _bounds(a0, b0, c0), _bounds(a1, b1, c1), _bounds(a2, b2, c2)
+            scale = 0.0
+            across, down, at_origin, slope = 0.0, 0.0, 0.0, np.float32(0)
+            for y in range(top, bottom + 1):
+                first, last = _span(left, right, y, edge0, edge1, edge2)
+                if first > last:
+                    continue
+                if scale == 0.0:
+                    scale = 1.0 / area
+                    d0, d1, d2 = 0.5 * clip.w[i] + 0.5, 0.5 * clip.w[j] + 0.5, 0.5 * clip.w[k] + 0.5
+                    across = (a0 * d0 + a1 * d1 + a2 * d2) * scale
+                    down = (b0 * d0 + b1 * d1 + b2 * d2) * scale
+                    at_origin = (c0 * d0 + c1 * d1 + c2 * d2) * scale
+                    at_origin += 2.0 * max(abs(across), abs(down)) + 4.0 / 65536.0
+                    slope = np.float32(across)
+                depth = np.float32(across * first + (down * y + at_origin))
+                before = np.uint64(y * size + first)  # numba looks whether other indices are negative
+                for step in range(last + 1 - first):
+                    here = min(max(depth + slope * np.float32(step), np.float32(0)), np.float32(1))
+                    depths[before + np.uint64(step)] = min(depths[before + np.uint64(step)], here)
+
+
+@compiled
+def restore_depths(shadow_map: Any, still: Any, touched: Any) -> None:
+    """Put the depths of what stands still back into the tiles that were touched."""
+    size = shadow_map.shape[0]
+    for tile_y in range(touched.shape[0]):
+        for tile_x in range(touched.shape[1]):
+            if touched[tile_y, tile_x]:
+                touched[tile_y, tile_x] = 0
+                end = min((tile_x + 1) * TILE, size)
+                for y in range(tile_y * TILE, min((tile_y + 1) * TILE, size)):
+                    for x in range(tile_x * TILE, end):
+                        shadow_map[y, x] = still[y, x]

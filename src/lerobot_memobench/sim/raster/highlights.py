@@ -1,0 +1,66 @@
+"""The prompt's way of marking a place: translucent discs in rows of their own behind a scene's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.raster.drawlist import ROWS, VERTEX, DrawList, Floats
+from lerobot_memobench.sim.raster.shapes import disc
+
+HIGHLIGHTS = 16
+"""Highlights that fit into a frame."""
+DISC_HALF_HEIGHT = 0.001
+_MATERIAL = (0.0, 1.0, 0.3, 0.0)
+
+
+@dataclass(frozen=True)
+class Highlight:
+    """A translucent disc drawn over the scene: the prompt's way of marking a place."""
+
+    position: tuple[float, float, float]
+    radius: float
+    rgba: tuple[float, float, float, float] = (1.0, 0.85, 0.1, 0.55)
+
+
+def with_discs(draw_list: DrawList) -> tuple[NDArray[np.void], NDArray[np.int32]]:
+    """Return a list's vertices and triangles and, behind them, a disc for each highlight, in rows of their own."""
+    positions, normals, uv, triangles = disc()
+    discs = np.zeros((HIGHLIGHTS, len(positions)), dtype=VERTEX)
+    discs["position"], discs["normal"], discs["uv"] = positions, normals, uv
+    discs["row"] = len(draw_list.geoms) + np.arange(HIGHLIGHTS)[:, None]
+    starts = len(draw_list.vertices) + len(positions) * np.arange(HIGHLIGHTS)[:, None, None]
+    vertices = np.concatenate([draw_list.vertices, discs.ravel()])
+    return vertices, np.concatenate([draw_list.triangles, (triangles + starts).reshape(-1, 3)]).astype(np.int32)
+
+
+def table_of(draw_list: DrawList) -> Floats:
+    """Return a table for a list's rows and those of the highlights, (rows, ROWS, 4)."""
+    return np.zeros((len(draw_list.geoms) + HIGHLIGHTS, ROWS, 4), dtype=np.float32)
+
+
+def fill_table(
+    table: Floats,
+    draw_list: DrawList,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    highlights: Sequence[Highlight],
+) -> None:
+    """Write the present state of a list's rows, and highlights, into a table.
+
+    Raises:
+        MemobenchError: there are more highlights than fit.
+    """
+    if len(highlights) > HIGHLIGHTS:
+        raise MemobenchError(f"there are {len(highlights)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
+    rows = len(draw_list.geoms)
+    draw_list.fill(table[:rows], model, data)
+    for row, mark in zip(table[rows:], highlights, strict=False):
+        row[:3] = np.diag([mark.radius, mark.radius, DISC_HALF_HEIGHT]) @ np.eye(3, 4)
+        row[:3, 3] = mark.position
+        row[3], row[4] = mark.rgba, _MATERIAL

@@ -1,0 +1,288 @@
+"""Draw a `DrawList` on the CPU: first which triangle each pixel shows, then the colour of each pixel once.
+
+The light is MuJoCo's: a headlight with ambience, parallel and spot lights, Blinn's highlights, textures that modulate
+all of it. Shadows are those of the first light of parallel rays that casts them, with soft edges. What stands still is
+kept for cameras that stand still: only what moves is drawn, and shadows that have changed.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.sim.raster.drawlist import LAYER_SIZE, DrawList, Floats
+from lerobot_memobench.sim.raster.geometry import (
+    TILE,
+    Shapes,
+    Target,
+    clip_space,
+    draw_depths,
+    draw_triangles,
+    restore_depths,
+)
+from lerobot_memobench.sim.raster.highlights import Highlight, fill_table, table_of, with_discs
+from lerobot_memobench.sim.raster.shading import (
+    BACKGROUND,
+    KEPT,
+    PICTURE,
+    TRANSLUCENT,
+    Lights,
+    Surfaces,
+    light_background,
+    scratch,
+    shade,
+    shadow_tiles,
+)
+from lerobot_memobench.sim.raster.textures import levels_of
+from lerobot_memobench.sim.raster.view import Lamps, camera_matrix, clipping
+
+Image = NDArray[np.uint8]
+OPAQUE = 0.995
+"""Alpha from which on MuJoCo takes a geom as opaque."""
+KEPT_SCENES = 4
+"""States of what stands still that are kept: simulations of one scene have fixtures at different places."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """What a camera sees of what stands still: its picture, depths, and the parts of colours that shadows change."""
+
+    image: Image
+    depth: Floats
+    kept: Floats
+    tile: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Still:
+    """What stands still in one state: its depths from the light, and what cameras see of it, by their matrices."""
+
+    shadow_map: Floats
+    backgrounds: dict[bytes, Background] = field(default_factory=dict)
+
+
+class Rasterizer:
+    """Everything that is needed to draw one draw list at one size; it serves one thread at a time.
+
+    Args:
+        model: where lights and clipping planes are read from.
+        draw_list: what there is to draw.
+        width, height: size of the frames, pixels.
+        shadow_size: side of the shadow map, pixels; 0 draws no shadows.
+        clamped: whether light is cut off at 1 before the texture takes its part, as in MuJoCo's renderer.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        draw_list: DrawList,
+        width: int,
+        height: int,
+        shadow_size: int,
+        clamped: bool = False,
+    ) -> None:
+        self._list, self._width, self._height = draw_list, width, height
+        self._lamps = Lamps(model, shadow_size > 0 and bool(draw_list.casting.any()), clamped)
+        rows = len(draw_list.geoms)
+        self._table = table_of(draw_list)
+        vertices, triangles = with_discs(draw_list)
+        self._shapes = _shapes(vertices, triangles, len(self._table))
+        self._surfaces = Surfaces(
+            np.ascontiguousarray(vertices["normal"]),
+            np.ascontiguousarray(vertices["uv"]),
+            vertices["row"].astype(np.int32),
+            levels_of(draw_list.layers),
+            LAYER_SIZE,
+        )
+        self._rows = np.arange(rows, dtype=np.int32)
+        self._clip = clip_space(len(vertices), len(self._table))
+        self._work = scratch(len(vertices), len(triangles), width * height)
+        self._target = Target(np.zeros((height, width), np.float32), np.zeros((height, width), np.int32))
+        still = np.arange(rows) < draw_list.still
+        self._still_casters = np.flatnonzero(still & draw_list.casting).astype(np.int32)
+        self._moving_casters = np.flatnonzero(~still & draw_list.casting).astype(np.int32)
+        size = shadow_size if self._lamps.caster is not None else 1
+        self._tiles = -(-size // TILE)
+        self._shadow_map = np.ones((size, size), np.float32)
+        # One more for pixels that no shadow can change.
+        self._touched = np.zeros(self._tiles**2 + 1, np.uint8)
+        self._still: OrderedDict[bytes, Still] = OrderedDict()
+        self._shown: bytes | None = None
+
+    # --- draw -----------------------------------------------------------------------------------------------
+
+    def draw(
+        self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight] = ()
+    ) -> Image:
+        """Return what a camera sees, (height, width, 3) uint8, first row on top.
+
+        Args:
+            model: an instance of the model that the draw list was made of.
+            data: the state to show.
+            camera: its name.
+            highlights: drawn in this order.
+        """
+        fill_table(self._table, self._list, model, data, highlights)
+        view = View(self, model, data, camera)
+        still = self._bring_shadows_up_to_date(view)
+        rows = self._rows
+        opaque = self._table[: len(rows), 3, 3] >= OPAQUE
+        moving = rows >= self._list.still
+        if model.body_weldid[model.cam_bodyid[view.camera]] == 0:
+            background = self._background(still, view, rows[opaque & ~moving])
+            image = background.image.copy()
+            self._target.depth[:] = background.depth
+            self._target.triangle[:] = -1
+            view.draw_triangles(rows[opaque & moving])
+            if self._lamps.caster is not None:
+                light_background(
+                    background.kept,
+                    background.tile,
+                    self._touched,
+                    self._target.triangle.reshape(-1),
+                    self._shadow_map,
+                    image.reshape(-1, 3),
+                )
+        else:
+            image = np.zeros((self._height, self._width, 3), np.uint8)
+            self._clear()
+            view.draw_triangles(rows[opaque])
+        view.shade(PICTURE, image)
+        translucent = self._near_to_far(view, rows[~opaque])
+        # MuJoCo's renderer draws them twice, in this order.
+        for row in [*translucent, *translucent[::-1], *(len(rows) + np.arange(len(highlights)))]:
+            self._draw_over(view, int(row), image)
+        return image
+
+    def draw_geoms(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> NDArray[np.int64]:
+        """Return the id of the geom that each pixel of `draw` shows, (height, width), -1 for none, highlights left out.
+
+        The middle of a pixel decides.
+        """
+        fill_table(self._table, self._list, model, data, ())
+        view = View(self, model, data, camera)
+        self._clear()
+        view.draw_triangles(self._rows)
+        shown = self._target.triangle
+        rows = self._surfaces.row[self._shapes.triangles[shown, 0]]
+        # A row of a highlight is none of the list, and is not drawn here.
+        return np.where(shown >= 0, self._list.geoms[np.minimum(rows, len(self._list.geoms) - 1)], -1)
+
+    def _clear(self) -> None:
+        self._target.depth[:] = 0.0
+        self._target.triangle[:] = -1
+
+    # --- what stands still, and its shadows -----------------------------------------------------------------
+
+    def _bring_shadows_up_to_date(self, view: View) -> Still:
+        """Draw the shadow map of the present state; return what is kept of what stands still in it."""
+        scene = self._table[: self._list.still].tobytes() + view.lighting
+        still = self._still.get(scene)
+        if still is None:
+            still = self._still[scene] = Still(np.ones_like(self._shadow_map))
+            if self._lamps.caster is not None:
+                self._draw_depths(view, self._still_casters, still.shadow_map, np.zeros_like(self._touched))
+            if len(self._still) > KEPT_SCENES:
+                self._still.popitem(last=False)
+        self._still.move_to_end(scene)
+        if self._lamps.caster is not None:
+            shown = scene + self._table[: len(self._list.geoms), :3].tobytes()
+            if shown != self._shown:
+                self._shadow_map_of(still, same=self._shown is not None and self._shown.startswith(scene))
+                self._draw_depths(view, self._moving_casters, self._shadow_map, self._touched)
+                self._shown = shown
+        return still
+
+    def _shadow_map_of(self, still: Still, same: bool) -> None:
+        if same:
+            restore_depths(self._shadow_map, still.shadow_map, self._tile_square(self._touched))
+        else:
+            self._shadow_map[:] = still.shadow_map
+            self._touched[:] = 0
+
+    def _tile_square(self, touched: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return touched[:-1].reshape(self._tiles, self._tiles)
+
+    def _draw_depths(self, view: View, rows: NDArray[np.int32], shadow_map: Floats, touched: NDArray[np.uint8]) -> None:
+        draw_depths(
+            self._shapes, rows, self._table, view.light_matrix, self._clip, shadow_map, self._tile_square(touched)
+        )
+
+    def _background(self, still: Still, view: View, rows: NDArray[np.int32]) -> Background:
+        """Return what a camera that stands still sees of what stands still."""
+        key = view.matrix.tobytes()
+        if key not in still.backgrounds:
+            still.backgrounds[key] = self._draw_background(still, view, rows)
+        return still.backgrounds[key]
+
+    def _draw_background(self, still: Still, view: View, rows: NDArray[np.int32]) -> Background:
+        pixels = self._width * self._height
+        image = np.zeros((self._height, self._width, 3), np.uint8)
+        kept = np.zeros((KEPT, pixels), np.float32)
+        tile = np.zeros(pixels, np.int32)
+        self._clear()
+        view.draw_triangles(rows)
+        view.shade(BACKGROUND, image, kept)
+        shadow_tiles(kept, still.shadow_map.shape[0], self._tiles, tile)
+        none, everywhere = np.full(pixels, -1, np.int32), np.ones_like(self._touched)
+        light_background(kept, tile, everywhere, none, still.shadow_map, image.reshape(-1, 3))
+        return Background(image, self._target.depth.copy(), kept, tile)
+
+    # --- what lets others through ---------------------------------------------------------------------------
+
+    def _near_to_far(self, view: View, rows: NDArray[np.int32]) -> NDArray[np.int32]:
+        distance = np.linalg.norm(self._table[rows, :3, 3] - view.eye, axis=1)
+        return rows[np.argsort(distance, kind="stable")]
+
+    def _draw_over(self, view: View, row: int, image: Image) -> None:
+        """Draw a translucent row over a picture: it hides nothing of what is drawn after it."""
+        depth = self._target.depth.copy()
+        self._target.triangle[:] = -1
+        view.draw_triangles(np.array([row], dtype=np.int32))
+        view.shade(TRANSLUCENT, image)
+        self._target.depth[:] = depth
+
+
+class View:
+    """One frame of a rasterizer: a camera's place and lights."""
+
+    def __init__(self, rasterizer: Rasterizer, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> None:
+        of = self._of = rasterizer
+        self.camera = int(model.camera(camera).id)
+        self.matrix = camera_matrix(model, data, self.camera, of._height, of._width)
+        self.eye = data.cam_xpos[self.camera].astype(np.float32)
+        self._near, self._far = (np.float32(distance) for distance in clipping(model))
+        self._lights: Lights = of._lamps.look(data, self.camera)
+        self.light_matrix = of._lamps.light_matrix(model, data)
+        # The headlight goes with the camera, whose matrix is a key of its own.
+        self.lighting = self._lights.to[1:].tobytes() + self._lights.axis[1:].tobytes()
+
+    def draw_triangles(self, rows: NDArray[np.int32]) -> None:
+        """Note which triangle of rows each pixel shows."""
+        of = self._of
+        draw_triangles(of._shapes, rows, of._table, self.matrix, self._near, self._far, of._clip, of._target)
+
+    def shade(self, mode: int, image: Image, kept: Floats | None = None) -> None:
+        """Colour the pixels in which a triangle was noted; see `shading.shade`."""
+        of = self._of
+        kept = np.zeros((KEPT, 0), np.float32) if kept is None else kept
+        shade(
+            of._shapes, of._surfaces, of._table, self._lights, self.eye, self.light_matrix, of._clip, of._shadow_map,
+            of._target, of._work, mode, image.reshape(-1, 3), kept,
+        )  # fmt: skip
+
+
+def _shapes(vertices: NDArray[np.void], triangles: NDArray[np.int32], rows: int) -> Shapes:
+    """Return triangles by rows, with the box around each row."""
+    row = vertices["row"].astype(np.int64)
+    first_vertex = np.searchsorted(row, np.arange(rows + 1)).astype(np.int32)
+    first_triangle = np.searchsorted(row[triangles[:, 0]], np.arange(rows + 1)).astype(np.int32)
+    positions = np.ascontiguousarray(vertices["position"])
+    low, high = (f.reduceat(positions, first_vertex[:-1], axis=0) for f in (np.minimum, np.maximum))
+    centre, half = 0.5 * (low + high), 0.5 * (high - low) + np.float32(1e-6)
+    return Shapes(positions, first_vertex, triangles, first_triangle, centre, half)

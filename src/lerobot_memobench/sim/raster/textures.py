@@ -1,0 +1,116 @@
+"""Textures as layers of one size, where they lie on shapes that bring no coordinates, and their coarser levels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.sim.raster.shapes import Triangles
+
+LAYER_SIZE = 512
+"""Side to which textures are brought, pixels: the largest of the project's own; a power of two."""
+SIDES = 6
+"""Of a cube, in OpenGL's order: +x, −x, +y, −y, +z, −z."""
+
+_ACROSS = ((2, -1), (2, 1), (0, 1), (0, 1), (0, 1), (0, -1))
+_DOWN = ((1, -1), (1, -1), (2, 1), (2, -1), (1, -1), (1, -1))
+"""For each side of a cube, the axis along which its picture goes and the direction (OpenGL 2.1, table 3.21)."""
+
+
+def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple[int, ...]]]:
+    """Return a model's textures at one size, and texture id → its layer, or six of a cube; layer 0 is white."""
+    from PIL import Image
+
+    layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
+    layer_of: dict[int, tuple[int, ...]] = {}
+    known: dict[bytes, int] = {}  # the sides of a cube are often one picture
+    for texture in range(model.ntex):
+        if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX or model.tex_nchannel[texture] != 3:
+            continue
+        height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+        start = int(model.tex_adr[texture])
+        pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
+        for picture in _pictures(model, texture, pixels):
+            content = picture.tobytes()
+            if content not in known:
+                known[content] = len(layers)
+                # At its own size this leaves every pixel as it is.
+                resized = Image.fromarray(picture).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC)
+                layers.append(np.asarray(resized))
+            layer_of[texture] = (*layer_of.get(texture, ()), known[content])
+    return np.stack(layers), layer_of
+
+
+def _pictures(model: mujoco.MjModel, texture: int, pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    """Return the picture of a flat texture, or the six of a cube, which may all be the one that there is."""
+    if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D:
+        return [pixels]
+    return [pixels] * SIDES if len(pixels) == pixels.shape[1] else np.split(pixels, SIDES)
+
+
+def levels_of(layers: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Return every layer at its size, at half of it, and so on down to one pixel, layer by layer.
+
+    Args:
+        layers: (L, LAYER_SIZE, LAYER_SIZE, 3).
+
+    Returns:
+        The pixels, red + 256 green + 65536 blue.
+    """
+    parts, level = [], layers.astype(np.uint16)
+    while True:
+        packed = np.zeros((*level.shape[:3], 4), np.uint8)
+        packed[..., :3] = level
+        parts.append(packed.view("<i4").reshape(len(layers), -1))
+        if level.shape[1] == 1:
+            return np.concatenate(parts, axis=1).astype(np.int32, copy=False).ravel()
+        rows = level[:, ::2] + level[:, 1::2]
+        level = (rows[:, :, ::2] + rows[:, :, 1::2] + 2) // 4
+
+
+def _full_size(model: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
+    """Return half extents (3,) of a geom as MuJoCo's renderer scales its shapes."""
+    size = np.array(model.geom_size[geom])
+    match mujoco.mjtGeom(int(model.geom_type[geom])):
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            return size[[0, 0, 0]]
+        case mujoco.mjtGeom.mjGEOM_CYLINDER | mujoco.mjtGeom.mjGEOM_CAPSULE:
+            return size[[0, 0, 1]]
+    return size
+
+
+def flat_coordinates(model: mujoco.MjModel, geom: int, shape: Triangles) -> Triangles:
+    """Lay a picture over a shape from above, as MuJoCo does: ``texrepeat`` times, or so many times per 2 m."""
+    points, normals, _, triangles = shape
+    material = int(model.geom_matid[geom])
+    scale = np.array(model.mat_texrepeat[material], dtype=np.float64)
+    size = _full_size(model, geom)[:2]
+    if not model.mat_texuniform[material]:
+        scale = np.where(size > 0, scale / np.where(size > 0, size, 1.0), scale)
+    uv = 0.5 * points[:, :2] * scale * [1.0, -1.0] - 0.5
+    return points, normals, uv, triangles
+
+
+def cube_coordinates(model: mujoco.MjModel, geom: int, shape: Triangles) -> Iterator[tuple[int, Triangles]]:
+    """Yield the sides of a cube around a shape that show on it, and the triangles that show each.
+
+    A triangle belongs to the side to which its middle points.
+    """
+    points, normals, _, triangles = shape
+    direction = np.asarray(points, dtype=np.float64)
+    if not model.mat_texuniform[int(model.geom_matid[geom])]:
+        direction = direction / np.maximum(_full_size(model, geom), 1e-9)
+    middle = direction[triangles].mean(axis=1)
+    axis = np.abs(middle).argmax(axis=1)
+    shown = 2 * axis + (np.take_along_axis(middle, axis[:, None], axis=1)[:, 0] < 0)
+    for side in np.unique(shown):
+        mine, index = np.unique(triangles[shown == side], return_inverse=True)
+        there = direction[mine]
+        depth = np.maximum(np.abs(there[:, side // 2]), 1e-9)
+        uv = [0.5 * sign * there[:, k] / depth + 0.5 for k, sign in (_ACROSS[side], _DOWN[side])]
+        # A picture ends at the cube's edges.
+        inside = np.clip(np.stack(uv, axis=1), 0.5 / LAYER_SIZE, 1 - 0.5 / LAYER_SIZE)
+        yield int(side), (points[mine], normals[mine], inside, index.reshape(-1, 3))

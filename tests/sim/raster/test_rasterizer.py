@@ -1,0 +1,143 @@
+"""What is kept from frame to frame changes no pixel, and the light is that of MuJoCo's own renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from lerobot_memobench.sim.raster.drawlist import build_draw_list
+from lerobot_memobench.sim.raster.highlights import Highlight
+from lerobot_memobench.sim.raster.rasterizer import KEPT_SCENES, Rasterizer
+from lerobot_memobench.sim.rendering import QUALITIES, ROOM, RenderSettings
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+
+SCENES = {
+    "put_the_tomato_into_the_top_drawer_of_the_cabinet": ("wooden_cabinet_1_top_level", -0.12),
+    "open_and_close_the_microwave": ("microwave_1_microjoint", -1.5),
+    "turn_on_the_stove_and_turn_it_off": ("flat_stove_1_button", 1.0),
+}
+"""A task with a fixture, and where its door, drawer or knob is open or on."""
+REACH = np.array([0.6, -0.5, -0.8, 0.2, 0.0, 0.5, 1.0])
+
+
+def states(sims: list[Simulation], joint: str, opened: float) -> Iterator[str]:
+    """Bring simulations of one scene into states that differ in what is kept, and name them."""
+    for k, sim in enumerate(sims):
+        sim.reset(7 + k)
+    yield "fixtures at different places"
+    sims[0].step(REACH)
+    sims[1].data.joint(joint).qpos[0] = opened
+    mujoco.mj_step1(sims[1].model, sims[1].data)
+    yield "one moved, one open"
+    sims[0].highlights = (Highlight((0.1, 0.0, 0.902), 0.12),)
+    yield "one highlighted"
+    sims[0].set_state(sims[1].state(), sims[1].fixture_poses())
+    yield "one as the other"
+    sims[1].reset(9)
+    yield "one reset"
+
+
+@pytest.mark.parametrize(
+    ("task", "quality"), [*((task, "default") for task in SCENES), ("turn_on_the_stove_and_turn_it_off", "fast")]
+)
+def test_frames_depend_on_nothing_that_is_kept(task: str, quality: str) -> None:
+    """They are those of a renderer that has drawn nothing, and nearly those of one for which nothing stands still.
+
+    Levels of textures are chosen at the ends of what is drawn of a surface, which things in front of it may part.
+    """
+    settings = RenderSettings(128, 128, quality)
+    sims = [Simulation(get_task(task), settings) for _ in range(2)]
+    model, draw_list = sims[0].model, build_draw_list(sims[0].model, ROOM)
+    others = {
+        most: Rasterizer(model, listed, 128, 128, QUALITIES[quality].shadow_map)
+        for most, listed in {0: draw_list, 2: replace(draw_list, still=0)}.items()
+    }
+    for state in states(sims, *SCENES[task]):
+        for sim in sims:
+            for name, camera in MJCF_CAMERAS.items():
+                ours = sim.render(name).astype(int)
+                for most, other in others.items():
+                    other._still.clear()
+                    other._shown = None
+                    off = np.abs(ours - other.draw(sim.model, sim.data, camera, sim.highlights))
+                    assert off.max() <= most, f"{state}, {name}"
+
+
+def test_no_more_scenes_are_kept_than_are_allowed() -> None:
+    sim = Simulation(get_task("open_and_close_the_microwave"), RenderSettings(32, 32))
+    rasterizer = Rasterizer(sim.model, build_draw_list(sim.model, ROOM), 32, 32, 64)
+    for seed in range(KEPT_SCENES + 2):
+        sim.reset(seed)
+        rasterizer.draw(sim.model, sim.data, "agentview")
+    assert len(rasterizer._still) == KEPT_SCENES
+
+
+# --- a scene with what the scenes of LIBERO have ---
+
+
+def textured_scene() -> mujoco.MjModel:
+    """Return spots, light of parallel rays, cubes and pictures on boxes and a floor, and what can be seen through."""
+    spec, shapes = mujoco.MjSpec(), mujoco.mjtGeom
+    spec.visual.headlight.ambient = [0.3, 0.3, 0.3]
+    _add_material(spec, "floor", (64, 64), repeat=(3, 3), uniform=True)
+    _add_material(spec, "picture", (64, 32), repeat=(2, 1), uniform=False)
+    _add_material(spec, "cube", (6 * 64, 64), repeat=(1, 1), uniform=False)
+    _add_material(spec, "one side", (64, 64), repeat=(1, 1), uniform=False, cube=True)
+    spec.add_material(name="shiny", rgba=[0.8, 0.3, 0.2, 1], specular=0.8, shininess=0.7)
+    lights, world = mujoco.mjtLightType, spec.worldbody
+    world.add_light(pos=[1, 1, 4], dir=[0, -0.15, -1], type=lights.mjLIGHT_SPOT, diffuse=[0.9] * 3, castshadow=False)
+    world.add_light(
+        pos=[-1, -1, 3], dir=[0.3, 0.3, -1], type=lights.mjLIGHT_SPOT, cutoff=30, exponent=5, castshadow=False,
+        attenuation=[1, 0.05, 0.02],
+    )  # fmt: skip
+    world.add_light(dir=[0.5, 0, -1], type=lights.mjLIGHT_DIRECTIONAL, ambient=[0.1, 0, 0], castshadow=False)
+    for kind, size, place, material in (
+        (shapes.mjGEOM_PLANE, [3, 3, 0.125], [0, 0, 0], "floor"),
+        (shapes.mjGEOM_BOX, [0.4, 0.3, 0.2], [0, 0, 0.3], "cube"),
+        (shapes.mjGEOM_BOX, [0.2, 0.3, 0.1], [-0.8, 0.4, 0.2], "picture"),
+        (shapes.mjGEOM_BOX, [0.2, 0.1, 0.2], [0.7, -0.5, 0.3], "one side"),
+        (shapes.mjGEOM_SPHERE, [0.25, 0, 0], [0.8, 0.5, 0.4], "shiny"),
+    ):
+        world.add_geom(type=kind, size=size, pos=place, material=material, group=1, quat=[0.95, 0.1, 0.05, 0.3])
+    world.add_geom(
+        type=shapes.mjGEOM_BOX, size=[0.3, 0.05, 0.3], pos=[-0.3, -0.9, 0.4], rgba=[0.2, 0.6, 1, 0.4], group=1
+    )
+    world.add_camera(name="above", pos=[0, -2.2, 2.0], xyaxes=[1, 0, 0, 0, 0.7, 0.75], fovy=50)
+    world.add_camera(name="inside", pos=[1.5, -1.2, 0.5], xyaxes=[0.6, 0.8, 0, -0.2, 0.15, 1], fovy=70)
+    return spec.compile()
+
+
+def _add_material(
+    spec: mujoco.MjSpec, name: str, shape: tuple[int, int], repeat: tuple[int, int], uniform: bool, cube: bool = False
+) -> None:
+    height, width = shape
+    kind = mujoco.mjtTexture.mjTEXTURE_CUBE if cube or height > 2 * width else mujoco.mjtTexture.mjTEXTURE_2D
+    squares = np.random.default_rng(3).integers(40, 255, (height // 8, width // 8, 3))
+    pixels = np.kron(squares, np.ones((8, 8, 1))).astype(np.uint8)
+    texture = spec.add_texture(name=name, type=kind, nchannel=3, height=height, width=width)
+    texture.data = pixels.tobytes()
+    material = spec.add_material(name=name, texrepeat=list(repeat), texuniform=uniform, specular=0.2, shininess=0.5)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+
+
+@pytest.mark.parametrize("camera", ["above", "inside"])
+def test_looks_like_mujocos_own_renderer(mujoco_renderer: type[mujoco.Renderer], camera: str) -> None:
+    model = textured_scene()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ours = Rasterizer(model, build_draw_list(model, sharp=True), 256, 256, 0, clamped=True)
+    model.vis.quality.offsamples = 0
+    with mujoco_renderer(model, 256, 256) as renderer:
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = [0, 1, 0, 0, 0, 0]
+        renderer.update_scene(data, camera, option)
+        theirs = renderer.render().astype(int)
+    off = np.abs(ours.draw(model, data, camera) - theirs)
+    assert theirs.std() > 50
+    assert off.mean() < 2.5
+    assert (off.max(axis=2) > 16).mean() < 0.03
