@@ -86,7 +86,7 @@ def test_a_killed_conversion_goes_on(folder, tmp_path, monkeypatch, holder, name
     convert(source, tmp_path / "ds")
     assert hashes(tmp_path / "ds") == hashes(tmp_path / "undisturbed")
     finished = 2 if holder is VideoWriter else 1
-    assert len(unpacked) == 3 - finished, "what is finished is not unpacked again"
+    assert len(unpacked) == 3 - finished, "finished files are not unpacked again"
 
 
 def _claim(path: Path, name: str, size: int) -> None:
@@ -98,7 +98,7 @@ def _claim(path: Path, name: str, size: int) -> None:
 
 
 def test_hostile_names_and_sizes_are_refused(folder, tmp_path, capsys):
-    """Each is named with its reason, nothing is written where it leads, and what is sound is converted."""
+    """Each is named with its reason, nothing is written where it leads, and the sound files are converted."""
     source, work = tmp_path / "a.zip", tmp_path / "work"
     work.mkdir()
     sound = (folder / "temporal" / f"{DRAWER}_demo.hdf5").read_bytes()

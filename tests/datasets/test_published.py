@@ -281,7 +281,7 @@ def test_liberos_rules_on_its_own_shapes(atom, at, true):
 
 @pytest.mark.skipif(not STOCK.exists(), reason="needs a file of stock LIBERO, which is in no repository")
 def test_a_file_of_stock_libero(tmp_path):
-    """Objects, joints and checkpoints are those that its simulator told when it wrote the file."""
+    """Objects, joints and checkpoints are those that its simulator noted when it wrote the file."""
     truth = json.loads(STOCK.with_suffix(".hdf5.truth.json").read_text())
     convert(STOCK, tmp_path / "ds")
     (table,) = (tmp_path / "ds" / "data").rglob("*.parquet")

@@ -21,7 +21,7 @@ from lerobot_memobench.datasets.hdf5.frames import FRAMES, QUARTER, Frame
 CAMERAS = {"agentview_image": "image", "robot0_eye_in_hand_image": "wrist_image"}
 LIBERO_CAMERAS = {"agentview_rgb": "image", "eye_in_hand_rgb": "wrist_image"}
 SCAN = Frame(QUARTER, (0.0, 0.0, 0.03))
-"""Of the authors' scans, say: their origin is 3 cm below ours, which no table says."""
+"""Frame of the authors' scans in this layout: no table of the reader has it."""
 FILE_OBJECT = "<_io.TextIOWrapper name='/home/them/task_config.bddl' mode='r' encoding='utf-8'>"
 
 

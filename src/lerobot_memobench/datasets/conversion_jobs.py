@@ -1,4 +1,4 @@
-"""What a conversion has to do: a job per demonstration of a file, and what of it cannot be used or is another task."""
+"""The work of a conversion: a job per demonstration of a file, its problems, and its differences to the catalogue."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ class ConversionJob(StagedJob):
 
 @dataclass
 class Plan:
-    """What is to be done, file after file.
+    """The work of a conversion, file after file.
 
     Attributes:
         folder: where episodes are staged.
         jobs: one per demonstration that looks as it should.
-        problems: what cannot be used.
-        notes: which tasks are not the catalogue's.
+        problems: files and groups that cannot be used, and why.
+        notes: differences of the others to what this package writes.
         image_size: (height, width) of the first demonstration, which all have.
     """
 
@@ -102,14 +102,14 @@ class Plan:
             self.problems.append(Problem(str(file.path), f"data/{group}", str(error)))
 
     def add_job(self, path: Path, group: str, image_size: tuple[int, int], frames: int) -> None:
-        """Add a demonstration, of whose pixels the job itself says whether they are of the first one's size."""
+        """Add a demonstration; its job refuses pictures that have not the size of the first one's."""
         self.image_size = self.image_size or image_size
         folder = self.folder / f"{len(self.jobs):06d}"
         self.jobs.append(ConversionJob(path, group, folder, self.image_size, frames, self.upside_down))
 
 
 def _notes(file: PublishedFile, demo: PublishedDemo) -> list[Problem]:
-    """Return in what a demonstration is not as the package's own; nothing where it makes no task or scene."""
+    """Return how a demonstration differs from this package's; nothing where it makes no task or scene."""
     try:
         task = task_of(file, demo).variant(0)
         reasons = [unlike_the_catalogue(task), other_scene(demo)]

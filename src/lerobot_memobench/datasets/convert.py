@@ -7,8 +7,8 @@ dataset to anybody. Of a zip archive one file at a time is unpacked, looked thro
 ::
 
     <staging>/episodes/                 finished episodes, see `staging`
-              files/00003.json          what the third file of an archive holds
-              unpacked/<its name>       the file at work
+              files/00003.json          groups, problems and notes of the third file of an archive
+              unpacked/<name>           the file that is being converted
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def convert(
         workers: processes.
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number.
             Of an archive its ``total`` is estimated from the files so far.
-        tell: told, before the first episode, about how large the dataset will be, and of each file of an archive.
+        tell: called, before the first episode, with the size of the dataset, and with each file of an archive.
 
     Raises:
         MemobenchError: there is nothing to convert, ``out`` holds something else, or its disk has no room (what is
@@ -189,7 +189,7 @@ class LeftOut(TypedDict):
 
 
 class FileRecord(TypedDict):
-    """What a file of an archive holds."""
+    """Groups, problems and notes of a file of an archive."""
 
     demonstrations: list[Sound]
     problems: list[LeftOut]
@@ -197,7 +197,7 @@ class FileRecord(TypedDict):
 
 
 def _tell_of_the_archive(archive: Archive, folder: Path, out: Path, tell: Callable[[str], None]) -> None:
-    """Tell the size of what is to be made, and of the file that will lie unpacked, before anything is."""
+    """Report the sizes of the dataset and of the largest unpacked file, before either is made."""
     size = run_size(archive.size // UNPACKED_FRAME, (LEROBOT,), IMAGE_SIZE)
     there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     largest = max((member.size for member in archive.members), default=0)
@@ -213,7 +213,7 @@ def _convert_archive(
     progress: ProgressCallback | None,
     tell: Callable[[str], None],
 ) -> None:
-    """Unpack, look through, convert and remove one file after another; those that are finished stay packed."""
+    """Unpack, look through, convert and remove one file after another; finished files stay packed."""
     records, unpacked = staging / "files", staging.absolute() / "unpacked"
     records.mkdir(exist_ok=True)
     shutil.rmtree(unpacked, ignore_errors=True)  # a killed run may have left a part
@@ -253,7 +253,7 @@ def _unpack_and_plan(archive: Archive, member: Member, unpacked: Path, plan: Pla
 
 
 def _write_down(record: Path, path: Path, plan: Plan) -> None:
-    """Record what a file holds, so that it need not be unpacked to know it."""
+    """Record the groups of a file, so that it need not be unpacked to know them."""
     content: FileRecord = {
         "demonstrations": [
             {"group": job.group, "height": job.image_size[0], "width": job.image_size[1], "frames": job.frames}
@@ -269,7 +269,7 @@ def _write_down(record: Path, path: Path, plan: Plan) -> None:
 
 
 def _take_up(record: Path, path: Path, plan: Plan) -> bool:
-    """Add to the plan what an earlier run found in a file; return whether one did."""
+    """Add the groups that an earlier run found in a file to the plan; return whether there was one."""
     try:
         found = read_json(record, FileRecord, "delete it to look through the file again")
     except FileNotFoundError:
@@ -282,7 +282,7 @@ def _take_up(record: Path, path: Path, plan: Plan) -> bool:
 
 
 class _Ahead:
-    """Tells how far an archive is: how many episodes the files hold that are still packed, those before them say."""
+    """Progress through an archive: files that are still packed are taken to be as full as those before them."""
 
     def __init__(self, size: int, progress: ProgressCallback | None) -> None:
         self._left, self._size, self._progress = size, size, progress

@@ -395,7 +395,7 @@ def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], wh
 
     Args:
         out: its destination. size: of the dataset, about. there: bytes of it that are staged already.
-        what: begins the sentence: how much will be made. work: bytes that are needed beside it while it is made.
+        what: begins the sentence: how much will be made. work: further bytes that are needed meanwhile.
 
     Raises:
         MemobenchError: not even one copy has room.

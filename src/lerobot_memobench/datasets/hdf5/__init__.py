@@ -12,7 +12,7 @@
 completed in order) and ``timestep_exec_start_idx`` (the frame at which execution starts) filled in. Frame t shows
 the observation before ``actions[t]``.
 
-The authors' files are of LIBERO's scenes, whose states have another order, other frames and other shapes than ours:
+The authors' files are of LIBERO's scenes. Their states have another order, other frames and other shapes than ours:
 ``frames`` puts them into ours, ``libero_rules`` evaluates predicates in theirs, ``archive`` reads them out of a zip.
 
 What this package knows beyond the layout is in further attributes, so that every reader of the layout finds what

