@@ -219,18 +219,46 @@ def test_what_leans_in_a_drawer_is_laid_down_again() -> None:
     assert leans == 1
 
 
-def test_a_handle_that_slipped_is_taken_again() -> None:
-    left = 12
+@pytest.mark.slow
+def test_what_is_pushed_up_over_its_drawer_is_not_dropped() -> None:
+    """A bowl let go of 13 cm too high had come to stand on its side, where it can hardly be taken."""
+    bowl, drawer = "akita_black_bowl_1", "wooden_cabinet_1_top_region"
+    left, heights = 12, []
+
+    def push(episode: Episode, action: np.ndarray) -> np.ndarray:
+        nonlocal left
+        over = episode.sim.body_pose(bowl)[0] - episode.sim.site_pose(drawer)[0]
+        if left and action[6] > 0 and np.hypot(*over[:2]) < 0.03 and over[2] < 0.1:
+            left -= 1
+            return np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0, 1.0])
+        if left < 12 and action[6] < 0:
+            heights.append(over[2])
+        return action
+
+    task = get_task("check_the_middle_drawer_and_put_the_black_bowl_in_the_top_drawer_and_close_it")
+    assert not play(task, 10_000, disturb=push).faults
+    assert heights[0] < 0.03
+
+
+@pytest.mark.parametrize(
+    ("task", "left"),
+    [
+        (get_task("check_the_top_drawer_of_the_cabinet"), 12),
+        pytest.param(get_task("check_the_top_drawer_a_given_number_of_times").variant(0), 80, marks=pytest.mark.slow),
+    ],
+)
+def test_a_handle_that_slipped_is_taken_again(task: Task, left: int) -> None:
+    """As often as it takes, where going on would spoil a count."""
 
     def slip(episode: Episode, action: np.ndarray) -> np.ndarray:
         nonlocal left
         _, q = episode.sim.world.articulation("wooden_cabinet_1_top_region")
-        if left and q < -0.07:
+        if left and q < -0.07 and action[6] > 0:
             left -= 1
             return np.array([0.0, 0.4, 0.4, 0.0, 0.0, 0.0, -1.0])
         return action
 
-    assert not play(get_task("check_the_top_drawer_of_the_cabinet"), 10_000, disturb=slip).faults
+    assert not play(task, 10_000, disturb=slip).faults
     assert left == 0
 
 
