@@ -1,7 +1,8 @@
-"""Import, once and with bytecode on, what the source in some folders imports, late imports included.
+"""Import, once and with bytecode on, what the source in some folders imports, late imports included; draw a picture.
 
-Where PYTHONDONTWRITEBYTECODE is set, as in many containers, every process would compile all of it anew. What is not
-installed here or does not import is left alone: this only saves time.
+Where PYTHONDONTWRITEBYTECODE is set, as in many containers, every process would compile all of it anew. The functions
+that draw are compiled by numba at their first call and kept. What is not installed here or does not import is left
+alone: this only saves time.
 
     python scripts/compile_imports.py src
 """
@@ -41,5 +42,22 @@ def compile_imports(folders: Iterable[Path]) -> None:
             importlib.import_module(name)
 
 
+def draw() -> None:
+    """Take a control step and draw both cameras, so that numba keeps what it compiles for it."""
+    with contextlib.suppress(Exception):
+        from lerobot_memobench.sim.rendering import RenderSettings
+        from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
+        from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+        for quality in ("fast", "default"):
+            simulation = Simulation(get_task(task_names()[0]), RenderSettings(64, 64, quality))
+            simulation.reset(0)
+            simulation.step(NO_OP)
+            for camera in MJCF_CAMERAS:
+                simulation.render(camera)
+                simulation.geoms(camera)
+
+
 if __name__ == "__main__":
     compile_imports([Path(folder) for folder in sys.argv[1:]])
+    draw()

@@ -146,33 +146,35 @@ def shade(
     size = (4 * side * side - 1) // 3  # of all levels of a layer
     for textured in (False, True):
         count = 0
-        for n in range(runs):
-            start, length, triangle = work.runs[n, 0], work.runs[n, 1], work.runs[n, 2]
-            row = surfaces.row[shapes.triangles[triangle, 0]]
-            layer = np.int64(table[row, 4, 3])
-            if (layer > 0) != textured:
-                continue
-            slot = work.slot[triangle]
-            alpha = min(max(table[row, 3, 3], _0), _1)
+        for n in range(runs + 1):  # the last one is none: it finishes what is left
+            start, length, alpha = 0, 0, _1
+            slot, layer = 0, 0
+            if n < runs:
+                start, length = np.int64(work.runs[n, 0]), np.int64(work.runs[n, 1])
+                triangle = work.runs[n, 2]
+                row = surfaces.row[shapes.triangles[triangle, 0]]
+                layer = np.int64(table[row, 4, 3])
+                if (layer > 0) != textured:
+                    continue
+                slot, alpha = np.int64(work.slot[triangle]), min(max(table[row, 3, 3], _0), _1)
             done = 0
-            while done < length:
+            while done < length or (n == runs and count > 0):
                 here = min(length - done, BATCH - count)
-                pixel = start + done
-                _fill(work.planes, slot, pixel, width, here, count, textured, shadows, work.ramp, t, i)
-                if textured:
-                    _choose_levels(work.planes, slot, pixel, width, here, count, layer * size, side, work.ramp, t, i)
-                done += here
-                count += here
-                if count == BATCH or (mode == TRANSLUCENT and done == length):
+                if here > 0:
+                    pixel = start + done
+                    _fill(work.planes, slot, pixel, width, here, count, textured, shadows, work.ramp, t, i)
+                    if textured:
+                        _choose_levels(
+                            work.planes, slot, pixel, width, here, count, layer * size, side, work.ramp, t, i
+                        )
+                    done += here
+                    count += here
+                if count == BATCH or n == runs or (mode == TRANSLUCENT and done == length):
                     if count < BATCH:
-                        _rest(count, side, t, i)
+                        _rest(count, t, i)
                     _colour(textured, shadows, texels, side, shadow_map, mode, t, i)
                     _write(count, mode, alpha, image, kept, t, i)
                     count = 0
-        if count:
-            _rest(count, side, t, i)
-            _colour(textured, shadows, texels, side, shadow_map, mode, t, i)
-            _write(count, mode, _1, image, kept, t, i)
 
 
 @compiled
@@ -412,7 +414,7 @@ def _choose_levels(
 
 
 @compiled
-def _rest(count: Any, side: Any, t: Any, i: Any) -> None:
+def _rest(count: Any, t: Any, i: Any) -> None:
     """Fill the rest of the last batch with what can be computed with."""
     for n in range(_FLOAT_ROWS):
         value = _1 if n == _INVERSE else _0
