@@ -16,6 +16,7 @@ from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats, write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.lerobot_format.terms import terms
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.errors import MemobenchError
@@ -348,6 +349,7 @@ def test_the_papers_world_comes_back_and_has_terms_of_its_own(demos, make_task, 
         card = DatasetCard.load(root / "README.md")
         assert card.data.license == licence
         assert ("boxes stand in for them: " in card.text) == bool(demo.stand_ins)
+    assert terms([{"task_name": name, "memory_type": "spatial", "seed": -1}])[0] == "cc-by-nc-4.0", "placed in ours"
     assert digest(spatial) != digest(replace(spatial, task=spatial.task.in_world(MEMOBENCH)))
 
 

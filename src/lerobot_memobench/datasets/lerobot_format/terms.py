@@ -29,15 +29,16 @@ def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
     Args:
         infos: of its episodes (`staging.Info`).
     """
+    infos = list(infos)
     there = [info for info in infos if info.get("world") == LIBERO]
-    if not there:
-        return "apache-2.0", OWN
     theirs = {
-        "The demonstrations": any(info["seed"] < 0 for info in there),  # converted: `memobench generate` knows the seed
+        "The demonstrations": any(info["seed"] < 0 for info in infos),  # converted: `memobench generate` knows the seed
         "The scanned objects": any(map(_shows_scans, there)),
     }
     parts = [_AUTHORS.format(what=what) for what, shown in theirs.items() if shown]
-    return NOT_COMMERCIAL if parts else SEVERAL, "\n\n".join([_LIBERO, *parts])
+    if not there and not parts:
+        return "apache-2.0", OWN
+    return NOT_COMMERCIAL if parts else SEVERAL, "\n\n".join([*([_LIBERO] if there else []), *parts])
 
 
 def _shows_scans(info: Mapping[str, Any]) -> bool:
