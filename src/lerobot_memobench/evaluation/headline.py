@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY, UNTOLD
-from lerobot_memobench.evaluation.metrics import Record, policy_inputs
-from lerobot_memobench.evaluation.records import Run, of_all, stand_ins_of
+from lerobot_memobench.evaluation.metrics import Record, policy_inputs, stand_ins_of
+from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
 

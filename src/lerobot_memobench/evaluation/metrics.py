@@ -123,7 +123,19 @@ def mixtures(records: Iterable[Record]) -> list[str]:
 
 def notes_on(records: Sequence[Record]) -> list[str]:
     """Return a sentence for each thing about rollouts that a reader of their figures must know."""
-    return faults(records) + unshown_prompts(records) + mixtures(records)
+    return faults(records) + unshown_prompts(records) + mixtures(records) + missing_scans(records)
+
+
+def stand_ins_of(records: Iterable[Record]) -> list[str]:
+    """Return the classes for which boxes stood in, in any of the rollouts, because their scans were missing."""
+    return sorted({name for record in records for name in record.get("stand_ins", ())})
+
+
+def missing_scans(records: Iterable[Record]) -> list[str]:
+    """Return a sentence where boxes stood in for scans."""
+    missing = ", ".join(stand_ins_of(records))
+    said = f"scans were missing, so boxes stood in for {missing}: figures with and without them do not compare"
+    return [said] if missing else []
 
 
 def unshown_prompts(records: Iterable[Record]) -> list[str]:

@@ -277,11 +277,6 @@ def of_all(records: Iterable[Mapping[str, Any]], key: str) -> str:
     return str(found)
 
 
-def stand_ins_of(records: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the classes for which others stood in, in any of the rollouts, because their scans were missing."""
-    return sorted({name for record in records for name in record.get("stand_ins", ())})
-
-
 def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
     """Return a result card (see `run.card`).
 
@@ -421,10 +416,6 @@ def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
     if not records:
         told = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{told}; run an evaluation first")
-    if missing := stand_ins_of(records):
-        notes.append(
-            f"scans were missing, so boxes stood in for {', '.join(missing)}: figures with them do not compare"
-        )
     return records, notes + notes_on(records)
 
 

@@ -138,7 +138,7 @@ def prefix_table(summary: Summary) -> Table:
 
 FURTHER_NOTES = {
     "wrong_order": " Wrong order: the steps of a procedure were done in another order than its prompt's.",
-    "cut_off": " Cut off: the horizon is shorter than the protocol's 1,200 steps, so nobody knows what was remembered.",
+    "cut_off": " Cut off: the horizon is shorter than the protocol's, so nobody knows what was remembered.",
     "miscount": " Miscount: the event was done too seldom or too often.",
     "wrong_place": " Wrong place: the thing was looked for where it is not.",
     "invalid_action": " Invalid action: one of another shape, or not finite, broke the rollout off.",

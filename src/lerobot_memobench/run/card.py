@@ -29,7 +29,8 @@ from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.upstream import DIFFERENCES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
-from lerobot_memobench.evaluation.records import CARD_FILE, stand_ins_of
+from lerobot_memobench.evaluation.metrics import stand_ins_of
+from lerobot_memobench.evaluation.records import CARD_FILE
 from lerobot_memobench.evaluation.tables import markdown_text
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
