@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.pacing import NOTHING, Pacing, steps_per_action
 from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
-from lerobot_memobench.envs.upstream import SettlingSimulation
 from lerobot_memobench.errors import check_choice
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
@@ -100,7 +99,7 @@ class Episode:
         self._limit = horizon * steps_per_action(speed)
         self._paced = pause_steps, speed, replan_steps
         self.demonstration_prompt = demonstration_prompt and task.prompt is not None
-        self.sim = SettlingSimulation(task, render) if protocol == UPSTREAM else Simulation(task, render)
+        self.sim = Simulation(task, render)
         self._slots: ObjectSlots | None = None
         self.task = task
         self.seed = -1
@@ -124,10 +123,12 @@ class Episode:
             task = self.published.variant(variant)
         self.task = task
         self.choice = None if variant is None else Choice(task)
-        self.progress = Progress(task, UPSTREAM_EVALUATIONS if self.protocol == UPSTREAM else 1)
-        if isinstance(self.sim, SettlingSimulation):
-            self.sim.follow(self.progress.settle)
-        self.sim.reset(self.seed)
+        if self.protocol == UPSTREAM:
+            self.progress = Progress(task, UPSTREAM_EVALUATIONS)
+            self.sim.reset(self.seed, self.progress.settle)
+        else:
+            self.progress = Progress(task)
+            self.sim.reset(self.seed)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
         self.step_index = 0

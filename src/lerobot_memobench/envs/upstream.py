@@ -6,15 +6,11 @@ written from that behaviour.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
-
-from numpy.typing import ArrayLike
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import UPSTREAM, UPSTREAM_HORIZON
-from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import PUBLISHED, REFERENTS
 
 DIFFERENCES = (
@@ -54,28 +50,3 @@ def upstream_settings(prefix: str, asked: Mapping[str, Any]) -> dict[str, Any]:
                 f"and {prefix}{name}={str(asked[name]).lower()} was asked for; leave one of the two out"
             )
     return {"demonstration_prompt": False, "horizon": min(asked["horizon"], UPSTREAM_HORIZON)}
-
-
-class SettlingSimulation(Simulation):
-    """A simulation whose stabilisation steps are followed, each of them: their clock runs there already."""
-
-    _following: Callable[[Callable[[Atom], bool]], None] | None = None
-    _settling = False
-
-    def follow(self, following: Callable[[Callable[[Atom], bool]], None]) -> None:
-        """Hand `holds` to ``following`` after each stabilisation step of later resets."""
-        self._following = following
-
-    def reset(self, seed: int) -> None:
-        """Draw the initial state of a seed and let it settle, followed; see `Simulation.reset`."""
-        self._settling = True
-        try:
-            super().reset(seed)
-        finally:
-            self._settling = False
-
-    def step(self, action: ArrayLike) -> None:
-        """Advance by one control step; see `Simulation.step`."""
-        super().step(action)
-        if self._settling and self._following is not None:
-            self._following(self.holds)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -115,10 +115,14 @@ class Simulation:
 
     # --- life -----------------------------------------------------------------------------------------------
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int, settling: Callable[[Callable[[Atom], bool]], None] | None = None) -> None:
         """Draw the initial state of a seed and let it settle for the stabilisation steps.
 
         Equal seeds of equal tasks give bit-equal states, whatever was simulated before.
+
+        Args:
+            seed: of the scene.
+            settling: called with `holds` after each stabilisation step.
         """
         self._at_home = None
         mujoco.mj_resetData(self.model, self.data)
@@ -132,6 +136,8 @@ class Simulation:
             self._controller.gripper = np.array([1.0, -1.0])
         for _ in range(STABILISATION_STEPS):
             self.step(NO_OP)
+            if settling is not None:
+                settling(self.holds)
         self._start.mark_hand()
         self._at_home = self.snapshot() if self._strict else None
         self.begin_execution()
