@@ -25,11 +25,13 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, corners, rotation
-from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.worlds import get_scene
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
+from lerobot_memobench.tasks.task import LIBERO
 from tests.support import libero_layout
+from tests.support.libero import needs_assets
 from tests.support.short_demonstrations import drawn_steps, with_pictures
 
 DRAWER = "check_the_middle_drawer_of_the_cabinet"
@@ -300,3 +302,27 @@ def test_a_file_of_stock_libero(tmp_path):
         np.testing.assert_allclose(sorted(joints), drawers, rtol=0, atol=2e-4)
     for number, told in enumerate(truth.values()):
         assert read_episode(tmp_path / "ds", number).whole["key_frames"] == told["meta"]["key_frame"]
+
+
+@needs_assets
+def test_a_file_keeps_its_scenes_in_the_papers_world(drawer, tmp_path):
+    """States are the file's to the bit, and the checkpoint is evaluated by LIBERO's rules."""
+    path = libero_layout.write(tmp_path / "drawer_demo.hdf5", drawer)
+    summary = convert(path, tmp_path / "ds", world=LIBERO)
+    assert (summary.exit_status, summary.episodes, summary.notes) == (0, 1, ())
+    episode = read_episode(tmp_path / "ds", 0)
+    with h5py.File(path) as file:
+        np.testing.assert_array_equal(episode.columns["states"], file["data/demo_1/states"][:])
+    assert (episode.world, episode.whole["key_frames"]) == (LIBERO, [SHUT])
+    np.testing.assert_allclose(episode.columns["observation.state"], drawer.proprio, rtol=0, atol=1e-6)
+
+
+@needs_assets
+def test_scenes_of_this_package_are_not_the_papers_world(drawer, tmp_path):
+    path = libero_layout.write(tmp_path / "drawer_demo.hdf5", drawer)
+    with h5py.File(path, "a") as file:
+        attributes = file["data/demo_1"].attrs
+        attributes["model_file"] = attributes["model_file"].replace('model="base"', 'model="memobench"')
+    summary = convert(path, tmp_path / "ds", world=LIBERO)
+    assert summary.folder is None
+    assert "convert it without --world libero" in str(summary.problems[0])

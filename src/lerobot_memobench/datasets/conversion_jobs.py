@@ -11,6 +11,7 @@ from lerobot_memobench.datasets.hdf5.restore import NO_SEED, other_scene, restor
 from lerobot_memobench.datasets.lerobot_format.layout import EpisodeRecord
 from lerobot_memobench.datasets.staging import EpisodeStage, StagedJob, episode_info, stage_failure
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, World
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class ConversionJob(StagedJob):
     image_size: tuple[int, int]
     frames: int
     upside_down: bool = False
+    world: World = MEMOBENCH
 
     @property
     def task_name(self) -> str:
@@ -58,7 +60,7 @@ class ConversionJob(StagedJob):
                     f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
                     f"demonstration {self.image_size[0]}×{self.image_size[1]}"
                 )
-            demo = restore(task_of(file, found), found)
+            demo = restore(task_of(file, found).in_world(self.world), found)
             EpisodeRecord.model_validate(episode_info(demo))  # here it ends one episode, when the tables are made all
             return demo
 
@@ -69,6 +71,8 @@ class Plan:
 
     Attributes:
         folder: where episodes are staged.
+        upside_down: whether pictures are stored bottom row first.
+        world: of the scenes that states are put into.
         jobs: one per demonstration that looks as it should.
         problems: files and groups that cannot be used, and why.
         notes: differences of the others to what this package writes.
@@ -77,6 +81,7 @@ class Plan:
 
     folder: Path
     upside_down: bool
+    world: World = MEMOBENCH
     jobs: list[ConversionJob] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
     notes: list[Problem] = field(default_factory=list)
@@ -97,7 +102,7 @@ class Plan:
         try:
             demo = file.read(group)
             self.add_job(file.path, group, demo.image_size, len(demo.states))
-            self.notes += _notes(file, demo)
+            self.notes += _notes(file, demo, self.world)
         except Unusable as error:
             self.problems.append(Problem(str(file.path), f"data/{group}", str(error)))
 
@@ -105,14 +110,14 @@ class Plan:
         """Add a demonstration; its job refuses pictures that have not the size of the first one's."""
         self.image_size = self.image_size or image_size
         folder = self.folder / f"{len(self.jobs):06d}"
-        self.jobs.append(ConversionJob(path, group, folder, self.image_size, frames, self.upside_down))
+        self.jobs.append(ConversionJob(path, group, folder, self.image_size, frames, self.upside_down, self.world))
 
 
-def _notes(file: PublishedFile, demo: PublishedDemo) -> list[Problem]:
+def _notes(file: PublishedFile, demo: PublishedDemo, world: World) -> list[Problem]:
     """Return how a demonstration differs from this package's; nothing where it makes no task or scene."""
     try:
         task = task_of(file, demo).variant(0)
-        reasons = [unlike_the_catalogue(task), other_scene(demo)]
+        reasons = [unlike_the_catalogue(task), None if world == LIBERO else other_scene(demo)]
     except MemobenchError:  # named when it is converted
         return []
     if file.lacks_its_text:

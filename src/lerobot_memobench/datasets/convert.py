@@ -41,11 +41,13 @@ from lerobot_memobench.datasets.staging import (
     remove_staging,
     staged,
 )
+from lerobot_memobench.envs.world_assets import check_assets
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, free_bytes, in_words, read_json, telling_of_the_disk, write_file
 from lerobot_memobench.jobs.executors import run_jobs
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
+from lerobot_memobench.tasks.task import MEMOBENCH, World
 
 UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
 """Bytes of a frame's pictures in the published files, which do not pack them."""
@@ -79,6 +81,7 @@ def convert(
     *,
     repo_id: str = DEFAULT_REPO_ID,
     upside_down: bool = False,
+    world: World = MEMOBENCH,
     workers: int = 1,
     progress: ProgressCallback | None = None,
     tell: Callable[[str], None] = lambda _: None,
@@ -90,6 +93,7 @@ def convert(
         out: absent, empty, or a conversion of the same files that was not finished.
         repo_id: name of the dataset.
         upside_down: the images are stored as robosuite's renderer gives them, bottom row first: turn them up.
+        world: of the scenes that states are put into: this package's, or ``libero``, which keeps those of LIBERO.
         workers: processes.
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number.
             Of an archive its ``total`` is estimated from the files so far.
@@ -100,6 +104,7 @@ def convert(
             finished stays).
     """
     source, out = Path(source).absolute(), Path(out)
+    check_assets(world)
     if not source.exists():
         raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")
     archive = Archive(source) if is_archive(source) else None
@@ -109,6 +114,7 @@ def convert(
         if archive is None
         else [[member.name, member.size, member.checksum] for member in archive.members],
         "upside_down": upside_down,
+        **({} if world == MEMOBENCH else {"world": world}),
     }
     if is_dataset(out):
         return _finished(out, request)
@@ -118,7 +124,7 @@ def convert(
         telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
         episodes_folder(out, request) as folder,
     ):
-        plan = Plan(folder, upside_down)
+        plan = Plan(folder, upside_down, world)
         if archive is None:
             for path in files:
                 plan.add(path)

@@ -1,8 +1,8 @@
-"""Put states of LIBERO's scenes into this package's: joints by name, things turned and shifted by their class.
+"""Put states of LIBERO's scenes into a task's scene: joints by name, things turned and shifted by their class.
 
 LIBERO's bodies have other frames than ours, and their joints stand in another order. A thing is put where the box
 around its collision shapes is: its middle from above, and its underside. So what the hand touches there, it touches
-here.
+here. In the world `libero` things have LIBERO's frames, and nothing is turned.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lerobot_memobench.datasets.hdf5.reading import Unusable
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.assets.registry import split_class
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import LIBERO, Task
 
 States = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ stand on the table show it."""
 
 
 def place(task: Task, sim: Simulation, scene: ModelFile, states: States) -> tuple[States, dict[str, Pose]]:
-    """Return states (T, D) of a model file's scene as states of ours, and the poses of our fixtures.
+    """Return states (T, D) of a model file's scene as states of the task's, and the poses of its fixtures.
 
     Raises:
         Unusable: the scene lacks a joint or a body, has one beyond the task, or a class has no known frame.
@@ -145,11 +145,15 @@ def _check_base(sim: Simulation, scene: ModelFile) -> None:
 def _frame_of(task: Task, scene: ModelFile, instance: str) -> Frame:
     """Return the frame of an instance of a class of `FRAMES`."""
     class_name = {**task.objects, **task.fixtures}[instance]
-    if scene.name == OURS:
+    if _same_frames(task, scene):
         return IDENTITY
     if class_name not in FRAMES:
         raise Unusable(f"{instance!r} cannot be placed: the frame of LIBERO's class {class_name!r} is not known")
     return FRAMES[class_name]
+
+
+def _same_frames(task: Task, scene: ModelFile) -> bool:
+    return scene.name == OURS or task.world == LIBERO
 
 
 def _fixture_pose(task: Task, scene: ModelFile, name: str) -> Pose:
@@ -164,7 +168,7 @@ def _fixture_pose(task: Task, scene: ModelFile, name: str) -> Pose:
 
 def _frame(task: Task, sim: Simulation, scene: ModelFile, instance: str, positions: States) -> Frame:
     """Return the frame of an object, of a scan by how high it stands."""
-    if scene.name == OURS or split_class(task.objects[instance])[0] not in SCANS:
+    if _same_frames(task, scene) or split_class(task.objects[instance])[0] not in SCANS:
         return _frame_of(task, scene, instance)
     starts = next((atom.args[1] for atom in task.init if atom.args[:1] == (instance,) and len(atom.args) == 2), "")
     region = task.regions.get(starts)

@@ -1,10 +1,10 @@
 """Restore a demonstration from a group of the published layout: its task, its execution, its checkpoints.
 
 The layout holds states, not what the arm felt or which predicates held. States of LIBERO's scenes are put into ours
-first (`frames`). Proprioception and visible objects are read off them in the simulator; where a stranger's
-demonstration prompt highlights something is not known. Checkpoint columns come from the key frames; where one is
-missing (-1) its predicate is evaluated on the states, with the latches and orders that a rollout has, and in LIBERO's
-scenes by LIBERO's own shapes and rules (`libero_rules`).
+first (`frames`), unless the task is in their world. Proprioception and visible objects are read off them in the
+simulator; where a stranger's demonstration prompt highlights something is not known. Checkpoint columns come from the
+key frames; where one is missing (-1) its predicate is evaluated on the states, with the latches and orders that a
+rollout has, and in LIBERO's scenes by LIBERO's own shapes and rules (`libero_rules`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
 from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
-from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, Task
+from lerobot_memobench.tasks.task import BDDL_FILE, LIBERO, MEMORY_TYPES, METADATA_FILE, Task
 
 NO_SEED = -1
 """Seed of a demonstration that does not say it."""
@@ -41,12 +41,12 @@ UNKNOWN = "tasks"
 
 @dataclass(frozen=True)
 class Placed:
-    """A demonstration in our scene.
+    """A demonstration in the task's scene.
 
     Attributes:
-        states: (T, D) of our scene.
-        fixture_poses: where our fixtures stand.
-        scene: the scene that the states come from, where it is not ours: it answers ``in`` and ``on``.
+        states: (T, D) of that scene.
+        fixture_poses: where its fixtures stand.
+        scene: the scene that the states come from, where its shapes are others: it answers ``in`` and ``on``.
     """
 
     states: NDArray[np.float64]
@@ -85,8 +85,9 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
             ),
             success=bool(demo.extras.get("success", read_off.success or (bool(frames) and min(frames) >= 0))),
             fixture_poses=placed.fixture_poses,
-            model_xml=demo.model_file if placed.scene is None else "",
+            model_xml=demo.model_file if placed.scene is None and task.world != LIBERO else "",
             scene_hash=str(demo.extras.get("scene_hash", "")),
+            stand_ins=sim.stand_ins,
             objects=read_off.objects,
         )
         found = digest(restored)
@@ -98,7 +99,9 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
 
 
 def _placed(sim: Simulation, task: Task, demo: PublishedDemo) -> Placed:
-    """Return states and fixtures in our scene; where this package wrote them, they are."""
+    """Return states and fixtures in the task's scene; where this package wrote them, they are in its own world's."""
+    if task.world == LIBERO and (is_ours(demo) or ModelFile(demo.model_file).name == OURS):
+        raise Unusable("its scenes are of world=memobench, not of LIBERO's assets; convert it without --world libero")
     if is_ours(demo) and "fixture_poses" in demo.extras:
         if demo.states.shape[1] != sim.state_dim:
             raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {task.name}")
@@ -107,7 +110,7 @@ def _placed(sim: Simulation, task: Task, demo: PublishedDemo) -> Placed:
         raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is not known")
     scene = ModelFile(demo.model_file)
     states, fixture_poses = place(task, sim, scene, demo.states)
-    return Placed(states, fixture_poses, None if scene.name == OURS else scene)
+    return Placed(states, fixture_poses, None if scene.name == OURS or task.world == LIBERO else scene)
 
 
 def is_ours(demo: PublishedDemo) -> bool:
@@ -119,7 +122,10 @@ def other_scene(demo: PublishedDemo) -> str | None:
     """Return how a demonstration's scene is not of this package, None where it is."""
     if is_ours(demo) or not demo.model_file.strip() or ModelFile(demo.model_file).name == OURS:
         return None
-    return "its scenes are LIBERO's: pictures and actions are as they were, states are put into this package's scenes"
+    return (
+        "its scenes are LIBERO's: pictures and actions are as they were, states are put into this package's scenes; "
+        "--world libero keeps them"
+    )
 
 
 def _known_or_read_off(frames: list[int], satisfied: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -185,7 +191,7 @@ def _read_off(
     sim: Simulation, task: Task, demo: PublishedDemo, placed: Placed, exec_start: int, *, asked: bool
 ) -> ReadOff:
     """Show the states to the simulator one after the other; evaluate goals and checkpoints where they are ``asked``."""
-    hold_steps = HOLD_STEPS if placed.scene is None else libero_rules.HOLD_STEPS
+    hold_steps = HOLD_STEPS if placed.scene is None and task.world != LIBERO else libero_rules.HOLD_STEPS
     evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)], hold_steps)
     holds = sim.holds if placed.scene is None else LiberoRules(task, placed.scene, sim.holds).holds
     look = ObjectSlots(sim)
