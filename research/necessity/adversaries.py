@@ -47,9 +47,9 @@ LEVELS = ("bottom", "middle", "top")
 TIMES = ("once", "twice", "three times")
 NOTE = 0.03
 """Distance that stands for one event where a drawer or an object is the note, m."""
-SLOT, PUNCTUAL = 32, 2
+SLOT, PUNCTUAL = 32, 3
 """Control steps of a slot of the clock, and within how many of them the hand comes home that comes in it."""
-RETURN = 14
+RETURN = 12
 """Control steps from the place where the hand hovers to its home."""
 HOVER = 0.08
 """Height above home at which the hand hovers, m."""
