@@ -628,7 +628,9 @@ def _look_up(shadow_map: Any, t: Any, i: Any) -> None:
         r = _1 if depth <= t[(_DEPTHS + 2) * STRIDE + x] else _0
         s = _1 if depth <= t[(_DEPTHS + 3) * STRIDE + x] else _0
         upper, lower = p + across * (q - p), r + across * (s - r)
-        t[_LIT * STRIDE + x] = upper + down * (lower - upper)
+        u, v = t[8 * STRIDE + x], t[9 * STRIDE + x]
+        # Beyond the map nothing casts shadows.
+        t[_LIT * STRIDE + x] = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)
 
 
 @compiled
@@ -677,7 +679,8 @@ def light_background(kept: Any, tile: Any, touched: Any, triangle: Any, shadow_m
         r = _1 if depth <= shadow_map[top + 1, left] else _0
         s = _1 if depth <= shadow_map[top + 1, left + 1] else _0
         upper, lower = p + across * (q - p), r + across * (s - r)
-        lit = upper + down * (lower - upper)
+        u, v = kept[6, k], kept[7, k]
+        lit = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)
         for c in range(3):
             colour = kept[c, k] + lit * kept[3 + c, k]
             image[k, c] = np.uint8(min(max(colour, _0), _255) + _HALF)
