@@ -71,7 +71,7 @@ class Renderer(Protocol):
 
 
 CACHED_RENDERERS = 4
-"""Renderers kept per thread: each holds its scene's textures, some 20 MB."""
+"""Renderers kept per thread: each holds its scene's textures and background, some 40 MB."""
 
 
 class _Thread(threading.local):
