@@ -106,7 +106,7 @@ def free_renderer(renderer: Renderer) -> None:
 
 
 def get_rasterizer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> Rasterizer:
-    """Return this thread's renderer for a scene that also says which geom each pixel shows.
+    """Return this thread's renderer for a scene that also maps pixels to geoms.
 
     It is the one of `get_renderer`; where GL draws the frames, one of the same size.
     """

@@ -1,4 +1,4 @@
-"""What is kept from frame to frame changes no pixel, and the light is that of MuJoCo's own renderer."""
+"""Pictures kept from frame to frame change no pixel, and the light is that of MuJoCo's own renderer."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REACH = np.array([0.6, -0.5, -0.8, 0.2, 0.0, 0.5, 1.0])
 
 
 def states(sims: list[Simulation], joint: str, opened: float) -> Iterator[str]:
-    """Bring simulations of one scene into states that differ in what is kept, and name them."""
+    """Bring simulations of one scene into states that differ in their still rows, and name them."""
     for k, sim in enumerate(sims):
         sim.reset(7 + k)
     yield "fixtures at different places"

@@ -48,7 +48,7 @@ class DrawList:
         casting: (rows,) whether a row casts shadows.
         layers: (L, LAYER_SIZE, LAYER_SIZE, 3) uint8 textures, the first one white.
         materials: (rows, 4) specular, shininess exponent, emission, layer.
-        mirror: what reflects the scene, if anything.
+        mirror: the geom that reflects the scene, if there is one.
     """
 
     vertices: NDArray[np.void]

@@ -46,7 +46,7 @@ class Clip(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What is drawn into: ``depth`` (H, W), the inverse distance, 0 at infinity; ``triangle`` (H, W), −1 for none."""
+    """Buffers of a picture: ``depth`` (H, W), the inverse distance, 0 at infinity; ``triangle`` (H, W), −1 for none."""
 
     depth: Floats
     triangle: Integers
@@ -67,7 +67,7 @@ def _project(shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, clip: A
         rows: which ones.
         table: poses, (all rows, ROWS, 4).
         matrix: from the world to clip space, (4, 4).
-        near: distance in front of which nothing is seen, m.
+        near: distance of the near clipping plane, m.
         clip: `Clip`, overwritten.
     """
     m = np.empty((3, 4), np.float32)
@@ -145,7 +145,7 @@ def _span(left: Any, right: Any, y: Any, edge0: Any, edge1: Any, edge2: Any) -> 
 def draw_triangles(
     shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, far: Any, clip: Any, target: Any
 ) -> None:
-    """Note in each pixel the nearest triangle of some rows, if it is nearer than what is there.
+    """Note in each pixel the nearest triangle of some rows, if it is nearer than the one there.
 
     Triangles are set up in homogeneous coordinates, so those that reach behind the camera need no clipping. The
     middle of a pixel decides. Faces are seen from the side on which their corners go clockwise: pictures are drawn
@@ -155,7 +155,7 @@ def draw_triangles(
         shapes: `Shapes`.
         rows: which ones, in the order in which they are drawn.
         table, matrix, near, clip: see `_project`.
-        far: distance beyond which nothing is seen, m.
+        far: distance of the far clipping plane, m.
         target: `Target`, brought up to date.
     """
     _project(shapes, rows, table, matrix, near, clip)
@@ -230,7 +230,7 @@ def draw_triangles(
 
 @compiled
 def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shadow_map: Any, touched: Any) -> None:
-    """Note in each texel the depth of what is nearest to a light of parallel rays.
+    """Note in each texel the depth of the surface nearest to a light of parallel rays.
 
     Depths are moved away from the light by more than a texel's slope, or surfaces would speckle themselves.
 
@@ -308,7 +308,7 @@ def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shad
 
 @compiled
 def restore_depths(shadow_map: Any, still: Any, touched: Any) -> None:
-    """Put the depths of what stands still back into the tiles that were touched."""
+    """Put the depths of still rows back into the tiles that were touched."""
     size = shadow_map.shape[0]
     for tile_y in range(touched.shape[0]):
         for tile_x in range(touched.shape[1]):

@@ -14,7 +14,7 @@ _REFLECTING = (mujoco.mjtGeom.mjGEOM_PLANE.value, mujoco.mjtGeom.mjGEOM_BOX.valu
 
 @dataclass(frozen=True)
 class Mirror:
-    """What reflects.
+    """A geom that reflects.
 
     Attributes:
         rows: of its geom in the draw list.
@@ -33,7 +33,7 @@ class Mirror:
 
 
 def find_mirror(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Mirror | None:
-    """Return what reflects among the geoms of a draw list's rows, None for nothing."""
+    """Return the first geom of a draw list's rows that reflects, None without one."""
     for geom in np.unique(geoms):
         material = int(model.geom_matid[geom])
         if material < 0 or model.geom_type[geom] not in _REFLECTING or model.mat_reflectance[material] <= 0:

@@ -1,8 +1,8 @@
 """Draw a `DrawList` on the CPU: first which triangle each pixel shows, then the colour of each pixel once.
 
 The light is MuJoCo's: a headlight with ambience, parallel and spot lights, Blinn's highlights, textures that modulate
-all of it. Shadows are those of the first light of parallel rays that casts them, with soft edges. What stands still is
-kept for cameras that stand still: only what moves is drawn, and shadows that have changed.
+all of it. Shadows are those of the first light of parallel rays that casts them, with soft edges. A still camera keeps
+its picture of the still rows: only moving rows and changed shadows are drawn.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ Image = NDArray[np.uint8]
 OPAQUE = 0.995
 """Alpha from which on MuJoCo takes a geom as opaque."""
 KEPT_SCENES = 4
-"""States of what stands still that are kept, and cameras of each: simulations of one scene have fixtures at different
+"""States of still rows that are kept, and cameras of each: simulations of one scene have fixtures at different
 places."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """What a camera sees of what stands still: its picture, depths, and the parts of colours that shadows change."""
+    """A camera's picture of the still rows: colours, depths, and the parts of colours that shadows change."""
 
     image: Image
     depth: Floats
@@ -64,7 +64,7 @@ class Background:
 
 @dataclass(frozen=True)
 class Still:
-    """What stands still in one state: its depths from the light, and what cameras see of it, by their matrices."""
+    """The still rows in one state: their depths from the light, and their pictures by the matrices of cameras."""
 
     shadow_map: Floats
     backgrounds: dict[bytes, Background] = field(default_factory=dict)
@@ -187,10 +187,10 @@ class Rasterizer:
         self._target.depth[:] = 0.0
         self._target.triangle[:] = -1
 
-    # --- what stands still, and its shadows -----------------------------------------------------------------
+    # --- still rows and their shadows -----------------------------------------------------------------------
 
     def _bring_shadows_up_to_date(self, view: View) -> Still:
-        """Draw the shadow map of the present state; return what is kept of what stands still in it."""
+        """Draw the shadow map of the present state; return the kept pictures of its still rows."""
         scene = self._table[: self._list.still].tobytes() + view.lighting
         still = self._still.get(scene)
         if still is None:
@@ -224,7 +224,7 @@ class Rasterizer:
         )
 
     def _background(self, still: Still, view: View, rows: NDArray[np.int32]) -> Background:
-        """Return what a camera that stands still sees of what stands still."""
+        """Return a still camera's picture of the still rows."""
         key = view.matrix.tobytes()
         if key not in still.backgrounds:
             if len(still.backgrounds) >= KEPT_SCENES:  # a camera that is put elsewhere for every frame
@@ -250,12 +250,12 @@ class Rasterizer:
     def _add_reflection(
         self, view: View, mirror: Mirror, rows: NDArray[np.int32], shown: NDArray[np.int32], image: Image
     ) -> None:
-        """Add to a picture what is seen in the upper side of what reflects, which is seen in ``shown``."""
+        """Add the reflection in the mirror's upper side to a picture whose triangles are ``shown``."""
         point, normal = mirror.plane(self._table)
         seen = self._upper[np.maximum(shown, 0)] & (shown >= 0)
         if (view.eye - point) @ normal <= 0 or not seen.any():
             return
-        # Only the part of the picture around it is drawn; what is mirrored is turned left to right.
+        # Only this part of the picture is drawn again; the mirrored scene is turned left to right.
         down, across = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
         part = slice(down[0], down[-1] + 1), slice(across[0], across[-1] + 1)
         seen = seen[part][:, ::-1]
@@ -267,24 +267,24 @@ class Rasterizer:
         other.target.triangle[~seen] = -1
         other.shade(PICTURE, reflection)
         self._table[:, 3, :3] = colours
-        # Outside of what is seen the reflection is black.
+        # Elsewhere the reflection is black.
         image[part] = np.minimum(image[part].astype(np.uint16) + reflection[:, ::-1], 255)
 
     def _reach_above(self, rows: NDArray[np.int32], point: Floats, normal: Floats) -> NDArray[np.int32]:
-        """Return the rows of which something may be above a plane."""
+        """Return the rows that may reach above a plane."""
         poses, centre, half = self._table[rows, :3], self._shapes.centre[rows], self._shapes.half[rows]
         middle = np.einsum("rij,rj->ri", poses[:, :, :3], centre) + poses[:, :, 3] - point
         reach = np.abs(np.einsum("rij,i->rj", poses[:, :, :3], normal)) * half
         return rows[middle @ normal + reach.sum(axis=1) > 0]
 
-    # --- what lets others through ---------------------------------------------------------------------------
+    # --- translucent rows -----------------------------------------------------------------------------------
 
     def _near_to_far(self, view: View, rows: NDArray[np.int32]) -> NDArray[np.int32]:
         distance = np.linalg.norm(self._table[rows, :3, 3] - view.eye, axis=1)
         return rows[np.argsort(distance, kind="stable")]
 
     def _draw_over(self, view: View, row: int, image: Image) -> None:
-        """Draw a translucent row over a picture: it hides nothing of what is drawn after it."""
+        """Draw a translucent row over a picture: it hides no later row."""
         depth = self._target.depth.copy()
         self._target.triangle[:] = -1
         view.draw_triangles(np.array([row], dtype=np.int32))
@@ -338,7 +338,7 @@ class View:
 
 
 def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
-    """Return which triangles are the upper side of what reflects."""
+    """Return which triangles are the upper side of the mirror."""
     upper, mirror = np.zeros(triangles, np.bool_), draw_list.mirror
     if mirror is not None:
         corners = draw_list.vertices[draw_list.triangles]

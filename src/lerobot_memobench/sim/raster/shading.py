@@ -20,7 +20,7 @@ Integers = NDArray[np.int32]
 
 BATCH = 256
 CHUNK = 16
-"""Pixels are appended to a batch in whole chunks: what is written too much is overwritten or not used. Indices are
+"""Pixels are appended to a batch in whole chunks: surplus numbers are overwritten or not used. Indices are
 unsigned there: numba looks whether others are negative, which no vector instruction does."""
 STRIDE = BATCH + CHUNK
 ATTRIBUTES = 11
@@ -28,7 +28,7 @@ ATTRIBUTES = 11
 KEPT = 9
 """Of a pixel of the background: steady colour (3), colour that a shadow may take (3), place in the shadow map (3)."""
 PICTURE, BACKGROUND, TRANSLUCENT = 0, 1, 2
-"""Where colours go: into the picture, into what is kept of the background, over the picture."""
+"""Where colours go: into the picture, into the kept background, over the picture."""
 
 # Rows of a batch: the attributes, and behind them
 _INVERSE, _LIT, _LEVEL, _SHARE, _PAINT, _ACROSS, _DOWN, _DEPTHS, _FLOAT_ROWS = 11, 12, 13, 14, 15, 18, 19, 20, 24
