@@ -1,7 +1,7 @@
 """Import, once and with bytecode on, what the source in some folders imports, late imports included; draw a picture.
 
 Where PYTHONDONTWRITEBYTECODE is set, as in many containers, every process would compile all of it anew. The functions
-that draw are compiled by numba at their first call and kept. What is not installed here or does not import is left
+that draw are compiled by numba at their first call and kept. Whatever is not installed here or does not import is left
 alone: this only saves time.
 
     python scripts/compile_imports.py src

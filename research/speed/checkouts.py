@@ -1,4 +1,4 @@
-"""``python -m research.speed.checkouts FOLDER``: this checkout's control step with two pictures beside another's.
+"""``python -m research.speed.checkouts FOLDER``: compare control steps with two pictures of two checkouts.
 
 Each checkout steps the same actions in a process of its own, in turns; a turn of ours makes a pair with the turn of
 theirs that follows. Processors' time is counted, which moves less than the clock on the wall where others compute too.
@@ -55,7 +55,7 @@ class Side:
 
     Args:
         folder: the checkout.
-        task, quality: what is simulated and drawn.
+        task, quality: of the simulation and its pictures.
     """
 
     def __init__(self, folder: Path, task: str, quality: str) -> None:
@@ -95,7 +95,7 @@ def compare(ours: Side, theirs: Side, rounds: int, steps: int) -> dict[str, obje
         steps: of each turn.
     """
     for side in (ours, theirs):
-        side.take(3)  # compiles, and draws what is kept
+        side.take(3)  # compiles, and draws the background
     pairs = [(ours.take(steps), theirs.take(steps)) for _ in range(rounds)]
     ratios = sorted(other[-1] / mine[-1] for mine, other in pairs)
     low, middle, high = statistics.quantiles(ratios, n=4)
@@ -108,12 +108,12 @@ def compare(ours: Side, theirs: Side, rounds: int, steps: int) -> dict[str, obje
 
 def checkouts(
     folder: Annotated[Path, typer.Argument(help="Another checkout of this project.")],
-    task: Annotated[str, typer.Option(help="What is simulated.")] = TASK,
+    task: Annotated[str, typer.Option(help="Task to simulate.")] = TASK,
     quality: Annotated[str, typer.Option(help="Of the pictures.")] = "default",
     rounds: Annotated[int, typer.Option(help="Pairs of turns.")] = 24,
     steps: Annotated[int, typer.Option(help="Control steps of a turn.")] = 10,
 ) -> None:
-    """Time a control step with two pictures of this checkout beside another's, in pairs."""
+    """Time a control step with two pictures of this checkout and of another, in pairs."""
     ours, theirs = Side(Path(__file__).parents[2], task, quality), Side(folder, task, quality)
     try:
         print(json.dumps({"task": task, "quality": quality, **compare(ours, theirs, rounds, steps)}))

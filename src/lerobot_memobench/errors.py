@@ -28,7 +28,7 @@ def unsupported_system() -> str:
     """Return one sentence where nothing can be simulated, "" elsewhere."""
     if sys.platform not in ("win32", "cygwin"):
         return ""
-    return "Windows locks no folders, as every run does: use WSL2; docs/start/install.md says what works without"
+    return "Windows locks no folders, which every run does: use WSL2; docs/start/install.md lists what works without"
 
 
 def check_choice(name: str, value: object, known: Sequence[str]) -> None:

@@ -93,7 +93,7 @@ class MEMOBench(StepBenchmark):
 
     @classmethod
     def configure_render(cls, mode: str) -> dict[str, str]:
-        """Draw with EGL on a GPU or whatever device there is; with OSMesa where the CPU is asked for."""
+        """Draw `render: high` with EGL on a GPU or whatever device there is; with OSMesa where the CPU is asked for."""
         applied: dict[str, str] = configure_mujoco_render(mode)
         return applied
 

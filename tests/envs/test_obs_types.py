@@ -23,7 +23,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.write import frame_count
 from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 from lerobot_memobench.protocol import EXECUTION, PROMPT
-from lerobot_memobench.sim import rendering
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
 
@@ -36,13 +35,13 @@ STATE = "observation.environment_state"
 
 @pytest.fixture
 def blind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever asks for a renderer or a GL context fails."""
+    """Whoever asks for a renderer fails."""
 
     def refuse(*_: object) -> None:
         raise AssertionError("something is drawn")
 
-    monkeypatch.setattr(rendering, "_gl_context", refuse)
-    monkeypatch.setattr("lerobot_memobench.sim.simulation.get_renderer", refuse)
+    for name in ("get_renderer", "get_rasterizer"):
+        monkeypatch.setattr(f"lerobot_memobench.sim.simulation.{name}", refuse)
 
 
 def make(name: str, obs_type: str = OBJECTS, **settings: Any) -> MemobenchEnv:

@@ -71,7 +71,7 @@ class Renderer(Protocol):
 
 
 CACHED_RENDERERS = 4
-"""Renderers kept per thread: each holds its scene's textures, some 20 MB."""
+"""Renderers kept per thread: each holds its scene's textures and background, some 40 MB."""
 
 
 class _Thread(threading.local):
@@ -106,7 +106,7 @@ def free_renderer(renderer: Renderer) -> None:
 
 
 def get_rasterizer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> Rasterizer:
-    """Return this thread's renderer for a scene that also says which geom each pixel shows.
+    """Return this thread's renderer for a scene that also maps pixels to geoms.
 
     It is the one of `get_renderer`; where GL draws the frames, one of the same size.
     """

@@ -101,7 +101,7 @@ class MultisampleRasterizer:
         self._resources.sample(GL.GL_TEXTURE_2D_ARRAY, GL.GL_LINEAR_MIPMAP_LINEAR, GL.GL_REPEAT)
 
     def _make_targets(self, samples: int) -> None:
-        """Make what is drawn into, and what is read from: one sample of a pixel's several."""
+        """Make framebuffers: one of several samples per pixel to draw into, one of single samples to read."""
         GL, make, size = self._gl, self._resources, (self._width, self._height)
         self._target = make.framebuffer()
         make.renderbuffer(GL.GL_RGBA8, GL.GL_COLOR_ATTACHMENT0, samples, size)

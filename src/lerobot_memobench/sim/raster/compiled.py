@@ -15,7 +15,7 @@ from numba import njit
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
-    "fastmath": {"nnan", "ninf", "nsz"},  # what is not finite never comes up; these flags change no other bit
+    "fastmath": {"nnan", "ninf", "nsz"},  # infinities and NaN never come up; these flags change no other bit
 }
 
 
@@ -23,6 +23,6 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function at its first call, kept for later processes where there is a place for it."""
     try:
         made: Callable[..., Any] = njit(cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # neither beside the source nor in the user's cache folder may be written
+    except RuntimeError:  # neither next to the source nor in the user's cache folder may be written
         made = njit(**_OPTIONS)(function)
     return made

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.sim.raster.mirror import Mirror, find_mirror
 from lerobot_memobench.sim.raster.shapes import Triangles, box_cells, triangles_of
 from lerobot_memobench.sim.raster.textures import LAYER_SIZE, cube_coordinates, flat_coordinates, layers_of
 
@@ -47,6 +48,7 @@ class DrawList:
         casting: (rows,) whether a row casts shadows.
         layers: (L, LAYER_SIZE, LAYER_SIZE, 3) uint8 textures, the first one white.
         materials: (rows, 4) specular, shininess exponent, emission, layer.
+        mirror: the geom that reflects the scene, if there is one.
     """
 
     vertices: NDArray[np.void]
@@ -56,6 +58,7 @@ class DrawList:
     casting: NDArray[np.bool_]
     layers: NDArray[np.uint8]
     materials: Floats
+    mirror: Mirror | None = None
 
     def fill(self, table: Floats, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Write poses, colours and materials of the present state into a table, (rows, ROWS, 4)."""
@@ -106,6 +109,7 @@ def build_draw_list(
         ~np.isin(bodies, _bodies(model, shadowless)),
         layers,
         np.array(materials, dtype=np.float32).reshape(-1, 4),
+        find_mirror(model, rows),
     )
 
 

@@ -17,6 +17,10 @@ TILE = 16
 """Side of a tile of the shadow map, texels: what a moving caster touches is noted by tile."""
 
 
+LEVEL = 1e-9
+"""Slope of an edge over a row below which it counts as level."""
+
+
 class Shapes(NamedTuple):
     """The triangles of a scene by rows of the table; they are the same in every frame.
 
@@ -42,7 +46,7 @@ class Clip(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What is drawn into: ``depth`` (H, W), the inverse distance, 0 at infinity; ``triangle`` (H, W), −1 for none."""
+    """Buffers of a picture: ``depth`` (H, W), the inverse distance, 0 at infinity; ``triangle`` (H, W), −1 for none."""
 
     depth: Floats
     triangle: Integers
@@ -63,7 +67,7 @@ def _project(shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, clip: A
         rows: which ones.
         table: poses, (all rows, ROWS, 4).
         matrix: from the world to clip space, (4, 4).
-        near: distance in front of which nothing is seen, m.
+        near: distance of the near clipping plane, m.
         clip: `Clip`, overwritten.
     """
     m = np.empty((3, 4), np.float32)
@@ -106,12 +110,24 @@ def _in_picture(m: Any, centre: Any, half: Any, near: Any) -> Any:
 def _bounds(a: Any, b: Any, c: Any) -> Any:
     """Return how an edge, a x + b y + c ≥ 0 inside, bounds x in row y: from below p y + q on, up to r y + s.
 
-    A level edge bounds none: all rows that a triangle is in lie within it.
+    A level edge bounds the rows, see `_rows`.
     """
-    if abs(a) <= 1e-9 * abs(b):
+    if abs(a) <= LEVEL * abs(b):
         return 0.0, -1e30, 0.0, 1e30
     slope, start = -b / a, -c / a
     return (slope, start, 0.0, 1e30) if a > 0.0 else (0.0, -1e30, slope, start)
+
+
+@compiled
+def _rows(top: Any, bottom: Any, a: Any, b: Any, c: Any) -> Any:
+    """Return those rows, from the first to the last, that are within an edge, if it is level."""
+    if abs(a) > LEVEL * abs(b):
+        return top, bottom
+    if b > 0.0:
+        return max(top, math.ceil(min(max(-c / b, -1e6), 1e6))), bottom
+    if b < 0.0:
+        return top, min(bottom, math.floor(min(max(-c / b, -1e6), 1e6)))
+    return top, bottom if c >= 0.0 else -1
 
 
 @compiled
@@ -129,7 +145,7 @@ def _span(left: Any, right: Any, y: Any, edge0: Any, edge1: Any, edge2: Any) -> 
 def draw_triangles(
     shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, far: Any, clip: Any, target: Any
 ) -> None:
-    """Note in each pixel the nearest triangle of some rows, if it is nearer than what is there.
+    """Note in each pixel the nearest triangle of some rows, if it is nearer than the one there.
 
     Triangles are set up in homogeneous coordinates, so those that reach behind the camera need no clipping. The
     middle of a pixel decides. Faces are seen from the side on which their corners go clockwise: pictures are drawn
@@ -139,7 +155,7 @@ def draw_triangles(
         shapes: `Shapes`.
         rows: which ones, in the order in which they are drawn.
         table, matrix, near, clip: see `_project`.
-        far: distance beyond which nothing is seen, m.
+        far: distance of the far clipping plane, m.
         target: `Target`, brought up to date.
     """
     _project(shapes, rows, table, matrix, near, clip)
@@ -152,17 +168,26 @@ def draw_triangles(
             continue
         for t in range(shapes.first_triangle[row], shapes.first_triangle[row + 1]):
             i, j, k = shapes.triangles[t, 0], shapes.triangles[t, 1], shapes.triangles[t, 2]
-            w0, w1, w2 = float(clip.w[i]), float(clip.w[j]), float(clip.w[k])
-            x0, y0 = (clip.x[i] + w0) * half_width, (clip.y[i] + w0) * half_height
-            x1, y1 = (clip.x[j] + w1) * half_width, (clip.y[j] + w1) * half_height
-            x2, y2 = (clip.x[k] + w2) * half_width, (clip.y[k] + w2) * half_height
+            xi, yi, wi = clip.x[i], clip.y[i], clip.w[i]
+            xj, yj, wj = clip.x[j], clip.y[j], clip.w[j]
+            xk, yk, wk = clip.x[k], clip.y[k], clip.w[k]
+            # Most triangles of a large row lie beyond one side of the picture.
+            if (xi > wi and xj > wj and xk > wk) or (xi < -wi and xj < -wj and xk < -wk):
+                continue
+            if (yi > wi and yj > wj and yk > wk) or (yi < -wi and yj < -wj and yk < -wk):
+                continue
+            w0, w1, w2 = float(wi), float(wj), float(wk)
+            x0, y0 = (xi + w0) * half_width, (yi + w0) * half_height
+            x1, y1 = (xj + w1) * half_width, (yj + w1) * half_height
+            x2, y2 = (xk + w2) * half_width, (yk + w2) * half_height
             # Each corner's share of a point (x, y, 1), not yet divided by the volume that the corners span.
             a0, b0, c0 = y2 * w1 - y1 * w2, x1 * w2 - x2 * w1, x2 * y1 - x1 * y2
             volume = a0 * x0 + b0 * y0 + c0 * w0
             if volume <= 1e-12:
                 continue
             left, right, top, bottom = 0, width - 1, 0, height - 1
-            if w0 > 1e-6 and w1 > 1e-6 and w2 > 1e-6:
+            behind = w0 <= 1e-6 or w1 <= 1e-6 or w2 <= 1e-6  # a corner is, and the triangle has no box in the picture
+            if not behind:
                 u0, u1, u2 = x0 / w0, x1 / w1, x2 / w2
                 v0, v1, v2 = y0 / w0, y1 / w1, y2 / w2
                 low, high = min(u0, u1, u2) - 0.5, max(u0, u1, u2) - 0.5
@@ -179,6 +204,10 @@ def draw_triangles(
             a2, b2, c2 = y1 * w0 - y0 * w1, x0 * w1 - x1 * w0, x1 * y0 - x0 * y1
             # Pixels are counted by their middles.
             c0, c1, c2 = c0 + 0.5 * (a0 + b0), c1 + 0.5 * (a1 + b1), c2 + 0.5 * (a2 + b2)
+            if behind:
+                top, bottom = _rows(top, bottom, a0, b0, c0)
+                top, bottom = _rows(top, bottom, a1, b1, c1)
+                top, bottom = _rows(top, bottom, a2, b2, c2)
             edge0, edge1, edge2 = _bounds(a0, b0, c0), _bounds(a1, b1, c1), _bounds(a2, b2, c2)
             scale = 0.0
             across, down, at_origin, slope = 0.0, 0.0, 0.0, np.float32(0)
@@ -201,7 +230,7 @@ def draw_triangles(
 
 @compiled
 def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shadow_map: Any, touched: Any) -> None:
-    """Note in each texel the depth of what is nearest to a light of parallel rays.
+    """Note in each texel the depth of the surface nearest to a light of parallel rays.
 
     Depths are moved away from the light by more than a texel's slope, or surfaces would speckle themselves.
 
@@ -279,7 +308,7 @@ def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shad
 
 @compiled
 def restore_depths(shadow_map: Any, still: Any, touched: Any) -> None:
-    """Put the depths of what stands still back into the tiles that were touched."""
+    """Put the depths of still rows back into the tiles that were touched."""
     size = shadow_map.shape[0]
     for tile_y in range(touched.shape[0]):
         for tile_x in range(touched.shape[1]):

@@ -1,12 +1,13 @@
 """Draw a `DrawList` on the CPU: first which triangle each pixel shows, then the colour of each pixel once.
 
 The light is MuJoCo's: a headlight with ambience, parallel and spot lights, Blinn's highlights, textures that modulate
-all of it. Shadows are those of the first light of parallel rays that casts them, with soft edges. What stands still is
-kept for cameras that stand still: only what moves is drawn, and shadows that have changed.
+all of it. Shadows are those of the first light of parallel rays that casts them, with soft edges. A still camera keeps
+its picture of the still rows: only moving rows and changed shadows are drawn.
 """
 
 from __future__ import annotations
 
+import copy
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ from lerobot_memobench.sim.raster.geometry import (
     restore_depths,
 )
 from lerobot_memobench.sim.raster.highlights import Highlight, fill_table, table_of, with_discs
+from lerobot_memobench.sim.raster.mirror import Mirror, cropped, mirrored
 from lerobot_memobench.sim.raster.shading import (
     BACKGROUND,
     KEPT,
@@ -45,22 +47,24 @@ Image = NDArray[np.uint8]
 OPAQUE = 0.995
 """Alpha from which on MuJoCo takes a geom as opaque."""
 KEPT_SCENES = 4
-"""States of what stands still that are kept: simulations of one scene have fixtures at different places."""
+"""States of still rows that are kept, and cameras of each: simulations of one scene have fixtures at different
+places."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """What a camera sees of what stands still: its picture, depths, and the parts of colours that shadows change."""
+    """A camera's picture of the still rows: colours, depths, and the parts of colours that shadows change."""
 
     image: Image
     depth: Floats
+    triangle: NDArray[np.int32]
     kept: Floats
     tile: NDArray[np.int32]
 
 
 @dataclass(frozen=True)
 class Still:
-    """What stands still in one state: its depths from the light, and what cameras see of it, by their matrices."""
+    """The still rows in one state: their depths from the light, and their pictures by the matrices of cameras."""
 
     shadow_map: Floats
     backgrounds: dict[bytes, Background] = field(default_factory=dict)
@@ -112,6 +116,7 @@ class Rasterizer:
         # One more for pixels that no shadow can change.
         self._touched = np.zeros(self._tiles**2 + 1, np.uint8)
         self._still: OrderedDict[bytes, Still] = OrderedDict()
+        self._upper = _upper_side(draw_list, len(triangles))
         self._shown: bytes | None = None
 
     # --- draw -----------------------------------------------------------------------------------------------
@@ -148,11 +153,16 @@ class Rasterizer:
                     self._shadow_map,
                     image.reshape(-1, 3),
                 )
+            behind = background.triangle
         else:
             image = np.zeros((self._height, self._width, 3), np.uint8)
             self._clear()
             view.draw_triangles(rows[opaque])
+            behind = self._target.triangle
         view.shade(PICTURE, image)
+        if self._list.mirror is not None:
+            shown = np.where(self._target.triangle >= 0, self._target.triangle, behind)
+            self._add_reflection(view, self._list.mirror, rows[opaque], shown, image)
         translucent = self._near_to_far(view, rows[~opaque])
         # MuJoCo's renderer draws them twice, in this order.
         for row in [*translucent, *translucent[::-1], *(len(rows) + np.arange(len(highlights)))]:
@@ -177,10 +187,10 @@ class Rasterizer:
         self._target.depth[:] = 0.0
         self._target.triangle[:] = -1
 
-    # --- what stands still, and its shadows -----------------------------------------------------------------
+    # --- still rows and their shadows -----------------------------------------------------------------------
 
     def _bring_shadows_up_to_date(self, view: View) -> Still:
-        """Draw the shadow map of the present state; return what is kept of what stands still in it."""
+        """Draw the shadow map of the present state; return the kept pictures of its still rows."""
         scene = self._table[: self._list.still].tobytes() + view.lighting
         still = self._still.get(scene)
         if still is None:
@@ -214,9 +224,11 @@ class Rasterizer:
         )
 
     def _background(self, still: Still, view: View, rows: NDArray[np.int32]) -> Background:
-        """Return what a camera that stands still sees of what stands still."""
+        """Return a still camera's picture of the still rows."""
         key = view.matrix.tobytes()
         if key not in still.backgrounds:
+            if len(still.backgrounds) >= KEPT_SCENES:  # a camera that is put elsewhere for every frame
+                still.backgrounds.pop(next(iter(still.backgrounds)))
             still.backgrounds[key] = self._draw_background(still, view, rows)
         return still.backgrounds[key]
 
@@ -231,16 +243,48 @@ class Rasterizer:
         shadow_tiles(kept, still.shadow_map.shape[0], self._tiles, tile)
         none, everywhere = np.full(pixels, -1, np.int32), np.ones_like(self._touched)
         light_background(kept, tile, everywhere, none, still.shadow_map, image.reshape(-1, 3))
-        return Background(image, self._target.depth.copy(), kept, tile)
+        return Background(image, self._target.depth.copy(), self._target.triangle.copy(), kept, tile)
 
-    # --- what lets others through ---------------------------------------------------------------------------
+    # --- reflections ----------------------------------------------------------------------------------------
+
+    def _add_reflection(
+        self, view: View, mirror: Mirror, rows: NDArray[np.int32], shown: NDArray[np.int32], image: Image
+    ) -> None:
+        """Add the reflection in the mirror's upper side to a picture whose triangles are ``shown``."""
+        point, normal = mirror.plane(self._table)
+        seen = self._upper[np.maximum(shown, 0)] & (shown >= 0)
+        if (view.eye - point) @ normal <= 0 or not seen.any():
+            return
+        # Only this part of the picture is drawn again; the mirrored scene is turned left to right.
+        down, across = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        part = slice(down[0], down[-1] + 1), slice(across[0], across[-1] + 1)
+        seen = seen[part][:, ::-1]
+        reflection = np.zeros((*seen.shape, 3), np.uint8)
+        other = view.mirrored(point, normal, (self._width - part[1].stop, part[0].start), seen.shape)
+        colours = self._table[:, 3, :3].copy()
+        self._table[:, 3, :3] *= mirror.reflectance
+        other.draw_triangles(self._reach_above(rows[~np.isin(rows, mirror.rows)], point, normal))
+        other.target.triangle[~seen] = -1
+        other.shade(PICTURE, reflection)
+        self._table[:, 3, :3] = colours
+        # Elsewhere the reflection is black.
+        image[part] = np.minimum(image[part].astype(np.uint16) + reflection[:, ::-1], 255)
+
+    def _reach_above(self, rows: NDArray[np.int32], point: Floats, normal: Floats) -> NDArray[np.int32]:
+        """Return the rows that may reach above a plane."""
+        poses, centre, half = self._table[rows, :3], self._shapes.centre[rows], self._shapes.half[rows]
+        middle = np.einsum("rij,rj->ri", poses[:, :, :3], centre) + poses[:, :, 3] - point
+        reach = np.abs(np.einsum("rij,i->rj", poses[:, :, :3], normal)) * half
+        return rows[middle @ normal + reach.sum(axis=1) > 0]
+
+    # --- translucent rows -----------------------------------------------------------------------------------
 
     def _near_to_far(self, view: View, rows: NDArray[np.int32]) -> NDArray[np.int32]:
         distance = np.linalg.norm(self._table[rows, :3, 3] - view.eye, axis=1)
         return rows[np.argsort(distance, kind="stable")]
 
     def _draw_over(self, view: View, row: int, image: Image) -> None:
-        """Draw a translucent row over a picture: it hides nothing of what is drawn after it."""
+        """Draw a translucent row over a picture: it hides no later row."""
         depth = self._target.depth.copy()
         self._target.triangle[:] = -1
         view.draw_triangles(np.array([row], dtype=np.int32))
@@ -256,16 +300,32 @@ class View:
         self.camera = int(model.camera(camera).id)
         self.matrix = camera_matrix(model, data, self.camera, of._height, of._width)
         self.eye = data.cam_xpos[self.camera].astype(np.float32)
+        self.target = of._target
         self._near, self._far = (np.float32(distance) for distance in clipping(model))
         self._lights: Lights = of._lamps.look(data, self.camera)
         self.light_matrix = of._lamps.light_matrix(model, data)
         # The headlight goes with the camera, whose matrix is a key of its own.
         self.lighting = self._lights.to[1:].tobytes() + self._lights.axis[1:].tobytes()
 
+    def mirrored(self, point: Floats, normal: Floats, corner: tuple[int, int], shape: tuple[int, ...]) -> View:
+        """Return a view of the scene mirrored in a plane, turned left to right; the same lights shine.
+
+        Args:
+            point, normal: of the plane.
+            corner: column and row of the turned picture at which the part begins that is drawn.
+            shape: height and width of that part.
+        """
+        other = copy.copy(self)
+        whole = self.target.triangle.shape
+        other.matrix = cropped(mirrored(self.matrix, point, normal), whole, corner, shape)
+        other.target = Target(np.zeros(shape, np.float32), np.full(shape, -1, np.int32))
+        other.eye = self.eye - 2.0 * ((self.eye - point) @ normal) * normal
+        return other
+
     def draw_triangles(self, rows: NDArray[np.int32]) -> None:
         """Note which triangle of rows each pixel shows."""
         of = self._of
-        draw_triangles(of._shapes, rows, of._table, self.matrix, self._near, self._far, of._clip, of._target)
+        draw_triangles(of._shapes, rows, of._table, self.matrix, self._near, self._far, of._clip, self.target)
 
     def shade(self, mode: int, image: Image, kept: Floats | None = None) -> None:
         """Colour the pixels in which a triangle was noted; see `shading.shade`."""
@@ -273,8 +333,18 @@ class View:
         kept = np.zeros((KEPT, 0), np.float32) if kept is None else kept
         shade(
             of._shapes, of._surfaces, of._table, self._lights, self.eye, self.light_matrix, of._clip, of._shadow_map,
-            of._target, of._work, mode, image.reshape(-1, 3), kept,
+            self.target, of._work, mode, image.reshape(-1, 3), kept,
         )  # fmt: skip
+
+
+def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
+    """Return which triangles are the upper side of the mirror."""
+    upper, mirror = np.zeros(triangles, np.bool_), draw_list.mirror
+    if mirror is not None:
+        corners = draw_list.vertices[draw_list.triangles]
+        mine = np.isin(corners["row"][:, 0], mirror.rows)
+        upper[: len(mine)] = mine & (corners["normal"][:, :, 2] > 0.99).all(axis=1)
+    return upper
 
 
 def _shapes(vertices: NDArray[np.void], triangles: NDArray[np.int32], rows: int) -> Shapes:

@@ -20,7 +20,7 @@ Integers = NDArray[np.int32]
 
 BATCH = 256
 CHUNK = 16
-"""Pixels are appended to a batch in whole chunks: what is written too much is overwritten or not used. Indices are
+"""Pixels are appended to a batch in whole chunks: surplus numbers are overwritten or not used. Indices are
 unsigned there: numba looks whether others are negative, which no vector instruction does."""
 STRIDE = BATCH + CHUNK
 ATTRIBUTES = 11
@@ -28,7 +28,7 @@ ATTRIBUTES = 11
 KEPT = 9
 """Of a pixel of the background: steady colour (3), colour that a shadow may take (3), place in the shadow map (3)."""
 PICTURE, BACKGROUND, TRANSLUCENT = 0, 1, 2
-"""Where colours go: into the picture, into what is kept of the background, over the picture."""
+"""Where colours go: into the picture, into the kept background, over the picture."""
 
 # Rows of a batch: the attributes, and behind them
 _INVERSE, _LIT, _LEVEL, _SHARE, _PAINT, _ACROSS, _DOWN, _DEPTHS, _FLOAT_ROWS = 11, 12, 13, 14, 15, 18, 19, 20, 24
@@ -628,7 +628,9 @@ def _look_up(shadow_map: Any, t: Any, i: Any) -> None:
         r = _1 if depth <= t[(_DEPTHS + 2) * STRIDE + x] else _0
         s = _1 if depth <= t[(_DEPTHS + 3) * STRIDE + x] else _0
         upper, lower = p + across * (q - p), r + across * (s - r)
-        t[_LIT * STRIDE + x] = upper + down * (lower - upper)
+        u, v = t[8 * STRIDE + x], t[9 * STRIDE + x]
+        # Beyond the map nothing casts shadows.
+        t[_LIT * STRIDE + x] = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)
 
 
 @compiled
@@ -677,7 +679,8 @@ def light_background(kept: Any, tile: Any, touched: Any, triangle: Any, shadow_m
         r = _1 if depth <= shadow_map[top + 1, left] else _0
         s = _1 if depth <= shadow_map[top + 1, left + 1] else _0
         upper, lower = p + across * (q - p), r + across * (s - r)
-        lit = upper + down * (lower - upper)
+        u, v = kept[6, k], kept[7, k]
+        lit = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)
         for c in range(3):
             colour = kept[c, k] + lit * kept[3 + c, k]
             image[k, c] = np.uint8(min(max(colour, _0), _255) + _HALF)

@@ -53,8 +53,8 @@ def triangles_of(
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
             return _capsule(float(size[0]), float(size[1]))
     raise MemobenchError(
-        f"geom {model.geom(geom).name!r} is a {kind.name.removeprefix('mjGEOM_').lower()}, which is not drawn; make "
-        "what is seen of planes, boxes, cylinders, spheres, ellipsoids, capsules and meshes"
+        f"geom {model.geom(geom).name!r} is a {kind.name.removeprefix('mjGEOM_').lower()}, which is not drawn; use "
+        "planes, boxes, cylinders, spheres, ellipsoids, capsules and meshes for visual geoms"
     )
 
 

@@ -26,7 +26,7 @@ def shadow_caster(model: mujoco.MjModel) -> int | None:
 
 
 def clipping(model: mujoco.MjModel) -> tuple[float, float]:
-    """Return the distances in front of which and beyond which nothing is seen, m."""
+    """Return the distances of the near and the far clipping plane, m."""
     near, far = (float(p * model.stat.extent) for p in (model.vis.map.znear, model.vis.map.zfar))
     return near, far
 
