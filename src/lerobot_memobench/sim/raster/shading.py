@@ -147,8 +147,11 @@ def shade(
     for textured in (False, True):
         count = 0
         for n in range(runs + 1):  # the last one is none: it finishes what is left
-            start, length, alpha = 0, 0, _1
-            slot, layer = 0, 0
+            start: Any = 0
+            length: Any = 0
+            slot: Any = 0
+            layer: Any = 0
+            alpha: Any = _1
             if n < runs:
                 start, length = np.int64(work.runs[n, 0]), np.int64(work.runs[n, 1])
                 triangle = work.runs[n, 2]
