@@ -16,7 +16,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.drawlist import LAYER_SIZE, DrawList, Floats
+from lerobot_memobench.sim.raster.background import KEPT, light_background, shadow_tiles
+from lerobot_memobench.sim.raster.drawlist import DrawList, Floats, Image
 from lerobot_memobench.sim.raster.geometry import (
     TILE,
     Shapes,
@@ -27,23 +28,19 @@ from lerobot_memobench.sim.raster.geometry import (
     restore_depths,
 )
 from lerobot_memobench.sim.raster.highlights import Highlight, fill_table, table_of, with_discs
+from lerobot_memobench.sim.raster.lights import Lamps, Lights
 from lerobot_memobench.sim.raster.mirror import Mirror, cropped, mirrored
 from lerobot_memobench.sim.raster.shading import (
     BACKGROUND,
-    KEPT,
     PICTURE,
     TRANSLUCENT,
-    Lights,
     Surfaces,
-    light_background,
     scratch,
     shade,
-    shadow_tiles,
 )
-from lerobot_memobench.sim.raster.textures import levels_of
-from lerobot_memobench.sim.raster.view import Lamps, camera_matrix, clipping
+from lerobot_memobench.sim.raster.textures import LAYER_SIZE, levels_of
+from lerobot_memobench.sim.raster.view import camera_matrix, clipping
 
-Image = NDArray[np.uint8]
 OPAQUE = 0.995
 """Alpha from which on MuJoCo takes a geom as opaque."""
 KEPT_SCENES = 4
@@ -182,6 +179,11 @@ class Rasterizer:
         rows = self._surfaces.row[self._shapes.triangles[shown, 0]]
         # A row of a highlight is none of the list, and is not drawn here.
         return np.where(shown >= 0, self._list.geoms[np.minimum(rows, len(self._list.geoms) - 1)], -1)
+
+    def free(self) -> None:
+        """Forget the pictures of still rows; the next frame draws them again."""
+        self._still.clear()
+        self._shown = None
 
     def _clear(self) -> None:
         self._target.depth[:] = 0.0
