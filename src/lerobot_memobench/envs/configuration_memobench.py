@@ -84,7 +84,7 @@ class MemobenchEnvConfig(EnvConfig):
             first observation; `auto`: in steps for a policy that reads prompts, else in reset.
         horizon: execution steps per episode.
         render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows, the arm's
-            whole meshes: for films, at ten times the cost).
+            whole meshes: for films, at ten times the cost; it alone needs a GL library).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
             of actions a policy executes per prediction: it looks at nothing else. A policy that remembers the frames
             in between refuses it; `observation.picture_age` has the control steps since the pictures were drawn.

@@ -36,7 +36,7 @@ from lerobot_memobench.protocol import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.raster.rasterizer import Image
+from lerobot_memobench.sim.raster.drawlist import Image
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
 from lerobot_memobench.tasks.catalogue import get_task

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
 
     from lerobot_memobench.envs.episode import Episode
-    from lerobot_memobench.sim.raster.rasterizer import Image
+    from lerobot_memobench.sim.raster.drawlist import Image
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)

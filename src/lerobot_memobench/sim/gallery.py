@@ -18,7 +18,7 @@ from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP, build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
-from lerobot_memobench.sim.rendering import RenderSettings, free_renderer, make_renderer
+from lerobot_memobench.sim.rendering import RenderSettings, make_renderer
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED, Task
@@ -133,7 +133,7 @@ def _cells(class_name: str, views: Sequence[View], size: int) -> list[tuple[str,
     for label, opened in zip(labels, (False, True), strict=False):
         _open(asset, model, data, opened)
         cells.append((label, np.hstack([renderer.draw(model, data, camera) for camera in cameras])))
-    free_renderer(renderer)
+    renderer.free()
     return cells
 
 

@@ -6,17 +6,18 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import mujoco
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim.gl.context import close_context
-from lerobot_memobench.sim.gl.rasterizer import MultisampleRasterizer
-from lerobot_memobench.sim.raster.drawlist import build_draw_list
+from lerobot_memobench.sim.raster.drawlist import Image, build_draw_list
 from lerobot_memobench.sim.raster.highlights import Highlight
-from lerobot_memobench.sim.raster.rasterizer import Image, Rasterizer
 from lerobot_memobench.sim.robot import whole_arm
+
+if TYPE_CHECKING:
+    from lerobot_memobench.sim.raster.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,10 @@ class Renderer(Protocol):
         """Return what a camera sees, (height, width, 3) uint8, first row on top."""
         ...
 
+    def free(self) -> None:
+        """Give back kept pictures, or the driver's objects."""
+        ...
+
 
 CACHED_RENDERERS = 4
 """Renderers kept per thread: each holds its scene's textures and background, some 40 MB."""
@@ -93,16 +98,10 @@ def get_renderer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> R
     full = (key, settings)
     if full not in renderers:
         while len(renderers) >= CACHED_RENDERERS:
-            free_renderer(renderers.popitem(last=False)[1])
+            renderers.popitem(last=False)[1].free()
         renderers[full] = make_renderer(model, settings)
     renderers.move_to_end(full)
     return renderers[full]
-
-
-def free_renderer(renderer: Renderer) -> None:
-    """Give back what a renderer holds of a GL driver's."""
-    if isinstance(renderer, MultisampleRasterizer):
-        renderer.free()
 
 
 def get_rasterizer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> Rasterizer:
@@ -111,24 +110,28 @@ def get_rasterizer(key: Any, model: mujoco.MjModel, settings: RenderSettings) ->
     It is the one of `get_renderer`; where GL draws the frames, one of the same size.
     """
     renderer = get_renderer(key, model, replace(settings, quality="fast") if settings.needs_gl else settings)
-    assert isinstance(renderer, Rasterizer)
-    return renderer
+    return cast("Rasterizer", renderer)
 
 
 def make_renderer(model: mujoco.MjModel, settings: RenderSettings) -> Renderer:
-    """Return a renderer of one's own for a scene; see `get_renderer`."""
+    """Return a renderer of one's own for a scene, to be freed by `Renderer.free`; see `get_renderer`."""
     quality, size = QUALITIES[settings.quality], (settings.width, settings.height)
     draw_list = build_draw_list(model, ROOM, whole_arm() if quality.whole_arm else None)
+    # PyOpenGL and numba are loaded with the first frame.
     if settings.needs_gl:
+        from lerobot_memobench.sim.gl.rasterizer import MultisampleRasterizer
+
         return MultisampleRasterizer(model, draw_list, *size, quality.samples, quality.shadow_map)
+    from lerobot_memobench.sim.raster.rasterizer import Rasterizer
+
     return Rasterizer(model, draw_list, *size, quality.shadow_map)
 
 
 def close_renderers() -> None:
-    """Drop the calling thread's renderers and GL context; the next frame makes new ones.
+    """Free the calling thread's renderers and GL context; the next frame makes new ones.
 
     A thread that has drawn with `high` calls this before it ends; for the main thread it happens at exit.
     """
     while _thread.renderers:
-        free_renderer(_thread.renderers.popitem()[1])
+        _thread.renderers.popitem()[1].free()
     close_context()

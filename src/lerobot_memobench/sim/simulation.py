@@ -16,8 +16,8 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING, make_controller
+from lerobot_memobench.sim.raster.drawlist import Image
 from lerobot_memobench.sim.raster.highlights import Highlight
-from lerobot_memobench.sim.raster.rasterizer import Image
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
 from lerobot_memobench.sim.world import Start

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.sim.raster.drawlist import build_draw_list
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.raster.drawlist import VISUAL_GROUP, build_draw_list
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.raster.rasterizer import KEPT_SCENES, Rasterizer
 from lerobot_memobench.sim.rendering import QUALITIES, ROOM, RenderSettings
@@ -62,10 +63,23 @@ def test_frames_depend_on_nothing_that_is_kept(task: str, quality: str) -> None:
             for name, camera in MJCF_CAMERAS.items():
                 ours = sim.render(name).astype(int)
                 for most, other in others.items():
-                    other._still.clear()
-                    other._shown = None
+                    other.free()
                     off = np.abs(ours - other.draw(sim.model, sim.data, camera, sim.highlights))
                     assert off.max() <= most, f"{state}, {name}"
+
+
+@pytest.mark.parametrize("place", [np.nan, np.inf, 1e9])
+def test_a_state_that_is_not_finite_is_refused(place: float) -> None:
+    sim = Simulation(get_task("open_and_close_the_microwave"), RenderSettings(32, 32))
+    sim.reset(7)
+    expected = sim.render()
+    kept = sim.data.geom_xpos.copy()
+    sim.data.geom_xpos[sim.model.geom_group == VISUAL_GROUP] = place
+    for draw in (sim.render, sim.geoms):
+        with pytest.raises(MemobenchError, match="expected a finite state"):
+            draw()
+    sim.data.geom_xpos[:] = kept
+    np.testing.assert_array_equal(sim.render(), expected)
 
 
 def test_no_more_scenes_are_kept_than_are_allowed() -> None:

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from lerobot_memobench.sim.gl.context import context_is_open, enter_context
 from lerobot_memobench.sim.gl.resources import Resources
 from lerobot_memobench.sim.gl.shaders import ATTRIBUTES, TEXTURE_UNITS, frame_block, scene_program, shadow_program
-from lerobot_memobench.sim.raster.drawlist import LAYER_SIZE, VERTEX, DrawList
+from lerobot_memobench.sim.raster.drawlist import VERTEX, DrawList, Image
 from lerobot_memobench.sim.raster.highlights import HIGHLIGHTS, Highlight, fill_table, table_of, with_discs
-from lerobot_memobench.sim.raster.view import Lamps, camera_matrix
-
-Image = NDArray[np.uint8]
+from lerobot_memobench.sim.raster.lights import Lamps
+from lerobot_memobench.sim.raster.textures import LAYER_SIZE
+from lerobot_memobench.sim.raster.view import camera_matrix
 
 
 class MultisampleRasterizer:

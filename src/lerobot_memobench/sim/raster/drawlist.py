@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.sim.raster.mirror import Mirror, find_mirror
 from lerobot_memobench.sim.raster.shapes import Triangles, box_cells, triangles_of
-from lerobot_memobench.sim.raster.textures import LAYER_SIZE, cube_coordinates, flat_coordinates, layers_of
+from lerobot_memobench.sim.raster.textures import cube_coordinates, flat_coordinates, layers_of
 
 VISUAL_GROUP = 1
 """Geoms of this group are seen; the others are for contacts."""
@@ -30,8 +30,8 @@ _NO_MATERIAL = (0.5, 64.0, 0.0, 0.0)
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("uv", "<f4", 2), ("row", "<f4")])
 
 Floats = NDArray[np.float32]
-
-__all__ = ["LAYER_SIZE", "ROWS", "VERTEX", "VISUAL_GROUP", "DrawList", "Floats", "build_draw_list", "colours"]
+Image = NDArray[np.uint8]
+"""(height, width, 3), first row on top."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.drawlist import LAYER_SIZE, DrawList, Floats
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.raster.background import KEPT, light_background, shadow_tiles
+from lerobot_memobench.sim.raster.drawlist import DrawList, Floats, Image
 from lerobot_memobench.sim.raster.geometry import (
     TILE,
     Shapes,
@@ -27,23 +29,21 @@ from lerobot_memobench.sim.raster.geometry import (
     restore_depths,
 )
 from lerobot_memobench.sim.raster.highlights import Highlight, fill_table, table_of, with_discs
+from lerobot_memobench.sim.raster.lights import Lamps, Lights
 from lerobot_memobench.sim.raster.mirror import Mirror, cropped, mirrored
 from lerobot_memobench.sim.raster.shading import (
     BACKGROUND,
-    KEPT,
     PICTURE,
     TRANSLUCENT,
-    Lights,
     Surfaces,
-    light_background,
     scratch,
     shade,
-    shadow_tiles,
 )
-from lerobot_memobench.sim.raster.textures import levels_of
-from lerobot_memobench.sim.raster.view import Lamps, camera_matrix, clipping
+from lerobot_memobench.sim.raster.textures import LAYER_SIZE, levels_of
+from lerobot_memobench.sim.raster.view import camera_matrix, clipping
 
-Image = NDArray[np.uint8]
+FARTHEST = 1e6
+"""Bound of all places in a scene, m."""
 OPAQUE = 0.995
 """Alpha from which on MuJoCo takes a geom as opaque."""
 KEPT_SCENES = 4
@@ -132,8 +132,7 @@ class Rasterizer:
             camera: its name.
             highlights: drawn in this order.
         """
-        fill_table(self._table, self._list, model, data, highlights)
-        view = View(self, model, data, camera)
+        view = self._look(model, data, camera, highlights)
         still = self._bring_shadows_up_to_date(view)
         rows = self._rows
         opaque = self._table[: len(rows), 3, 3] >= OPAQUE
@@ -174,14 +173,34 @@ class Rasterizer:
 
         The middle of a pixel decides.
         """
-        fill_table(self._table, self._list, model, data, ())
-        view = View(self, model, data, camera)
+        view = self._look(model, data, camera, ())
         self._clear()
         view.draw_triangles(self._rows)
         shown = self._target.triangle
         rows = self._surfaces.row[self._shapes.triangles[shown, 0]]
         # A row of a highlight is none of the list, and is not drawn here.
         return np.where(shown >= 0, self._list.geoms[np.minimum(rows, len(self._list.geoms) - 1)], -1)
+
+    def _look(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight]) -> View:
+        """Fill the table with a state and return a camera's view of it.
+
+        Raises:
+            MemobenchError: something is at no place. Compiled functions would write outside of their memory.
+        """
+        fill_table(self._table, self._list, model, data, highlights)
+        view = View(self, model, data, camera)
+        rows = len(self._rows) + len(highlights)
+        for numbers in (self._table[:rows, :3], view.matrix, view.light_matrix):
+            if numbers.size and not float(np.abs(numbers).max()) < FARTHEST:
+                raise MemobenchError(
+                    f"a body, camera or highlight to be drawn is not within {FARTHEST:g} m; expected a finite state"
+                )
+        return view
+
+    def free(self) -> None:
+        """Forget the pictures of still rows; the next frame draws them again."""
+        self._still.clear()
+        self._shown = None
 
     def _clear(self) -> None:
         self._target.depth[:] = 0.0

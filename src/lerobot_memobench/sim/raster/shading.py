@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.sim.raster.compiled import compiled
-from lerobot_memobench.sim.raster.geometry import TILE
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int32]
@@ -25,8 +24,6 @@ unsigned there: numba looks whether others are negative, which no vector instruc
 STRIDE = BATCH + CHUNK
 ATTRIBUTES = 11
 """Of a vertex: steady light (3), light that a shadow may take (3), texture coordinates (2), shadow map (3)."""
-KEPT = 9
-"""Of a pixel of the background: steady colour (3), colour that a shadow may take (3), place in the shadow map (3)."""
 PICTURE, BACKGROUND, TRANSLUCENT = 0, 1, 2
 """Where colours go: into the picture, into the kept background, over the picture."""
 
@@ -52,27 +49,6 @@ class Surfaces(NamedTuple):
     row: Integers
     texels: Integers
     side: int
-
-
-class Lights(NamedTuple):
-    """The lights of a frame, the headlight first.
-
-    ``to``: (L, 3), direction to a light of parallel rays, place of another; ``placed``: (L,), whether it is the latter;
-    ``axis``: (L, 3), where it shines; ``cone``: (L, 2), cosine of its cutoff and exponent; ``attenuation``: (L, 3);
-    ``ambient``, ``diffuse``, ``specular``: (L, 3). ``caster``: which one casts shadows, −1 for none. ``clamped``:
-    whether light is cut off at 1 before the texture takes its part.
-    """
-
-    to: Floats
-    placed: NDArray[np.bool_]
-    axis: Floats
-    cone: Floats
-    attenuation: Floats
-    ambient: Floats
-    diffuse: Floats
-    specular: Floats
-    caster: int
-    clamped: bool
 
 
 class Scratch(NamedTuple):
@@ -127,14 +103,14 @@ def shade(
     Args:
         shapes, table, clip, target: see `geometry.draw_triangles`, which has been called.
         surfaces: `Surfaces`.
-        lights: `Lights`.
+        lights: `lights.Lights`.
         eye: the camera's place, (3,).
         light_matrix: from the world to the caster's clip space, (4, 4).
         shadow_map: see `geometry.draw_depths`.
         work: `Scratch`.
         mode: `PICTURE`, `BACKGROUND` or `TRANSLUCENT`.
         image: (H * W, 3) uint8, brought up to date in the modes `PICTURE` and `TRANSLUCENT`.
-        kept: (KEPT, H * W), brought up to date in the mode `BACKGROUND`.
+        kept: (background.KEPT, H * W), brought up to date in the mode `BACKGROUND`.
     """
     height, width = target.triangle.shape
     runs = _find_runs(target.triangle, work.runs)
@@ -153,13 +129,13 @@ def shade(
             layer: Any = 0
             alpha: Any = _1
             if n < runs:
-                start, length = np.int64(work.runs[n, 0]), np.int64(work.runs[n, 1])
+                start, length = int(work.runs[n, 0]), int(work.runs[n, 1])
                 triangle = work.runs[n, 2]
                 row = surfaces.row[shapes.triangles[triangle, 0]]
-                layer = np.int64(table[row, 4, 3])
+                layer = int(table[row, 4, 3])
                 if (layer > 0) != textured:
                     continue
-                slot, alpha = np.int64(work.slot[triangle]), min(max(table[row, 3, 3], _0), _1)
+                slot, alpha = int(work.slot[triangle]), min(max(table[row, 3, 3], _0), _1)
             done = 0
             while done < length or (n == runs and count > 0):
                 here = min(length - done, BATCH - count)
@@ -634,56 +610,3 @@ def _look_up(shadow_map: Any, t: Any, i: Any) -> None:
         u, v = t[8 * STRIDE + x], t[9 * STRIDE + x]
         # Beyond the map nothing casts shadows.
         t[_LIT * STRIDE + x] = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)
-
-
-@compiled
-def shadow_tiles(kept: Any, size: Any, tiles: Any, tile: Any) -> None:
-    """Write down for each pixel of the background in which tile its shadow is looked up.
-
-    Args:
-        kept: (KEPT, pixels).
-        size: side of the shadow map, texels.
-        tiles: tiles in its side; those of pixels that no shadow can change get the number behind the last tile.
-        tile: (pixels,), overwritten.
-    """
-    wide, last = np.float32(size), np.float32(size - 2)
-    for p in range(tile.size):
-        if kept[3, p] > _0 or kept[4, p] > _0 or kept[5, p] > _0:
-            left = int(min(max(kept[6, p] * wide - _HALF, _0), last))
-            top = int(min(max(kept[7, p] * wide - _HALF, _0), last))
-            tile[p] = top // TILE * tiles + left // TILE
-        else:
-            tile[p] = tiles * tiles
-
-
-@compiled
-def light_background(kept: Any, tile: Any, touched: Any, triangle: Any, shadow_map: Any, image: Any) -> None:
-    """Colour the pixels of the background whose tile of the shadow map was touched.
-
-    Args:
-        kept: (KEPT, pixels).
-        tile: see `shadow_tiles`.
-        touched: by tile, and one more for pixels that no shadow can change.
-        triangle: (pixels,), −1 where the background shows.
-        shadow_map: (size, size).
-        image: (pixels, 3) uint8, brought up to date.
-    """
-    size = shadow_map.shape[0]
-    wide, last = np.float32(size), np.float32(size - 2)
-    for k in range(tile.size):
-        if not touched[tile[k]] or triangle[k] >= 0:
-            continue
-        a = min(max(kept[6, k] * wide - _HALF, _0), last)
-        b = min(max(kept[7, k] * wide - _HALF, _0), last)
-        left, top = np.int32(a), np.int32(b)
-        across, down, depth = a - np.float32(left), b - np.float32(top), kept[8, k]
-        p = _1 if depth <= shadow_map[top, left] else _0
-        q = _1 if depth <= shadow_map[top, left + 1] else _0
-        r = _1 if depth <= shadow_map[top + 1, left] else _0
-        s = _1 if depth <= shadow_map[top + 1, left + 1] else _0
-        upper, lower = p + across * (q - p), r + across * (s - r)
-        u, v = kept[6, k], kept[7, k]
-        lit = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)
-        for c in range(3):
-            colour = kept[c, k] + lit * kept[3 + c, k]
-            image[k, c] = np.uint8(min(max(colour, _0), _255) + _HALF)
