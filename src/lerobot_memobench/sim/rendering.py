@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Protocol
 
 import mujoco
@@ -13,9 +14,10 @@ import mujoco
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim.gl.context import close_context
 from lerobot_memobench.sim.gl.rasterizer import MultisampleRasterizer
-from lerobot_memobench.sim.raster.drawlist import build_draw_list
+from lerobot_memobench.sim.raster.drawlist import DrawList, build_draw_list
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.raster.rasterizer import Image, Rasterizer
+from lerobot_memobench.sim.raster.shapes import Triangles, mesh_in_file
 from lerobot_memobench.sim.robot import whole_arm
 
 
@@ -84,17 +86,25 @@ class _Thread(threading.local):
 _thread = _Thread()
 
 
-def get_renderer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> Renderer:
+def get_renderer(
+    key: Any, model: mujoco.MjModel, settings: RenderSettings, draw_list: DrawList | None = None
+) -> Renderer:
     """Return this thread's renderer for a scene, made at its first frame.
 
     Simulations of the same scene share it: meshes and textures are the scene's, poses come with each frame's data.
+
+    Args:
+        key: the scene's name.
+        model: a compiled scene.
+        settings: size and quality of frames.
+        draw_list: what there is to draw, where it is not all visual geoms of the model.
     """
     renderers = _thread.renderers
     full = (key, settings)
     if full not in renderers:
         while len(renderers) >= CACHED_RENDERERS:
             free_renderer(renderers.popitem(last=False)[1])
-        renderers[full] = make_renderer(model, settings)
+        renderers[full] = make_renderer(model, settings, draw_list)
     renderers.move_to_end(full)
     return renderers[full]
 
@@ -105,23 +115,34 @@ def free_renderer(renderer: Renderer) -> None:
         renderer.free()
 
 
-def get_rasterizer(key: Any, model: mujoco.MjModel, settings: RenderSettings) -> Rasterizer:
+def get_rasterizer(
+    key: Any, model: mujoco.MjModel, settings: RenderSettings, draw_list: DrawList | None = None
+) -> Rasterizer:
     """Return this thread's renderer for a scene that also says which geom each pixel shows.
 
     It is the one of `get_renderer`; where GL draws the frames, one of the same size.
     """
-    renderer = get_renderer(key, model, replace(settings, quality="fast") if settings.needs_gl else settings)
+    settings = replace(settings, quality="fast") if settings.needs_gl else settings
+    renderer = get_renderer(key, model, settings, draw_list)
     assert isinstance(renderer, Rasterizer)
     return renderer
 
 
-def make_renderer(model: mujoco.MjModel, settings: RenderSettings) -> Renderer:
+def make_renderer(model: mujoco.MjModel, settings: RenderSettings, draw_list: DrawList | None = None) -> Renderer:
     """Return a renderer of one's own for a scene; see `get_renderer`."""
     quality, size = QUALITIES[settings.quality], (settings.width, settings.height)
-    draw_list = build_draw_list(model, ROOM, whole_arm() if quality.whole_arm else None)
+    if draw_list is None:
+        draw_list = build_draw_list(model, ROOM, _whole_arm_meshes() if quality.whole_arm else None)
     if settings.needs_gl:
         return MultisampleRasterizer(model, draw_list, *size, quality.samples, quality.shadow_map)
     return Rasterizer(model, draw_list, *size, quality.shadow_map)
+
+
+@cache
+def _whole_arm_meshes() -> dict[str, Triangles]:
+    """Return the meshes of the whole arm by name."""
+    arm = whole_arm()
+    return {arm.mesh(mesh).name: mesh_in_file(arm, mesh) for mesh in range(arm.nmesh)}
 
 
 def close_renderers() -> None:

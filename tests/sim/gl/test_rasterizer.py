@@ -9,7 +9,7 @@ import numpy as np
 from lerobot_memobench.sim.gl.rasterizer import MultisampleRasterizer
 from lerobot_memobench.sim.gl.shaders import frame_block
 from lerobot_memobench.sim.rendering import RenderSettings, make_renderer
-from lerobot_memobench.sim.scene import get_scene
+from lerobot_memobench.sim.worlds import get_scene
 from lerobot_memobench.tasks.catalogue import get_task
 
 

@@ -130,7 +130,7 @@ def test_looks_like_mujocos_own_renderer(mujoco_renderer: type[mujoco.Renderer],
     model = textured_scene()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    ours = Rasterizer(model, build_draw_list(model, sharp=True), 256, 256, 0, clamped=True)
+    ours = Rasterizer(model, build_draw_list(model, as_mujoco=True), 256, 256, 0)
     model.vis.quality.offsamples = 0
     with mujoco_renderer(model, 256, 256) as renderer:
         option = mujoco.MjvOption()

@@ -22,8 +22,6 @@ _DOWN = ((1, -1), (1, -1), (2, 1), (2, -1), (1, -1), (1, -1))
 
 def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple[int, ...]]]:
     """Return a model's textures at one size, and texture id → its layer, or six of a cube; layer 0 is white."""
-    from PIL import Image
-
     layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
     layer_of: dict[int, tuple[int, ...]] = {}
     known: dict[bytes, int] = {}  # the sides of a cube are often one picture
@@ -37,11 +35,16 @@ def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple
             content = picture.tobytes()
             if content not in known:
                 known[content] = len(layers)
-                # At its own size this leaves every pixel as it is.
-                resized = Image.fromarray(picture).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC)
-                layers.append(np.asarray(resized))
+                layers.append(resized(picture))
             layer_of[texture] = (*layer_of.get(texture, ()), known[content])
     return np.stack(layers), layer_of
+
+
+def resized(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a picture at the size of layers; one of that size is left as it is."""
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(picture).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC))
 
 
 def _pictures(model: mujoco.MjModel, texture: int, pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:

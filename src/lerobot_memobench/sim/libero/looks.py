@@ -1,0 +1,138 @@
+"""Keep what is seen of LIBERO's world in the user's cache folder: meshes with each vertex once, textures at one size.
+
+Its files hold 80 MB, which take seconds to read. Here each is read once; later processes compile a model in which boxes
+stand for meshes, and draw the meshes that are kept. No face is left out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.io import cache_folder, draft_of, file_hash
+from lerobot_memobench.sim.raster.drawlist import PIECE, DrawList, build_draw_list
+from lerobot_memobench.sim.raster.shapes import in_pieces, mesh_in_file, welded
+from lerobot_memobench.sim.raster.textures import LAYER_SIZE, resized
+
+Arrays = dict[str, NDArray[Any]]
+FORM = "2"
+"""Of the kept files; another one for each change of what they hold."""
+STAND_IN = np.array([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], dtype=np.float64)
+STAND_IN_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+"""A box in place of a mesh; the compiler leaves it in the frame of its file."""
+
+
+def drawn(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
+    """Return a scene to take poses and lights from, and what to draw of it.
+
+    Args:
+        spec: the scene with its visual geoms; it is changed.
+
+    Raises:
+        ValueError: MuJoCo cannot read a file.
+    """
+    files = {_key(part): part for part in [*spec.meshes, *spec.textures] if part.file}
+    kept = {key: _read(key) for key in files}
+    missing = {key: files[key] for key, arrays in kept.items() if arrays is None}
+    if missing:
+        whole = spec.copy().compile()
+        kept |= {key: _keep(key, _content(whole, part)) for key, part in missing.items()}
+    meshes = {}
+    for key, part in files.items():
+        arrays = kept[key]
+        assert arrays is not None
+        if isinstance(part, mujoco.MjsMesh):
+            meshes[part.name] = arrays
+            _stand_in(part)
+        elif arrays:
+            _replace(part, arrays["pixels"])
+    model = spec.compile()
+    _set_frames(model, meshes)
+    shapes = {name: (of["points"], of["normals"], of["uv"], of["triangles"]) for name, of in meshes.items() if of}
+    return model, build_draw_list(model, meshes=shapes, as_mujoco=True)
+
+
+# --- what is kept of a file ---
+
+
+def _key(part: mujoco.MjsMesh | mujoco.MjsTexture) -> str:
+    """Return a name for what is kept of a mesh or a texture, by all that it depends on."""
+    scale = part.scale.tolist() if isinstance(part, mujoco.MjsMesh) else LAYER_SIZE
+    facts = FORM, mujoco.__version__, file_hash(Path(part.file)), scale
+    return hashlib.sha256(repr(facts).encode()).hexdigest()[:24]
+
+
+def _path(key: str) -> Path:
+    return cache_folder() / "libero" / f"{key}.npz"
+
+
+def _read(key: str) -> Arrays | None:
+    with contextlib.suppress(OSError, ValueError, KeyError, EOFError), np.load(_path(key), allow_pickle=False) as kept:
+        return dict(kept)
+    return None
+
+
+def _keep(key: str, arrays: Arrays) -> Arrays:
+    """Write arrays where the folder takes them; without it each process reads LIBERO's files."""
+    path = _path(key)
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with draft_of(path) as draft:
+            np.savez(draft, **arrays)  # type: ignore[arg-type]  # numpy's stub wants one type for all
+    return arrays
+
+
+def _content(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) -> Arrays:
+    """Return what is kept of a compiled mesh or texture: of a mesh that is not seen its frame, of other textures
+    than of three channels nothing."""
+    if isinstance(part, mujoco.MjsTexture):
+        texture = model.tex(part.name)
+        if texture.nchannel[0] != 3:
+            return {}
+        start, height, width = int(texture.adr[0]), int(texture.height[0]), int(texture.width[0])
+        pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
+        return {"pixels": resized(pixels)} if height == width else {}
+    mesh = model.mesh(part.name).id
+    shown = np.flatnonzero((model.geom_dataid == mesh) & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value))
+    frame = {"pos": model.mesh_pos[mesh], "quat": model.mesh_quat[mesh], "size": model.geom_size[shown[:1]]}
+    points, normals, uv, triangles = in_pieces(welded(mesh_in_file(model, mesh)), PIECE)
+    return {**frame, "points": points, "normals": normals, "uv": uv, "triangles": triangles}
+
+
+# --- in place of files ---
+
+
+def _stand_in(mesh: mujoco.MjsMesh) -> None:
+    faces = [corner for a, b, c, d in STAND_IN_FACES for corner in (a, b, c, a, c, d)]
+    mesh.file, mesh.scale = "", [1.0, 1.0, 1.0]
+    mesh.uservert, mesh.userface = (0.01 * STAND_IN).ravel().tolist(), faces
+
+
+def _replace(texture: mujoco.MjsTexture, pixels: NDArray[np.uint8]) -> None:
+    texture.file, texture.nchannel = "", 3
+    texture.height, texture.width = pixels.shape[:2]
+    texture.data = pixels.tobytes()
+
+
+def _set_frames(model: mujoco.MjModel, meshes: Mapping[str, Arrays]) -> None:
+    """Give geoms of stand-ins the frames and sizes of the kept meshes: pictures are laid over them by these."""
+    for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value):
+        mesh = int(model.geom_dataid[geom])
+        kept = meshes.get(model.mesh(mesh).name)
+        if kept is None:
+            continue
+        model.mesh_pos[mesh], model.mesh_quat[mesh] = kept["pos"], kept["quat"]
+        offset, turn = np.empty(3), np.empty(4)
+        mujoco.mju_rotVecQuat(offset, kept["pos"], model.geom_quat[geom])
+        mujoco.mju_mulQuat(turn, model.geom_quat[geom], kept["quat"])
+        model.geom_pos[geom] += offset
+        model.geom_quat[geom] = turn
+        model.geom_size[geom] = kept["size"][0]
+        model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE.value
