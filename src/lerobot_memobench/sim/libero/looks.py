@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.io import cache_folder, draft_of, file_hash
-from lerobot_memobench.sim.raster.drawlist import PIECE, DrawList, build_draw_list
-from lerobot_memobench.sim.raster.shapes import in_pieces, mesh_in_file, welded
+from lerobot_memobench.sim.raster.drawlist import PIECE, VISUAL_GROUP, DrawList, build_draw_list
+from lerobot_memobench.sim.raster.shapes import Triangles, in_pieces, mesh_in_file, welded
 from lerobot_memobench.sim.raster.textures import LAYER_SIZE, resized
 
 Arrays = dict[str, NDArray[Any]]
-FORM = "2"
+FORM = "3"
 """Of the kept files; another one for each change of what they hold."""
 STAND_IN = np.array([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], dtype=np.float64)
 STAND_IN_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -38,6 +38,10 @@ def drawn(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
     Raises:
         ValueError: MuJoCo cannot read a file.
     """
+    seen = {geom.meshname for geom in spec.geoms if geom.group == VISUAL_GROUP}
+    for mesh in spec.meshes:
+        if mesh.name not in seen and mesh.file:
+            _stand_in(mesh)
     files = {_key(part): part for part in [*spec.meshes, *spec.textures] if part.file}
     kept = {key: _read(key) for key in files}
     missing = {key: files[key] for key, arrays in kept.items() if arrays is None}
@@ -55,7 +59,7 @@ def drawn(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
             _replace(part, arrays["pixels"])
     model = spec.compile()
     _set_frames(model, meshes)
-    shapes = {name: (of["points"], of["normals"], of["uv"], of["triangles"]) for name, of in meshes.items() if of}
+    shapes = {name: _shape(arrays) for name, arrays in meshes.items()}
     return model, build_draw_list(model, meshes=shapes, as_mujoco=True)
 
 
@@ -90,8 +94,7 @@ def _keep(key: str, arrays: Arrays) -> Arrays:
 
 
 def _content(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) -> Arrays:
-    """Return what is kept of a compiled mesh or texture: of a mesh that is not seen its frame, of other textures
-    than of three channels nothing."""
+    """Return what is kept of a compiled mesh or texture; nothing of a texture that is no square of three channels."""
     if isinstance(part, mujoco.MjsTexture):
         texture = model.tex(part.name)
         if texture.nchannel[0] != 3:
@@ -101,9 +104,14 @@ def _content(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) ->
         return {"pixels": resized(pixels)} if height == width else {}
     mesh = model.mesh(part.name).id
     shown = np.flatnonzero((model.geom_dataid == mesh) & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value))
-    frame = {"pos": model.mesh_pos[mesh], "quat": model.mesh_quat[mesh], "size": model.geom_size[shown[:1]]}
-    points, normals, uv, triangles = in_pieces(welded(mesh_in_file(model, mesh)), PIECE)
-    return {**frame, "points": points, "normals": normals, "uv": uv, "triangles": triangles}
+    frame = np.concatenate([model.mesh_pos[mesh], model.mesh_quat[mesh], model.geom_size[shown[0]]])
+    *vertices, triangles = in_pieces(welded(mesh_in_file(model, mesh)), PIECE)
+    return {"frame": frame, "vertices": np.concatenate(vertices, axis=1), "triangles": triangles}
+
+
+def _shape(kept: Arrays) -> Triangles:
+    vertices = kept["vertices"]
+    return vertices[:, :3], vertices[:, 3:6], vertices[:, 6:], kept["triangles"]
 
 
 # --- in place of files ---
@@ -128,11 +136,12 @@ def _set_frames(model: mujoco.MjModel, meshes: Mapping[str, Arrays]) -> None:
         kept = meshes.get(model.mesh(mesh).name)
         if kept is None:
             continue
-        model.mesh_pos[mesh], model.mesh_quat[mesh] = kept["pos"], kept["quat"]
+        position, quaternion, size = np.split(kept["frame"], (3, 7))
+        model.mesh_pos[mesh], model.mesh_quat[mesh] = position, quaternion
         offset, turn = np.empty(3), np.empty(4)
-        mujoco.mju_rotVecQuat(offset, kept["pos"], model.geom_quat[geom])
-        mujoco.mju_mulQuat(turn, model.geom_quat[geom], kept["quat"])
+        mujoco.mju_rotVecQuat(offset, position, model.geom_quat[geom])
+        mujoco.mju_mulQuat(turn, model.geom_quat[geom], quaternion)
         model.geom_pos[geom] += offset
         model.geom_quat[geom] = turn
-        model.geom_size[geom] = kept["size"][0]
+        model.geom_size[geom] = size
         model.geom_sameframe[geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE.value

@@ -106,12 +106,21 @@ def _in_picture(m: Any, centre: Any, half: Any, near: Any) -> Any:
 def _bounds(a: Any, b: Any, c: Any) -> Any:
     """Return how an edge, a x + b y + c ≥ 0 inside, bounds x in row y: from below p y + q on, up to r y + s.
 
-    A level edge bounds none: all rows that a triangle is in lie within it.
+    A level edge bounds none: it bounds rows, see `_rows_within`.
     """
     if abs(a) <= 1e-9 * abs(b):
         return 0.0, -1e30, 0.0, 1e30
     slope, start = -b / a, -c / a
     return (slope, start, 0.0, 1e30) if a > 0.0 else (0.0, -1e30, slope, start)
+
+
+@compiled
+def _rows_within(a: Any, b: Any, c: Any, top: Any, bottom: Any) -> Any:
+    """Return the first and last of some rows that lie within an edge, if it is level; see `_bounds`."""
+    if abs(a) > 1e-9 * abs(b) or b == 0.0:
+        return top, bottom
+    row = min(max(-c / b, -1.0), bottom + 1.0)
+    return (max(top, math.ceil(row)), bottom) if b > 0.0 else (top, min(bottom, math.floor(row)))
 
 
 @compiled
@@ -162,7 +171,8 @@ def draw_triangles(
             if volume <= 1e-12:
                 continue
             left, right, top, bottom = 0, width - 1, 0, height - 1
-            if w0 > 1e-6 and w1 > 1e-6 and w2 > 1e-6:
+            in_front = w0 > 1e-6 and w1 > 1e-6 and w2 > 1e-6
+            if in_front:
                 u0, u1, u2 = x0 / w0, x1 / w1, x2 / w2
                 v0, v1, v2 = y0 / w0, y1 / w1, y2 / w2
                 low, high = min(u0, u1, u2) - 0.5, max(u0, u1, u2) - 0.5
@@ -179,6 +189,10 @@ def draw_triangles(
             a2, b2, c2 = y1 * w0 - y0 * w1, x0 * w1 - x1 * w0, x1 * y0 - x0 * y1
             # Pixels are counted by their middles.
             c0, c1, c2 = c0 + 0.5 * (a0 + b0), c1 + 0.5 * (a1 + b1), c2 + 0.5 * (a2 + b2)
+            if not in_front:  # otherwise level edges bound the box
+                top, bottom = _rows_within(a0, b0, c0, top, bottom)
+                top, bottom = _rows_within(a1, b1, c1, top, bottom)
+                top, bottom = _rows_within(a2, b2, c2, top, bottom)
             edge0, edge1, edge2 = _bounds(a0, b0, c0), _bounds(a1, b1, c1), _bounds(a2, b2, c2)
             scale = 0.0
             across, down, at_origin, slope = 0.0, 0.0, 0.0, np.float32(0)
