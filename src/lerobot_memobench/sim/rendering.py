@@ -10,6 +10,7 @@ from functools import cache
 from typing import Any, Protocol
 
 import mujoco
+import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim.gl.context import close_context
@@ -36,7 +37,8 @@ class Quality:
 
 QUALITIES = {"fast": Quality(0), "default": Quality(1024), "high": Quality(2048, samples=4, whole_arm=True)}
 """Textures and light are the same in all. ``fast`` leaves out shadows. ``high`` is for pictures and videos: it smooths
-edges, sharpens shadows and draws the arm whole. It alone needs a GL library, and costs ten times as much."""
+edges, sharpens shadows and draws the arm whole. It alone needs a GL library, and costs ten times as much.
+Scenes that are drawn as by MuJoCo need none for ``high`` either."""
 
 ROOM = ("room", "kitchen_table")
 """Bodies that cast no shadow: what theirs would fall on is under or behind them."""
@@ -70,6 +72,22 @@ class Renderer(Protocol):
     ) -> Image:
         """Return what a camera sees, (height, width, 3) uint8, first row on top."""
         ...
+
+
+@dataclass(frozen=True)
+class Supersampled:
+    """Draw frames of twice the width and height, and take the mean of four pixels: smooth edges without GL."""
+
+    renderer: Rasterizer
+
+    def draw(
+        self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight] = ()
+    ) -> Image:
+        """Return what a camera sees; see `Renderer`."""
+        fine = self.renderer.draw(model, data, camera, highlights)
+        height, width, channels = fine.shape
+        total = fine.reshape(height // 2, 2, width // 2, 2, channels).sum(axis=(1, 3), dtype=np.uint16)
+        return ((total + 2) // 4).astype(np.uint8)
 
 
 CACHED_RENDERERS = 4
@@ -133,6 +151,8 @@ def make_renderer(model: mujoco.MjModel, settings: RenderSettings, draw_list: Dr
     quality, size = QUALITIES[settings.quality], (settings.width, settings.height)
     if draw_list is None:
         draw_list = build_draw_list(model, ROOM, _whole_arm_meshes() if quality.whole_arm else None)
+    if draw_list.as_mujoco and quality.samples:
+        return Supersampled(Rasterizer(model, draw_list, 2 * settings.width, 2 * settings.height, 0))
     if settings.needs_gl:
         return MultisampleRasterizer(model, draw_list, *size, quality.samples, quality.shadow_map)
     return Rasterizer(model, draw_list, *size, quality.shadow_map)

@@ -1,7 +1,7 @@
 """Keep what is seen of LIBERO's world in the user's cache folder: meshes with each vertex once, textures at one size.
 
 Its files hold 80 MB, which take seconds to read. Here each is read once; later processes compile a model in which boxes
-stand for meshes, and draw the meshes that are kept. No face is left out.
+stand for meshes, and draw the meshes that are kept. Things of many faces are thinned; kitchen and arm are not.
 """
 
 from __future__ import annotations
@@ -22,8 +22,14 @@ from lerobot_memobench.sim.raster.shapes import Triangles, in_pieces, mesh_in_fi
 from lerobot_memobench.sim.raster.textures import LAYER_SIZE, resized
 
 Arrays = dict[str, NDArray[Any]]
-FORM = "3"
+FORM = "5"
 """Of the kept files; another one for each change of what they hold."""
+LEAST_THINNED, THINNED_TO = 6000, 4000
+"""Triangles of meshes that are thinned, and to how many: things fill a thousandth of a picture each."""
+LARGEST_THINNED = 0.5
+"""Their largest size, m: what is larger stands still, and is drawn once per scene."""
+AGREEMENT = 0.96
+"""Cosine below which a corner of a thinned mesh has its face's normal: a few large faces show no rounded edge."""
 STAND_IN = np.array([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], dtype=np.float64)
 STAND_IN_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """A box in place of a mesh; the compiler leaves it in the frame of its file."""
@@ -105,8 +111,42 @@ def _content(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) ->
     mesh = model.mesh(part.name).id
     shown = np.flatnonzero((model.geom_dataid == mesh) & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value))
     frame = np.concatenate([model.mesh_pos[mesh], model.mesh_quat[mesh], model.geom_size[shown[0]]])
-    *vertices, triangles = in_pieces(welded(mesh_in_file(model, mesh)), PIECE)
+    material = model.geom_matid[shown[0]]
+    textured = material >= 0 and model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value] >= 0
+    shape = mesh_in_file(model, mesh)
+    *vertices, triangles = in_pieces(welded(_thinned(shape) if textured else shape), PIECE)
     return {"frame": frame, "vertices": np.concatenate(vertices, axis=1), "triangles": triangles}
+
+
+def _thinned(shape: Triangles) -> Triangles:
+    """Return a thing's shape with few triangles where its picture is one piece; seams of the picture stay.
+
+    Collapsed vertices take the coordinates and the normal of the nearest one of theirs.
+    """
+    points, normals, uv, triangles = shape
+    if len(triangles) <= LEAST_THINNED or not uv.any() or np.ptp(points, axis=0).max() > LARGEST_THINNED:
+        return shape
+    import fast_simplification  # only the first picture on a machine needs it
+
+    spots, smooth, spot_uv, faces = welded((points, np.zeros_like(points), uv, triangles))
+    smooth = np.zeros_like(spots)
+    _, _, _, same = welded((points, np.zeros_like(points), uv, np.arange(len(points))[:, None]))
+    np.add.at(smooth, same[:, 0], normals)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    _, _, collapses = fast_simplification.simplify(
+        spots, faces, target_count=THINNED_TO, agg=5, return_collapses=True, preserve_border=True
+    )
+    corners, thin, moved = fast_simplification.replay_simplification(spots, faces, collapses)
+    off = np.linalg.norm(spots - corners[moved], axis=1)
+    order = np.lexsort((-off, moved))  # the nearest one of each is written last
+    nearest = np.zeros(len(corners), np.int64)
+    nearest[moved[order]] = order
+    flat = np.cross(corners[thin[:, 1]] - corners[thin[:, 0]], corners[thin[:, 2]] - corners[thin[:, 0]])
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-20)
+    mean = smooth[nearest] / np.maximum(np.linalg.norm(smooth[nearest], axis=1, keepdims=True), 1e-20)
+    edged = np.einsum("fcx,fx->fc", mean[thin], flat) < AGREEMENT
+    normal = np.where(edged[..., None], flat[:, None], mean[thin]).reshape(-1, 3)
+    return corners[thin.ravel()], normal, spot_uv[nearest][thin.ravel()], np.arange(thin.size).reshape(-1, 3)
 
 
 def _shape(kept: Arrays) -> Triangles:
