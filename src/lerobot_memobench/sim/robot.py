@@ -161,18 +161,23 @@ def robot_xml() -> str:
 def robot_spec() -> mujoco.MjSpec:
     """Return a fresh spec that holds the arm and robosuite's physics options, for a scene to be added to."""
     spec = mujoco.MjSpec.from_string(robot_xml())
-    thin(spec)
+    _thin(spec)
+    draw_as_seen(spec)
     return spec
 
 
-def thin(spec: mujoco.MjSpec) -> None:
-    """Give the arm of a scene the thinned meshes, and draw nothing of it that a camera does not see."""
+def _thin(spec: mujoco.MjSpec) -> None:
+    """Give the arm of a scene the thinned meshes."""
     arrays = _arrays()
     for mesh in spec.meshes:
         if f"v:{mesh.name}" in arrays:
             mesh.file = ""
             mesh.uservert = arrays[f"v:{mesh.name}"].ravel().tolist()
             mesh.userface = arrays[f"f:{mesh.name}"].ravel().tolist()
+
+
+def draw_as_seen(spec: mujoco.MjSpec) -> None:
+    """Draw nothing of the arm of a scene that a camera does not see, and let nothing touch what is drawn alone."""
     for geom in spec.geoms:
         if geom.meshname and "vis" not in geom.meshname and geom.group == 1:
             geom.contype, geom.conaffinity = 0, 0

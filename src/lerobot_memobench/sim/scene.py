@@ -17,6 +17,7 @@ from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.assets.builder import SITE_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE, build_kitchen
 from lerobot_memobench.sim.assets.registry import build_asset
+from lerobot_memobench.sim.raster.drawlist import DrawList
 from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, Task
 
 Array = NDArray[np.float64]
@@ -45,8 +46,9 @@ class Scene:
     """Every fixture but the table, then every object, by instance name; in LIBERO's world objects go first."""
     stand_ins: tuple[str, ...] = ()
     """Classes that are boxes, because the user does not have the paper's scans of them."""
-    drawing: Callable[[], mujoco.MjModel] | None = None
-    """Returns the model to draw, of the same bodies and joints, where ``model`` has no visual geoms."""
+    drawing: Callable[[], tuple[mujoco.MjModel, DrawList]] | None = None
+    """Returns a model with lights, of the same bodies and joints, and what to draw of it, where ``model`` has no
+    visual geoms."""
     opaque_group: int = VISUAL_GROUP
     """Group of the geoms of ``model`` that hide things behind them."""
 

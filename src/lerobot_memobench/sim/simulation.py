@@ -16,7 +16,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING, make_controller
-from lerobot_memobench.sim.raster.drawlist import Image
+from lerobot_memobench.sim.raster.drawlist import DrawList, Image
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
@@ -103,7 +103,7 @@ class Simulation:
         self._at_home: Snapshot | None = None
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
-        self._drawn: tuple[mujoco.MjModel, mujoco.MjData] | None = None
+        self._drawn: tuple[mujoco.MjModel, mujoco.MjData, DrawList | None] | None = None
         self._controller = make_controller(self.model)
         self._placer = kind.placer(task, self.model, self.data, scene.assets)
         self._hand = self.model.body(robot.HAND_BODY).id
@@ -111,7 +111,7 @@ class Simulation:
         self._arm_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
         self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
         self._full = mujoco.mjtState.mjSTATE_INTEGRATION.value
-        self._glow = [(asset, self.model.geom(geom).id) for asset in scene.assets.values() for geom in asset.glow]
+        self._glowing = [(asset, geom) for asset in scene.assets.values() for geom in asset.glow]
 
     # --- life -----------------------------------------------------------------------------------------------
 
@@ -299,34 +299,38 @@ class Simulation:
 
     def render(self, camera: str = "agentview") -> Image:
         """Return what a camera (`agentview` or `wrist`) sees, (height, width, 3) uint8, upright."""
-        for asset, geom in self._glow:
+        model, data, draw_list = self._drawing()
+        for asset, geom in self._glowing:
             lit = self.holds(Atom("turnon", (asset.name,)))
-            self.model.geom_rgba[geom] = asset.glow_on if lit else asset.glow_off
-        model, data = self._drawing()
-        renderer = get_renderer(self._scene.key, model, self.render_settings)
+            model.geom(geom).rgba = asset.glow_on if lit else asset.glow_off
+        renderer = get_renderer(self._scene.key, model, self.render_settings, draw_list)
         return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
 
     def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
-        model, data = self._drawing()
-        rasterizer = get_rasterizer(self._scene.key, model, self.render_settings)
+        model, data, draw_list = self._drawing()
+        rasterizer = get_rasterizer(self._scene.key, model, self.render_settings, draw_list)
         return rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
 
-    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return the model to draw and its present state: those that move, or the scene's drawing in the same pose."""
+    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData, DrawList | None]:
+        """Return the model to draw, its present state, and what to draw of it, None for all that is visual.
+
+        They are those that move, or the scene's drawing in the same pose.
+        """
         if self._scene.drawing is None:
-            return self.model, self.data
+            return self.model, self.data, None
         if self._drawn is None:
-            model = copy.copy(self._scene.drawing())
-            self._drawn = model, mujoco.MjData(model)
-        model, data = self._drawn
+            drawing, listed = self._scene.drawing()
+            drawing = copy.copy(drawing)
+            self._drawn = drawing, mujoco.MjData(drawing), listed
+        model, data, draw_list = self._drawn
         for name, pose in self.fixture_poses().items():
             body = model.body(name).id
             model.body_pos[body], model.body_quat[body] = pose[:3], pose[3:]
         data.qpos[:] = self.data.qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        return model, data
+        return model, data, draw_list
 
     def proprio(self) -> NDArray[np.float32]:
         """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""

@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.raster.drawlist import DrawList, build_draw_list
-from lerobot_memobench.sim.raster.shapes import disc
+from lerobot_memobench.sim.raster.shapes import disc, mesh_in_file
 from lerobot_memobench.sim.rendering import ROOM
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -79,19 +79,21 @@ def test_a_finer_mesh_stands_where_the_scenes_does() -> None:
     coarse = wedge(WEDGE, WEDGE_FACES)
     fine = wedge(np.vstack([WEDGE, HORN]), np.vstack([WEDGE_FACES[:3], (1, 2, 4), (2, 3, 4), (3, 1, 4)]))
     assert np.abs(coarse.mesh_quat - fine.mesh_quat).max() > 0.05
-    ours, theirs = build_draw_list(coarse, finer=fine), build_draw_list(fine)
+    ours, theirs = build_draw_list(coarse, meshes={"wedge": mesh_in_file(fine, 0)}), build_draw_list(fine)
     assert len(ours.triangles) == 6
     for place in in_world(theirs, fine, "position"):
         distance = np.linalg.norm(in_world(ours, coarse, "position") - place, axis=1)
         assert distance.min() < 1e-6
-    assert len(build_draw_list(coarse, finer=mujoco.MjSpec().compile()).triangles) == 4  # it has none of that name
+    assert len(build_draw_list(coarse, meshes={"another": mesh_in_file(fine, 0)}).triangles) == 4
 
 
 def test_edges_of_a_finer_mesh_are_sharp() -> None:
     """Each corner of a wedge has its faces' normals, as MuJoCo's renderer draws it, not their mean."""
     model = wedge(WEDGE, WEDGE_FACES)
-    sharp = build_draw_list(model, finer=wedge(WEDGE, WEDGE_FACES))
-    np.testing.assert_array_equal(build_draw_list(model, sharp=True).vertices, sharp.vertices)
+    sharp = build_draw_list(model, meshes={"wedge": mesh_in_file(model, 0)})
+    straight = build_draw_list(model, as_mujoco=True).vertices
+    for what in ("position", "normal"):
+        np.testing.assert_allclose(straight[what], sharp.vertices[what], atol=1e-6)
     faces = sharp.triangles
     a, b, c = (sharp.vertices["position"][faces[:, k]] for k in range(3))
     flat = np.cross(b - a, c - a)

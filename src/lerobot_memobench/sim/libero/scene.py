@@ -1,11 +1,12 @@
 """Build a task's scene in LIBERO's world: its kitchen, the arm of robosuite 1.4.0, objects, then fixtures.
 
-A simulation moves a model without visual geoms, which moves to the bit as the whole one and is built in some 25 ms. The
-whole one, whose meshes and textures have 80 MB, is compiled at the first picture.
+A simulation moves a model without visual geoms, which moves to the bit as the whole one and is built in some 25 ms.
+What is seen, whose files have 80 MB, is read at the first picture (`looks`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -22,6 +23,8 @@ from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP, VI
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.libero import mjcf
 from lerobot_memobench.sim.libero.classes import Part, parts_of
+from lerobot_memobench.sim.libero.looks import drawn
+from lerobot_memobench.sim.raster.drawlist import DrawList
 from lerobot_memobench.sim.scene import (
     AGENTVIEW,
     AGENTVIEW_POSITION,
@@ -40,6 +43,11 @@ ZONE_HALF_HEIGHT = 0.007
 FLOOR, WALL = "textures/gray_ceramic_tile.png", "textures/yellow_linen_wall_texture.png"
 """Textures of LIBERO's kitchen."""
 FREE_DAMPING = "0.0005"
+GLOWING = {"flat_stove": "burner"}
+"""Class -> the site that LIBERO shows while one of it is on."""
+GLOW = "glow"
+"""Name of the geom in its place, after the instance's."""
+GLOW_ON, GLOW_OFF = (0.9, 0.05, 0.05, 1.0), (0.9, 0.05, 0.05, 0.0)
 
 
 def build_scene(task: Task) -> Scene:
@@ -48,16 +56,23 @@ def build_scene(task: Task) -> Scene:
     Raises:
         MemobenchError: LIBERO's assets are missing or other ones, or the world lacks a class of the task.
     """
-    model = _compiled(task)
+    with _naming(task):
+        model = scene_spec(task).compile()
     assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
     boxes = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name).stand_in]
-    drawing = cache(lambda: _compiled(task, visuals=True))
+
+    @cache
+    def drawing() -> tuple[mujoco.MjModel, DrawList]:
+        with _naming(task):
+            return drawn(scene_spec(task, visuals=True))
+
     return Scene(scene_key(task), model, assets, tuple(sorted(set(boxes))), drawing, COLLISION_GROUP)
 
 
-def _compiled(task: Task, visuals: bool = False) -> mujoco.MjModel:
+@contextlib.contextmanager
+def _naming(task: Task) -> Iterator[None]:
     try:
-        return scene_spec(task, visuals).compile()
+        yield
     except ValueError as error:  # MuJoCo cannot read a file
         raise MemobenchError(f"the scene of task {task.name} in the world 'libero' cannot be built: {error}") from None
 
@@ -81,25 +96,27 @@ def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
     # robosuite's files reserve room for 5,000 contacts, 1.3 GB of addresses per simulation; no scene uses 1 MB.
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
     if visuals:
-        robot.thin(spec)
-        _draw_floor(spec)
+        robot.draw_as_seen(spec)
+        _add_glow(spec, task)
     return spec
 
 
-def _draw_floor(spec: mujoco.MjSpec) -> None:
-    """Draw a flat box in place of the plane that is the floor: `sim.gl` draws no planes."""
-    floor, half = spec.geom("floor"), 0.005
-    floor.group = COLLISION_GROUP
-    spec.worldbody.add_geom(
-        name="floor_visual",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[floor.size[0], floor.size[1], half],
-        pos=[0.0, 0.0, -half],
-        group=VISUAL_GROUP,
-        contype=0,
-        conaffinity=0,
-        material=floor.material,
-    )
+def _add_glow(spec: mujoco.MjSpec, task: Task) -> None:
+    """Make the discs that redden switched-on burners geoms: LIBERO has sites, which it shows and hides."""
+    for name, class_name in instances(task):
+        if class_name in GLOWING:
+            disc = spec.site(f"{name}_{GLOWING[class_name]}")
+            disc.parent.add_geom(
+                name=f"{name}_{GLOW}",
+                type=disc.type,
+                size=disc.size,
+                pos=disc.pos,
+                rgba=GLOW_OFF,
+                group=VISUAL_GROUP,
+                contype=0,
+                conaffinity=0,
+                mass=0.0,
+            )
 
 
 def scene_xml(task: Task, visuals: bool) -> str:
@@ -231,6 +248,9 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
         articulations=MappingProxyType({region: _articulation(name, part) for region, part in parts_of(class_name)}),
         regions=MappingProxyType({full.removeprefix(f"{name}_"): full for full in regions}),
         supports=high[2],
+        glow=(f"{name}_{GLOW}",) if class_name in GLOWING else (),
+        glow_on=GLOW_ON,
+        glow_off=GLOW_OFF,
     )
 
 

@@ -6,7 +6,7 @@ filled for every frame. The list is made once per scene; drawing it needs no mod
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import mujoco
@@ -14,13 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.sim.raster.mirror import Mirror, find_mirror
-from lerobot_memobench.sim.raster.shapes import Triangles, box_cells, triangles_of
+from lerobot_memobench.sim.raster.shapes import Triangles, box_cells, pieces_of, triangles_of
 from lerobot_memobench.sim.raster.textures import cube_coordinates, flat_coordinates, layers_of
 
 VISUAL_GROUP = 1
 """Geoms of this group are seen; the others are for contacts."""
 ROWS = 5
 """Lines of four numbers per row in the table: three of the pose, colour, material."""
+
+PIECE = 2000
+"""Most triangles of a mesh in a row of a scene that is drawn as by MuJoCo: rows out of sight cost nothing."""
 
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 """A geom of this colour shows its material's, as in MuJoCo."""
@@ -38,7 +41,7 @@ Image = NDArray[np.uint8]
 class DrawList:
     """The triangles of a scene, row by row.
 
-    A row is a geom; one with a cube texture has a row for each side of the cube.
+    A row is a geom; one with a cube texture has a row for each side of the cube, a large mesh one for each piece.
 
     Attributes:
         vertices: structured array of `VERTEX`, in the frames of their rows, in the order of rows.
@@ -49,6 +52,7 @@ class DrawList:
         layers: (L, LAYER_SIZE, LAYER_SIZE, 3) uint8 textures, the first one white.
         materials: (rows, 4) specular, shininess exponent, emission, layer.
         mirror: the geom that reflects the scene, if there is one.
+        as_mujoco: see `build_draw_list`.
     """
 
     vertices: NDArray[np.void]
@@ -59,6 +63,7 @@ class DrawList:
     layers: NDArray[np.uint8]
     materials: Floats
     mirror: Mirror | None = None
+    as_mujoco: bool = False
 
     def fill(self, table: Floats, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Write poses, colours and materials of the present state into a table, (rows, ROWS, 4)."""
@@ -71,16 +76,17 @@ class DrawList:
 def build_draw_list(
     model: mujoco.MjModel,
     shadowless: tuple[str, ...] = (),
-    finer: mujoco.MjModel | None = None,
-    sharp: bool = False,
+    meshes: Mapping[str, Triangles] | None = None,
+    as_mujoco: bool = False,
 ) -> DrawList:
     """Collect the visual geoms of a model.
 
     Args:
         model: a compiled scene.
         shadowless: bodies that cast no shadow.
-        finer: a model whose meshes are drawn in place of the scene's of the same names.
-        sharp: whether edges of meshes are sharp, as MuJoCo's renderer draws them; those of ``finer`` always are.
+        meshes: drawn in place of the scene's of these names; see `shapes.mesh_in_file`.
+        as_mujoco: whether all looks as in MuJoCo's own renderer: edges of meshes are sharp, and light is cut off at 1
+            before the texture takes its part.
 
     Raises:
         MemobenchError: for a visual geom of a shape that is not drawn here.
@@ -91,7 +97,7 @@ def build_draw_list(
     geoms: list[int] = []
     materials, parts, indices, start = [], [], [], 0
     for geom in [*visual[~moves].tolist(), *visual[moves].tolist()]:
-        for layer, (positions, normals, uv, triangles) in _textured(model, geom, finer, sharp, layer_of):
+        for layer, (positions, normals, uv, triangles) in _textured(model, geom, meshes, as_mujoco, layer_of):
             part = np.zeros(len(positions), dtype=VERTEX)
             part["position"], part["normal"], part["uv"], part["row"] = positions, normals, uv, len(geoms)
             parts.append(part)
@@ -110,6 +116,7 @@ def build_draw_list(
         layers,
         np.array(materials, dtype=np.float32).reshape(-1, 4),
         find_mirror(model, rows),
+        as_mujoco,
     )
 
 
@@ -139,8 +146,8 @@ def _material(model: mujoco.MjModel, geom: int) -> tuple[float, float, float]:
 def _textured(
     model: mujoco.MjModel,
     geom: int,
-    finer: mujoco.MjModel | None,
-    sharp: bool,
+    meshes: Mapping[str, Triangles] | None,
+    as_mujoco: bool,
     layer_of: dict[int, tuple[int, ...]],
 ) -> Iterator[tuple[int, Triangles]]:
     """Yield a geom's triangles with their texture coordinates, and the layer that they show."""
@@ -151,9 +158,10 @@ def _textured(
     is_mesh = kind == mujoco.mjtGeom.mjGEOM_MESH.value
     # MuJoCo computes light at corners, and has several in a side of a box; only this light shows the difference.
     fine = kind == mujoco.mjtGeom.mjGEOM_BOX.value and (texture in layer_of or _has_spots(model))
-    shape = box_cells(model, geom) if fine else triangles_of(model, geom, finer, sharp)
-    if texture not in layer_of or (is_mesh and model.mesh_texcoordadr[mesh] >= 0):
-        yield layers[0], shape
+    shape = box_cells(model, geom) if fine else triangles_of(model, geom, meshes, as_mujoco)
+    mapped = is_mesh and (bool(shape[2].any()) or model.mesh_texcoordadr[mesh] >= 0)
+    if texture not in layer_of or mapped:
+        yield from ((layers[0], piece) for piece in (pieces_of(shape, PIECE) if is_mesh and as_mujoco else (shape,)))
     elif len(layers) == 1:
         yield layers[0], flat_coordinates(model, geom, shape)
     else:

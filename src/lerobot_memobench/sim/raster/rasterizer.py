@@ -78,20 +78,11 @@ class Rasterizer:
         draw_list: what there is to draw.
         width, height: size of the frames, pixels.
         shadow_size: side of the shadow map, pixels; 0 draws no shadows.
-        clamped: whether light is cut off at 1 before the texture takes its part, as in MuJoCo's renderer.
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        draw_list: DrawList,
-        width: int,
-        height: int,
-        shadow_size: int,
-        clamped: bool = False,
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int, shadow_size: int) -> None:
         self._list, self._width, self._height = draw_list, width, height
-        self._lamps = Lamps(model, shadow_size > 0 and bool(draw_list.casting.any()), clamped)
+        self._lamps = Lamps(model, shadow_size > 0 and bool(draw_list.casting.any()), draw_list.as_mujoco)
         rows = len(draw_list.geoms)
         self._table = table_of(draw_list)
         vertices, triangles = with_discs(draw_list)
@@ -162,7 +153,7 @@ class Rasterizer:
         if self._list.mirror is not None:
             shown = np.where(self._target.triangle >= 0, self._target.triangle, behind)
             self._add_reflection(view, self._list.mirror, rows[opaque], shown, image)
-        translucent = self._near_to_far(view, rows[~opaque])
+        translucent = self._near_to_far(view, rows[~opaque & (self._table[: len(rows), 3, 3] > 0.0)])
         # MuJoCo's renderer draws them twice, in this order.
         for row in [*translucent, *translucent[::-1], *(len(rows) + np.arange(len(highlights)))]:
             self._draw_over(view, int(row), image)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +24,15 @@ Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floatin
 
 
 def triangles_of(
-    model: mujoco.MjModel, geom: int, finer: mujoco.MjModel | None = None, sharp: bool = False
+    model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangles] | None = None, sharp: bool = False
 ) -> Triangles:
     """Return a geom's triangles in its own frame.
 
     Args:
         model: a compiled scene.
         geom: its id.
-        finer: a model whose mesh of the same name is taken, where it has one; its edges are sharp.
-        sharp: whether edges of other meshes are.
+        meshes: taken in place of the model's of these names; see `mesh_in_file`.
+        sharp: whether edges of other meshes are sharp.
 
     Raises:
         MemobenchError: for a shape that is not drawn here.
@@ -39,7 +41,7 @@ def triangles_of(
     size = np.asarray(model.geom_size[geom])
     match kind:
         case mujoco.mjtGeom.mjGEOM_MESH:
-            return _named_mesh(model, int(model.geom_dataid[geom]), finer or model, sharp)
+            return _named_mesh(model, int(model.geom_dataid[geom]), meshes or {}, sharp)
         case mujoco.mjtGeom.mjGEOM_BOX:
             return _box(size)
         case mujoco.mjtGeom.mjGEOM_PLANE:
@@ -58,18 +60,64 @@ def triangles_of(
     )
 
 
-def _named_mesh(model: mujoco.MjModel, mesh: int, source: mujoco.MjModel, sharp: bool) -> Triangles:
-    """Return another model's mesh of the same name in the frame of this model's mesh, which is also its geom's.
+def _named_mesh(model: mujoco.MjModel, mesh: int, meshes: Mapping[str, Triangles], sharp: bool) -> Triangles:
+    """Return a mesh, or the given one of its name, in the frame of the model's mesh, which is also its geom's.
 
     The compiler moves every mesh into its own centre and principal axes, and a mesh of more faces has others.
     """
-    other = mujoco.mj_name2id(source, mujoco.mjtObj.mjOBJ_MESH, model.mesh(mesh).name)
-    if source is model or other < 0:
+    name = model.mesh(mesh).name
+    if name not in meshes:
         return _mesh(model, mesh, LEAST_AGREEMENT if sharp else -np.inf)
-    here, there = _mesh_axes(model, mesh), _mesh_axes(source, other)
-    points, normals, uv, triangles = _mesh(source, other, LEAST_AGREEMENT)
-    in_file = points @ there.T + source.mesh_pos[other]
-    return (in_file - model.mesh_pos[mesh]) @ here, normals @ there.T @ here, uv, triangles
+    here = _mesh_axes(model, mesh)
+    points, normals, uv, triangles = meshes[name]
+    return (points - model.mesh_pos[mesh]) @ here, normals @ here, uv, triangles
+
+
+def mesh_in_file(model: mujoco.MjModel, mesh: int) -> Triangles:
+    """Return a mesh with sharp edges, in the frame of its file."""
+    axes = _mesh_axes(model, mesh)
+    points, normals, uv, triangles = _mesh(model, mesh, LEAST_AGREEMENT)
+    return points @ axes.T + model.mesh_pos[mesh], normals @ axes.T, uv, triangles
+
+
+def welded(shape: Triangles) -> Triangles:
+    """Return a shape in single precision whose vertices all differ: many files list one for each corner."""
+    points, normals, uv, triangles = shape
+    rows = np.concatenate([points, normals, uv], axis=1).astype(np.float32) + np.float32(0)  # no negative zeros
+    unique, index = _unique_in_order(rows.view(np.int32))
+    rows = unique.view(np.float32)
+    return rows[:, :3], rows[:, 3:6], rows[:, 6:], index[triangles].astype(np.int32)
+
+
+def in_pieces(shape: Triangles, most: int) -> Triangles:
+    """Return a shape in an order in which so many triangles after each other lie in one region, with vertices alone."""
+    points, normals, uv, triangles = shape
+    middle = points[triangles].mean(axis=1)
+    left: list[NDArray[np.int64]] = [np.arange(len(triangles))]
+    order: list[NDArray[np.int64]] = []
+    while left:
+        mine = left.pop()
+        if len(mine) > most:
+            axis = np.ptp(middle[mine], axis=0).argmax()
+            mine = mine[np.argsort(middle[mine, axis], kind="stable")]
+            half = (len(mine) + most) // (2 * most) * most
+            left += [mine[half:], mine[:half]]
+        else:
+            order.append(np.sort(mine))
+    parts = [np.unique(triangles[mine], return_inverse=True) for mine in order]
+    starts = np.cumsum([0, *(len(used) for used, _ in parts)])
+    used = np.concatenate([used for used, _ in parts])
+    moved = [index.reshape(-1, 3) + start for (_, index), start in zip(parts, starts, strict=False)]
+    return points[used], normals[used], uv[used], np.concatenate(moved).astype(np.int32)
+
+
+def pieces_of(shape: Triangles, most: int) -> Iterator[Triangles]:
+    """Cut a shape into pieces of so many triangles after each other; see `in_pieces`."""
+    points, normals, uv, triangles = shape
+    for start in range(0, len(triangles), most):
+        mine = triangles[start : start + most]
+        first, end = int(mine.min()), int(mine.max()) + 1
+        yield points[first:end], normals[first:end], uv[first:end], mine - first
 
 
 def _mesh_axes(model: mujoco.MjModel, mesh: int) -> NDArray[np.float64]:

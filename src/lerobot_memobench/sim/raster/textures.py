@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.sim.raster.compiled import compiled
 from lerobot_memobench.sim.raster.shapes import Triangles
 
 LAYER_SIZE = 512
@@ -22,8 +24,6 @@ _DOWN = ((1, -1), (1, -1), (2, 1), (2, -1), (1, -1), (1, -1))
 
 def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple[int, ...]]]:
     """Return a model's textures at one size, and texture id → its layer, or six of a cube; layer 0 is white."""
-    from PIL import Image
-
     layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
     layer_of: dict[int, tuple[int, ...]] = {}
     known: dict[bytes, int] = {}  # the sides of a cube are often one picture
@@ -37,11 +37,18 @@ def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple
             content = picture.tobytes()
             if content not in known:
                 known[content] = len(layers)
-                # At its own size this leaves every pixel as it is.
-                resized = Image.fromarray(picture).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC)
-                layers.append(np.asarray(resized))
+                layers.append(resized(picture))
             layer_of[texture] = (*layer_of.get(texture, ()), known[content])
     return np.stack(layers), layer_of
+
+
+def resized(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a picture at the size of layers; one of that size is left as it is."""
+    from PIL import Image
+
+    if picture.shape[:2] == (LAYER_SIZE, LAYER_SIZE):
+        return picture
+    return np.asarray(Image.fromarray(picture).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC))
 
 
 def _pictures(model: mujoco.MjModel, texture: int, pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
@@ -60,15 +67,34 @@ def levels_of(layers: NDArray[np.uint8]) -> NDArray[np.int32]:
     Returns:
         The pixels, red + 256 green + 65536 blue.
     """
-    parts, level = [], layers.astype(np.uint16)
-    while True:
-        packed = np.zeros((*level.shape[:3], 4), np.uint8)
-        packed[..., :3] = level
-        parts.append(packed.view("<i4").reshape(len(layers), -1))
-        if level.shape[1] == 1:
-            return np.concatenate(parts, axis=1).astype(np.int32, copy=False).ravel()
-        rows = level[:, ::2] + level[:, 1::2]
-        level = (rows[:, :, ::2] + rows[:, :, 1::2] + 2) // 4
+    count, side = len(layers), LAYER_SIZE
+    levels = np.empty((count, (4 * side * side - 1) // 3), np.int32)
+    _fill_levels(layers, levels)
+    return levels.ravel()
+
+
+@compiled
+def _fill_levels(layers: Any, levels: Any) -> None:
+    """Write each level behind the one of twice its side, of which a pixel is the mean of four."""
+    for layer in range(layers.shape[0]):
+        side, start = layers.shape[1], 0
+        for y in range(side):
+            for x in range(side):
+                red, green, blue = layers[layer, y, x, 0], layers[layer, y, x, 1], layers[layer, y, x, 2]
+                levels[layer, y * side + x] = np.int32(red) + np.int32(green) * 256 + np.int32(blue) * 65536
+        while side > 1:
+            end, half = start + side * side, side // 2
+            for y in range(half):
+                for x in range(half):
+                    upper = start + 2 * y * side + 2 * x
+                    pixel = 0
+                    for shift in (0, 8, 16):
+                        total = 2
+                        for at in (upper, upper + 1, upper + side, upper + side + 1):
+                            total += levels[layer, at] >> shift & 255
+                        pixel += total // 4 << shift
+                    levels[layer, end + y * half + x] = pixel
+            side, start = half, end
 
 
 def _full_size(model: mujoco.MjModel, geom: int) -> NDArray[np.float64]:

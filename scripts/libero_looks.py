@@ -1,0 +1,191 @@
+"""Compare pictures of the paper's world with MuJoCo's own renderer, which draws LIBERO's files whole; show both worlds.
+
+    python scripts/libero_looks.py errors [--sheet FILE]     # one scene of each task without scans
+    python scripts/libero_looks.py worlds FILE               # both worlds, side by side
+    python scripts/libero_looks.py speed
+
+All want ``PYTHONPATH=src:.`` and the extra [libero]; `errors` wants MuJoCo's renderer (``MUJOCO_GL=egl``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lerobot_memobench.sim.libero.scene import scene_xml
+from lerobot_memobench.sim.scene import ARENA_BYTES
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.task import Task
+
+Pixels = NDArray[np.uint8]
+
+FIRST_SEED = 21
+"""Of the scenes that are compared; the renderer was tuned on seed 7."""
+STEPS = 25
+"""Control steps of one random action before a scene is compared."""
+FAR_OFF = 16
+"""Of 255: a pixel of which a channel is further off counts as differing."""
+SHOWN, HIDDEN = 5, 4
+"""Groups of sites."""
+WORLDS_TASKS = (
+    "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it",
+    "check_the_middle_drawer_and_put_the_black_bowl_in_the_top_drawer_and_close_it",
+    "put_the_milk_picked_up_in_the_prompt_video_on_the_plate",
+)
+
+
+def tasks() -> list[Task]:
+    """Return the tasks of which all classes are LIBERO's own, in its world."""
+    return [task.in_world("libero") for name in task_names() if (task := get_task(name)).memory_type != "spatial"]
+
+
+def scene(task: Task, seed: int) -> Simulation:
+    """Return a simulation with the arm somewhere over the table, and every drawer, door and knob at a random place."""
+    rng, sim = np.random.default_rng(seed), Simulation(task)
+    sim.reset(seed)
+    action = np.append(rng.uniform(-0.6, 0.6, 6) * [1, 1, 0.5, 0.3, 0.3, 0.3], -1.0)
+    for _ in range(STEPS):
+        sim.step(action)
+    for asset in sim.assets.values():
+        for part in asset.articulations.values():
+            low, high = sorted((part.closed_q, part.open_q))
+            sim.data.joint(part.joint).qpos[0] = rng.uniform(low, high)
+    mujoco.mj_step1(sim.model, sim.data)
+    return sim
+
+
+def whole_model(sim: Simulation) -> mujoco.MjModel:
+    """Return LIBERO's scene as its files have it, with all meshes and textures; the burner shows while it is on."""
+    spec = mujoco.MjSpec.from_string(scene_xml(sim.task, visuals=True))
+    spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
+    for site in spec.sites:
+        site.group = HIDDEN
+    for name, asset in sim.assets.items():
+        for part in asset.articulations.values():
+            if part.kind == "knob" and sim.data.joint(part.joint).qpos[0] >= part.on_at_least:
+                spec.site(f"{name}_burner").group = SHOWN
+    return spec.compile()
+
+
+def mujocos(sim: Simulation, model: mujoco.MjModel, samples: int) -> list[Pixels]:
+    """Return what MuJoCo's own renderer draws for both cameras, so many samples per pixel."""
+    data = mujoco.MjData(model)
+    for name, pose in sim.fixture_poses().items():
+        body = model.body(name).id
+        model.body_pos[body], model.body_quat[body] = pose[:3], pose[3:]
+    data.qpos[:] = sim.data.qpos
+    mujoco.mj_forward(model, data)
+    model.vis.quality.offsamples = samples
+    option, pictures = mujoco.MjvOption(), []
+    option.geomgroup[0] = 0
+    option.sitegroup[:] = 0
+    option.sitegroup[SHOWN] = 1
+    with mujoco.Renderer(model, sim.render_settings.height, sim.render_settings.width) as renderer:
+        for camera in MJCF_CAMERAS.values():
+            renderer.update_scene(data, camera, option)
+            pictures.append(renderer.render())
+    return pictures
+
+
+def errors(sheet: Path | None) -> None:
+    """Print the mean error of each scene and camera, of 255, and the share of pixels that differ."""
+    table, rows = [], []
+    print("task | seed | agentview, wrist (one sample) | differing | agentview, wrist (four samples)")
+    for seed, task in enumerate(tasks(), FIRST_SEED):
+        sim = scene(task, seed)
+        ours = [sim.render(camera) for camera in MJCF_CAMERAS]
+        model = whole_model(sim)
+        row: list[float] = []
+        for samples in (0, 4):
+            theirs = mujocos(sim, model, samples)
+            off = [np.abs(a.astype(int) - b) for a, b in zip(ours, theirs, strict=True)]
+            row += [float(one.mean()) for one in off]
+            row += [100 * float((one.max(axis=2) > FAR_OFF).mean()) for one in off]
+        table.append(row)
+        rows.append(np.hstack([picture for pair in zip(theirs, ours, strict=True) for picture in pair]))
+        print(_line(task.name, seed, row), flush=True)
+    print(_line("mean", "", np.mean(table, axis=0).tolist()))
+    print(_line("largest", "", np.max(table, axis=0).tolist()))
+    if sheet:
+        half = (len(rows) + 1) // 2
+        rows += [np.zeros_like(rows[0])] * (2 * half - len(rows))
+        Image.fromarray(np.hstack([np.vstack(rows[:half]), np.vstack(rows[half:])])).save(sheet)
+
+
+def _line(name: str, seed: int | str, row: list[float]) -> str:
+    one, far, four, _ = row[:2], row[2:4], row[4:6], row[6:]
+    marks = [", ".join(f"{value:.2f}" for value in part) for part in (one, four)]
+    return f"{name} | {seed} | {marks[0]} | {', '.join(f'{value:.1f} %' for value in far)} | {marks[1]}"
+
+
+def worlds(path: Path) -> None:
+    """Draw scenes of both worlds, agentview over wrist, as a picture of at most 150 kB."""
+    columns = []
+    for name in WORLDS_TASKS:
+        for task in (get_task(name), get_task(name).in_world("libero")):
+            sim = Simulation(task)
+            sim.reset(8)
+            columns.append(np.vstack([sim.render(camera) for camera in MJCF_CAMERAS]))
+    gap = np.full((columns[0].shape[0], 4, 3), 255, np.uint8)
+    picture = Image.fromarray(np.hstack([part for column in columns for part in (column, gap)][:-1]))
+    small = picture.resize((picture.width * 5 // 8, picture.height * 5 // 8), Image.Resampling.LANCZOS)
+    small.quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def speed() -> None:
+    """Print the CPU time of construction, first pictures, resets and steps with two pictures."""
+    print("task | construct and two pictures | reset | reset, two pictures | step | step, two pictures")
+    for task in tasks()[::7]:
+        print(task.name, *(f"{1e3 * value:.1f} ms" for value in _times(task)), sep=" | ", flush=True)
+
+
+def _times(task: Task) -> Iterator[float]:
+    start = time.process_time()
+    sim = Simulation(task)
+    sim.reset(7)
+    _look(sim)
+    yield time.process_time() - start
+    for steps, looks in ((False, False), (False, True), (True, False), (True, True)):
+        count = 40 if steps else 10
+        start = time.process_time()
+        for seed in range(count):
+            if steps:
+                sim.step(np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0]))
+            else:
+                sim.reset(7 + seed)
+            if looks:
+                _look(sim)
+        yield (time.process_time() - start) / count
+
+
+def _look(sim: Simulation) -> None:
+    for camera in MJCF_CAMERAS:
+        sim.render(camera)
+
+
+def main() -> None:
+    """Run the command that was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("errors").add_argument("--sheet", type=Path)
+    commands.add_parser("worlds").add_argument("path", type=Path)
+    commands.add_parser("speed")
+    args = parser.parse_args()
+    if args.command == "errors":
+        errors(args.sheet)
+    elif args.command == "worlds":
+        worlds(args.path)
+    else:
+        speed()
+
+
+if __name__ == "__main__":
+    main()
