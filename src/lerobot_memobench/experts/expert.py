@@ -243,7 +243,7 @@ class Expert:
 
     def _put_on(self, name: str, support: str) -> Steps:
         on_object = support in self.sim.assets
-        middle = self.sim.body_pose(support)[0] if on_object else self._middle_of(support)
+        middle = self.sim.asset_pose(support)[0] if on_object else self._middle_of(support)
         place = middle - self.sim.assets[name].bottom * UP
         drawer = drawer_around(self.hand, name)
         if drawer is not None:
