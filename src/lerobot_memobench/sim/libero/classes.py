@@ -153,7 +153,9 @@ CLASSES: dict[str, LiberoClass] = {
         ("x", pi / 2),
         grasps=(Grasp((0.0, 0.0, 0.0195), ALONG_Y, 0.0286), Grasp((0.0, 0.0, 0.0195), ALONG_X, 0.0362)),
     ),
-    "butter": _grocery("butter", ("x", 0.0), grasps=(Grasp((0.0, 0.0, 0.0), ALONG_Y, 0.0396),)),
+    "butter": _grocery(
+        "butter", ("x", 0.0), grasps=(Grasp((0.0, 0.0, 0.0), ALONG_Y, 0.0396), Grasp((0.0, 0.0, 0.0), ALONG_X, 0.0762))
+    ),
     "milk": _grocery(
         "milk",
         ("x", pi / 2),
