@@ -55,6 +55,8 @@ SWING_LEAD = 0.13
 EASE = 0.04
 """The same where the door is as far open as it should be, rad: a hand that arrives fast throws the door on, out of
 reach."""
+FREE_EASE = 0.015
+"""The same for a door that nothing but damping stops, rad."""
 PUSH_GAP = 0.06
 """Distance in front of a handle from which the closed fingers come to push it, m."""
 
@@ -357,6 +359,7 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
     articulation, start = hand.sim.world.articulation(name)
     goal = articulation.open_below if opening else articulation.closed_q
     way = float(np.sign(goal - start))
+    ease = EASE if hand.sim.model.joint(articulation.joint).frictionloss[0] > 0.0 else FREE_EASE
     flip = np.sign(door_now(hand, name, (goal - start) / 2).outward @ EASY_CLOSING) or 1.0
 
     def turned(ahead: float = 0.0) -> Array:
@@ -375,7 +378,7 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
         door = door_now(hand, name)
         if _swung(hand, door, articulation, opening):
             break
-        lead = way * min(SWING_LEAD, abs(goal - door.q) + EASE)
+        lead = way * min(SWING_LEAD, abs(goal - door.q) + ease)
         yield hand.toward(at(-EDGE_DEPTH, lead)(), turned(lead / 2), CLOSED, speed=0.8)
     yield from let_go(hand)
 

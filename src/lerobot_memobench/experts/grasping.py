@@ -43,6 +43,7 @@ from lerobot_memobench.experts.travel import (
     lean_from_fixtures,
     outward_of,
     reach_lean,
+    region_box,
     release,
     rise,
     travel,
@@ -450,14 +451,14 @@ def put_at(hand: Hand, held: Held, position: Array, rotation: Array) -> Steps:
 
 def put_in_drawer(hand: Hand, held: Held, region: str, outward: Array) -> Steps:
     """Drop the held thing into an open drawer."""
-    half = hand.sim.site_half_size(region)
+    height = region_box(hand, region)[2][2]
     asset = hand.sim.assets[held.name]
     # Close along the front: the hand is 20 cm wide that way and would hit the cabinet the other way.
     turn = frame(DOWN, cross(UP, outward))
 
     def destination() -> Array:
         centre, _ = hand.sim.site_pose(region)
-        return centre + 0.015 * outward + (half[2] - asset.bottom - 0.005) * UP - 0.02 * UP
+        return centre + 0.015 * outward + (height - asset.bottom - 0.005) * UP - 0.02 * UP
 
     for _ in range(ATTEMPTS):
         yield from carry(hand, held, destination, turn, clearance=0.12, tolerance=0.012)

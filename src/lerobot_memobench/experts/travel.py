@@ -98,8 +98,24 @@ def stands_out(hand: Hand, name: str, region: str) -> bool:
     """Say whether a thing in a drawer is so far above it that the drawer cannot be shut: a bowl that leans, say."""
     position, rotation = hand.sim.asset_pose(name)
     highest = position[2] + (rotation @ corners(hand.sim.assets[name]))[2].max()
-    over: float = highest - hand.sim.site_pose(region)[0][2] - hand.sim.site_half_size(region)[2]
+    centre, _, half = region_box(hand, region)
+    over: float = highest - centre[2] - half[2]
     return over > MOST_OVER
+
+
+def region_box(hand: Hand, region: str) -> tuple[Array, Array, Array]:
+    """Return centre (3,), rotation (3, 3) and half size (3,) of a region, the third axis pointing up.
+
+    LIBERO's drawers have sites that lie on a side.
+    """
+    centre, rotation = hand.sim.site_pose(region)
+    half = hand.sim.site_half_size(region)
+    upright = int(np.argmax(np.abs(rotation[2])))
+    if upright == 2:
+        return centre, rotation, half
+    order = [(upright + 1) % 3, (upright + 2) % 3, upright]
+    up = np.sign(rotation[2, upright])
+    return centre, rotation[:, order] * np.array([up, 1.0, up]), half[order]
 
 
 def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
@@ -118,10 +134,10 @@ def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
 
 
 def _drawer_box(hand: Hand, region: str, handle_site: str) -> tuple[Array, Array, Array]:
-    centre, turned = hand.sim.site_pose(region)
+    centre, turned, half = region_box(hand, region)
     handle, _ = hand.sim.site_pose(handle_site)
     reach = np.abs(turned.T @ (handle - centre)) + 0.008
-    return centre, turned, np.maximum(hand.sim.site_half_size(region) + 0.012, reach)
+    return centre, turned, np.maximum(half + 0.012, reach)
 
 
 def in_the_way(hand: Hand, name: str, target: Array, turn: Array) -> float:
