@@ -359,13 +359,14 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
     articulation, start = hand.sim.world.articulation(name)
     goal = articulation.open_below if opening else articulation.closed_q
     way = float(np.sign(goal - start))
-    ease = EASE if hand.sim.model.joint(articulation.joint).frictionloss[0] > 0.0 else FREE_EASE
+    free = hand.sim.model.joint(articulation.joint).frictionloss[0] == 0.0
+    ease, over = (FREE_EASE, HOVER) if free else (EASE, 0.0)  # a free door stands wider open: lean on the way down, too
     flip = np.sign(door_now(hand, name, (goal - start) / 2).outward @ EASY_CLOSING) or 1.0
 
     def turned(ahead: float = 0.0) -> Array:
         # A door that stands wide open is taken with the fingers pointing outwards: upright, the hand is too short.
         door = door_now(hand, name, ahead)
-        return leaning(flip * door.outward, reach_lean(hand, door.edge, STRETCHED))
+        return leaning(flip * door.outward, reach_lean(hand, door.edge + over * UP, STRETCHED))
 
     def at(back: float, ahead: float = 0.0) -> Callable[[], Array]:
         return lambda: door_now(hand, name, ahead).edge - back * turned(ahead)[:, 2]
