@@ -90,7 +90,7 @@ class PromptDemonstrator:
         self.shown = all(self._sim.holds(atom) for atom in (*hidden, HOME))
 
     def _pick(self, hand: Hand) -> Steps:
-        place, turned = self._sim.body_pose(self._referent())
+        place, turned = self._sim.asset_pose(self._referent())
         held = yield from pick(hand, self._referent())
         if held is not None:
             self.shown = True
@@ -99,7 +99,7 @@ class PromptDemonstrator:
 
     def _point(self, hand: Hand) -> Steps:
         asset = self._sim.assets[self._referent()]
-        place, _ = self._sim.body_pose(self._referent())
+        place, _ = self._sim.asset_pose(self._referent())
         above = place + (asset.top + 0.03) * UP
         rotation = pointing(hand, above)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.015)
@@ -128,6 +128,6 @@ def highlights_at(task: Task, sim: Simulation, frame: int) -> tuple[Highlight, .
 
 def highlight_of(sim: Simulation, name: str) -> Highlight:
     """Return the highlight of the place where a thing stands."""
-    asset, (place, _) = sim.assets[name], sim.body_pose(name)
+    asset, (place, _) = sim.assets[name], sim.asset_pose(name)
     spot = (float(place[0]), float(place[1]), float(place[2] + asset.bottom + 0.002))
     return Highlight(spot, asset.radius + 0.035)

@@ -23,7 +23,7 @@ from lerobot_memobench.experts.fixtures import (
 )
 from lerobot_memobench.experts.grasping import pick, put_in_drawer, put_on, put_on_region
 from lerobot_memobench.experts.hand import OPEN, UP, Hand, Steps
-from lerobot_memobench.experts.travel import come_home, drawer_around, outward_of, stands_out
+from lerobot_memobench.experts.travel import come_home, drawer_around, outward_of, region_box, stands_out
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import (
@@ -243,7 +243,7 @@ class Expert:
 
     def _put_on(self, name: str, support: str) -> Steps:
         on_object = support in self.sim.assets
-        middle = self.sim.body_pose(support)[0] if on_object else self._middle_of(support)
+        middle = self.sim.asset_pose(support)[0] if on_object else self._middle_of(support)
         place = middle - self.sim.assets[name].bottom * UP
         drawer = drawer_around(self.hand, name)
         if drawer is not None:
@@ -260,8 +260,8 @@ class Expert:
         if declared is not None and declared.target == TABLE:
             x1, y1, x2, y2 = declared.ranges[0]
             return np.array([(x1 + x2) / 2, (y1 + y2) / 2, TABLE_TOP])
-        centre, rotation = self.sim.site_pose(region)
-        return centre + rotation @ np.array([0.0, 0.0, self.sim.site_half_size(region)[2]])
+        centre, rotation, half = region_box(self.hand, region)
+        return centre + rotation @ np.array([0.0, 0.0, half[2]])
 
     def _open(self, name: str) -> Steps:
         door = pull_open if self.task.suite == STRICT else open_door

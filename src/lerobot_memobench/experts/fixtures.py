@@ -27,6 +27,7 @@ from lerobot_memobench.experts.hand import (
     unit,
 )
 from lerobot_memobench.experts.travel import (
+    FULLY_OPEN,
     LOST,
     far,
     leaning,
@@ -40,6 +41,9 @@ from lerobot_memobench.sim.assets.asset import Articulation
 
 TILT = np.radians(35)
 """How far the hand points down when it takes a handle: enough for the flange to clear the table."""
+SKEW, SKEW_TILT = np.radians(40), np.radians(24)
+"""How far the hand is rolled to take a bar that is longer than its fingers open, one above and one below it, and how
+far it then points down: upright or steeper it would touch the table under the lowest drawer, or the handle above."""
 
 REACH = 0.72
 """Distance from the arm's foot up to which a hand that points down moves freely, m."""
@@ -51,6 +55,8 @@ SWING_LEAD = 0.13
 EASE = 0.04
 """The same where the door is as far open as it should be, rad: a hand that arrives fast throws the door on, out of
 reach."""
+FREE_EASE = 0.015
+"""The same for a door that nothing but damping stops, rad."""
 PUSH_GAP = 0.06
 """Distance in front of a handle from which the closed fingers come to push it, m."""
 
@@ -91,14 +97,23 @@ def _off_handle(hand: Hand, articulation: Articulation, tilt: float, back: float
     return target
 
 
+def _grip_of(hand: Hand, articulation: Articulation, tilt: float) -> Array:
+    """Return the rotation (3, 3) of a hand that holds a handle: along the front, or askew where that is too long."""
+    _, back, rotation = _at_handle(hand, articulation, tilt)
+    if articulation.handle.length < FULLY_OPEN:
+        return rotation
+    return Rotation.from_rotvec(SKEW * back).as_matrix() @ rotation
+
+
 def open_drawer(hand: Hand, region: str) -> Steps:
     """Take a drawer's handle and pull until the drawer counts as open."""
     articulation, _ = hand.sim.world.articulation(region)
-    tilt = TILT + float(hand.rng.uniform(-0.06, 0.06))
+    steep = TILT if articulation.handle.length < FULLY_OPEN else SKEW_TILT
+    tilt = steep + float(hand.rng.uniform(-0.06, 0.06))
     for _ in range(ATTEMPTS):
         out = outward_of(hand, articulation)
         yield from _take_handle(hand, articulation, tilt)
-        rotation = _at_handle(hand, articulation, tilt)[2]
+        rotation = _grip_of(hand, articulation, tilt)
         yield from _pull_drawer(hand, region, rotation, out)
         yield from hand.open(6)
         back = _off_handle(hand, articulation, tilt, 0.09)
@@ -111,7 +126,7 @@ def _take_handle(hand: Hand, articulation: Articulation, tilt: float) -> Steps:
     at = partial(_off_handle, hand, articulation, tilt)
 
     def turned() -> Array:
-        return _at_handle(hand, articulation, tilt)[2]
+        return _grip_of(hand, articulation, tilt)
 
     yield from rise(hand, OPEN, 0.16)
     yield from hand.move(at(0.14), turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
@@ -162,7 +177,8 @@ def _come_before(hand: Hand, articulation: Articulation, rotation: Array, out: A
 def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
     """Push a drawer by its handle until it is shut, or the fingers slip off sideways."""
     articulation, _ = hand.sim.world.articulation(region)
-    shut = pressed(lambda: hand.sim.world.articulation(region)[1] > articulation.closed_above + 0.003)
+    spare = min(0.003, articulation.closed_q - articulation.closed_above)
+    shut = pressed(lambda: hand.sim.world.articulation(region)[1] > articulation.closed_above + spare)
     for _ in range(110):
         if shut():
             break
@@ -273,7 +289,7 @@ def _edge(hand: Hand, name: str, handle: Array, outward: Array, along: Array) ->
     owner = _owner(hand, name)
     depth = articulation.handle.clearance + articulation.handle.thickness[0] / 2 + DOOR_THICKNESS / 2
     edge = handle - depth * outward - EDGE_INSET * along
-    edge[2] = hand.sim.body_pose(owner)[0][2] + hand.sim.assets[owner].top
+    edge[2] = hand.sim.asset_pose(owner)[0][2] + hand.sim.assets[owner].top
     return edge
 
 
@@ -343,12 +359,14 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
     articulation, start = hand.sim.world.articulation(name)
     goal = articulation.open_below if opening else articulation.closed_q
     way = float(np.sign(goal - start))
+    free = hand.sim.model.joint(articulation.joint).frictionloss[0] == 0.0
+    ease, over = (FREE_EASE, HOVER) if free else (EASE, 0.0)  # a free door stands wider open: lean on the way down, too
     flip = np.sign(door_now(hand, name, (goal - start) / 2).outward @ EASY_CLOSING) or 1.0
 
     def turned(ahead: float = 0.0) -> Array:
         # A door that stands wide open is taken with the fingers pointing outwards: upright, the hand is too short.
         door = door_now(hand, name, ahead)
-        return leaning(flip * door.outward, reach_lean(hand, door.edge, STRETCHED))
+        return leaning(flip * door.outward, reach_lean(hand, door.edge + over * UP, STRETCHED))
 
     def at(back: float, ahead: float = 0.0) -> Callable[[], Array]:
         return lambda: door_now(hand, name, ahead).edge - back * turned(ahead)[:, 2]
@@ -361,7 +379,7 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
         door = door_now(hand, name)
         if _swung(hand, door, articulation, opening):
             break
-        lead = way * min(SWING_LEAD, abs(goal - door.q) + EASE)
+        lead = way * min(SWING_LEAD, abs(goal - door.q) + ease)
         yield hand.toward(at(-EDGE_DEPTH, lead)(), turned(lead / 2), CLOSED, speed=0.8)
     yield from let_go(hand)
 

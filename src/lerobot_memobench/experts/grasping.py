@@ -43,6 +43,7 @@ from lerobot_memobench.experts.travel import (
     lean_from_fixtures,
     outward_of,
     reach_lean,
+    region_box,
     release,
     rise,
     travel,
@@ -122,7 +123,7 @@ def grasp_pose(
     Where one forbids the other it keeps clear, unless it is to be ``reaching``.
     """
     opening = hand.sim.gripper_opening() if opening is None else opening
-    position, rotation = hand.sim.body_pose(name)
+    position, rotation = hand.sim.asset_pose(name)
     spun = rotation @ Rotation.from_rotvec([0.0, 0.0, spin]).as_matrix()
     target = position + spun @ np.asarray(grasp.position)
     rim = _is_rim(hand, name, grasp)
@@ -144,7 +145,7 @@ def grasp_pose(
 
 def _ground(hand: Hand, name: str) -> float:
     """Return the height, m, of what a thing rests on, which the fingers should not press: the table, a plate."""
-    position, rotation = hand.sim.body_pose(name)
+    position, rotation = hand.sim.asset_pose(name)
     lowest = position[2] + (rotation @ corners(hand.sim.assets[name]))[2].min()
     return max(TABLE_TOP, float(lowest) - SUNK)
 
@@ -156,7 +157,7 @@ def _lean(hand: Hand, name: str, target: Array, closing: Array, place: Array | N
     away = lean - (lean @ closing) * closing
     reach = reach_lean(hand, target)
     if place is not None:
-        position, _ = hand.sim.body_pose(name)
+        position, _ = hand.sim.asset_pose(name)
         there = reach_lean(hand, place + target - position, STRETCHED)
         reach = max(reach, there, key=length)
     away = away + reach - (reach @ closing) * closing
@@ -175,7 +176,7 @@ def _closing_of_fallen(hand: Hand, name: str) -> float:
     if drawer is not None:
         out = outward_of(hand, hand.sim.world.articulation(drawer)[0])
         return float(np.arctan2(out[0], -out[1]))
-    _, rotation = hand.sim.body_pose(name)
+    _, rotation = hand.sim.asset_pose(name)
     asset = hand.sim.assets[name]
     size = np.asarray(asset.high) - np.asarray(asset.low)
     upright = int(np.argmax(np.abs(rotation[2])))
@@ -288,7 +289,7 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
     blocked = in_the_way(hand, name, target, turn)
     cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
     cost += 0.3 if way.grasp.width > WIDE else 0.0
-    position, _ = hand.sim.body_pose(name)
+    position, _ = hand.sim.asset_pose(name)
     if _is_rim(hand, name, way.grasp):
         cost += FAR_SIDE * (1.0 + float(unit(target - position) @ hand.radial(position)))
     ends = [target] if way.place is None else [target, way.place + target - position]
@@ -314,7 +315,7 @@ def pick(
     failed = 0
     for attempt in range(ATTEMPTS):
         way = _choose_grasp(hand, name, failed, avoid, place)
-        upright = hand.sim.body_pose(name)[1][2, 2] if _is_rim(hand, name, way.grasp) else -1.0
+        upright = hand.sim.asset_pose(name)[1][2, 2] if _is_rim(hand, name, way.grasp) else -1.0
         yield from rise(hand, OPEN)
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
@@ -323,7 +324,7 @@ def pick(
         # Fingers that met go back at once, the first time to the same place: what is learned of a miss is then not that
         # nothing is lifted first, nor that another way is tried for no reason that can be seen.
         failed += attempt > 0 or not hand.empty
-        missed = hand.empty or hand.sim.body_pose(name)[1][2, 2] < upright - TIPPED
+        missed = hand.empty or hand.sim.asset_pose(name)[1][2, 2] < upright - TIPPED
         held = None if missed else (yield from _lift(hand, name))
         if held is not None:
             return held
@@ -333,11 +334,11 @@ def pick(
 
 def _lift(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, Held | None]:
     """Lift what the fingers have closed on; return how it is held, None where it stayed behind."""
-    start, _ = hand.sim.body_pose(name)
+    start, _ = hand.sim.asset_pose(name)
     # Back along the fingers: straight up where the hand hangs down, away from what it leans away from.
     lifted = hand.position - LIFT * hand.rotation[:, 2]
     yield from hand.move(lifted, hand.rotation, CLOSED, tolerance=0.02, speed=0.7, timeout=60)
-    now, turn = hand.sim.body_pose(name)
+    now, turn = hand.sim.asset_pose(name)
     if hand.empty or now[2] - start[2] <= LIFT * 0.5:
         return None
     position, rotation = hand.sim.eef_pose()
@@ -397,7 +398,7 @@ def _hand_over(hand: Hand, held: Held, destination: Target, turn: Array) -> Call
         def target() -> Array:
             # Where the thing really is in the hand, not where it was when grasped: it may have turned or slipped.
             position, rotation = hand.sim.eef_pose()
-            now, _ = hand.sim.body_pose(held.name)
+            now, _ = hand.sim.asset_pose(held.name)
             offset = turn @ rotation.T @ (now - position)
             return destination() - offset + height * UP
 
@@ -408,7 +409,7 @@ def _hand_over(hand: Hand, held: Held, destination: Target, turn: Array) -> Call
 
 def _upright(hand: Hand, held: Held) -> Array:
     """Return the hand's rotation (3, 3) at which the held thing stands level, turned about the vertical as it is."""
-    _, now = hand.sim.body_pose(held.name)
+    _, now = hand.sim.asset_pose(held.name)
     tilt = cross(now[:, 2], UP)
     angle = float(np.arctan2(np.linalg.norm(tilt), now[2, 2]))
     if angle > MOST_RIGHTING:
@@ -424,8 +425,8 @@ def put_on(hand: Hand, held: Held, support: str) -> Steps:
     turn = _upright(hand, held)
 
     def destination() -> Array:
-        position, rotation = hand.sim.body_pose(support)
-        _, tilt = hand.sim.body_pose(held.name)
+        position, rotation = hand.sim.asset_pose(support)
+        _, tilt = hand.sim.asset_pose(held.name)
         drop = -asset.bottom if tilt[2, 2] > 0.9 else asset.radius * 0.6
         return position + rotation @ np.array([0.0, 0.0, height]) + (drop + 0.008) * UP
 
@@ -450,17 +451,17 @@ def put_at(hand: Hand, held: Held, position: Array, rotation: Array) -> Steps:
 
 def put_in_drawer(hand: Hand, held: Held, region: str, outward: Array) -> Steps:
     """Drop the held thing into an open drawer."""
-    half = hand.sim.site_half_size(region)
+    height = region_box(hand, region)[2][2]
     asset = hand.sim.assets[held.name]
     # Close along the front: the hand is 20 cm wide that way and would hit the cabinet the other way.
     turn = frame(DOWN, cross(UP, outward))
 
     def destination() -> Array:
         centre, _ = hand.sim.site_pose(region)
-        return centre + 0.015 * outward + (half[2] - asset.bottom - 0.005) * UP - 0.02 * UP
+        return centre + 0.015 * outward + (height - asset.bottom - 0.005) * UP - 0.02 * UP
 
     for _ in range(ATTEMPTS):
         yield from carry(hand, held, destination, turn, clearance=0.12, tolerance=0.012)
-        if not holding(hand, held) or length(hand.sim.body_pose(held.name)[0] - destination()) < ASTRAY:
+        if not holding(hand, held) or length(hand.sim.asset_pose(held.name)[0] - destination()) < ASTRAY:
             break
     yield from release(hand)

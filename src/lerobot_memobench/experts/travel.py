@@ -96,10 +96,26 @@ def drawer_around(hand: Hand, name: str) -> str | None:
 
 def stands_out(hand: Hand, name: str, region: str) -> bool:
     """Say whether a thing in a drawer is so far above it that the drawer cannot be shut: a bowl that leans, say."""
-    position, rotation = hand.sim.body_pose(name)
+    position, rotation = hand.sim.asset_pose(name)
     highest = position[2] + (rotation @ corners(hand.sim.assets[name]))[2].max()
-    over: float = highest - hand.sim.site_pose(region)[0][2] - hand.sim.site_half_size(region)[2]
+    centre, _, half = region_box(hand, region)
+    over: float = highest - centre[2] - half[2]
     return over > MOST_OVER
+
+
+def region_box(hand: Hand, region: str) -> tuple[Array, Array, Array]:
+    """Return centre (3,), rotation (3, 3) and half size (3,) of a region, the third axis pointing up.
+
+    LIBERO's drawers have sites that lie on a side.
+    """
+    centre, rotation = hand.sim.site_pose(region)
+    half = hand.sim.site_half_size(region)
+    upright = int(np.argmax(np.abs(rotation[2])))
+    if upright == 2:
+        return centre, rotation, half
+    order = [(upright + 1) % 3, (upright + 2) % 3, upright]
+    up = np.sign(rotation[2, upright])
+    return centre, rotation[:, order] * np.array([up, 1.0, up]), half[order]
 
 
 def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
@@ -108,7 +124,7 @@ def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
     for other, asset in hand.sim.assets.items():
         if asset.kind != "fixture" or other == name:
             continue
-        position, rotation = hand.sim.body_pose(other)
+        position, rotation = hand.sim.asset_pose(other)
         low, high = np.asarray(asset.low), np.asarray(asset.high)
         boxes.append((position + rotation @ (low + high) / 2, rotation, (high - low) / 2))
         for region, articulation in asset.articulations.items():
@@ -118,10 +134,10 @@ def tall_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
 
 
 def _drawer_box(hand: Hand, region: str, handle_site: str) -> tuple[Array, Array, Array]:
-    centre, turned = hand.sim.site_pose(region)
+    centre, turned, half = region_box(hand, region)
     handle, _ = hand.sim.site_pose(handle_site)
     reach = np.abs(turned.T @ (handle - centre)) + 0.008
-    return centre, turned, np.maximum(hand.sim.site_half_size(region) + 0.012, reach)
+    return centre, turned, np.maximum(half + 0.012, reach)
 
 
 def in_the_way(hand: Hand, name: str, target: Array, turn: Array) -> float:
@@ -131,7 +147,7 @@ def in_the_way(hand: Hand, name: str, target: Array, turn: Array) -> float:
     for other, asset in hand.sim.assets.items():
         if asset.kind == "fixture" or other == name:
             continue
-        position, rotation = hand.sim.body_pose(other)
+        position, rotation = hand.sim.asset_pose(other)
         low, high = np.asarray(asset.low), np.asarray(asset.high)
         local = (points - position) @ rotation - (low + high) / 2
         depth = ((high - low) / 2 + HAND_MARGIN - np.abs(local)).min(axis=1)
@@ -146,7 +162,7 @@ def crowding(hand: Hand, name: str, target: Array, turn: Array) -> float:
     for other, asset in hand.sim.assets.items():
         if other == name or asset.kind == "fixture":
             continue
-        position, rotation = hand.sim.body_pose(other)
+        position, rotation = hand.sim.asset_pose(other)
         if position[2] + asset.top < target[2] - FINGER_REACH:
             continue
         for side in (-1.0, 1.0):
@@ -178,7 +194,7 @@ def clear_height(hand: Hand, start: Array, end: Array, *, lowest: float, wide: f
     for other, asset in hand.sim.assets.items():
         if asset.kind == "fixture" or other in but:
             continue
-        position, rotation = hand.sim.body_pose(other)
+        position, rotation = hand.sim.asset_pose(other)
         gap = float(np.linalg.norm((way - position)[:, :2], axis=1).min()) - asset.radius - wide
         if gap < 0.0:
             height = max(height, float(position[2] + (rotation @ corners(asset))[2].max()))
@@ -291,7 +307,7 @@ class Held:
 def holding(hand: Hand, held: Held) -> bool:
     """Return whether the thing is still where it was in the hand when it was taken."""
     position, rotation = hand.sim.eef_pose()
-    now, _ = hand.sim.body_pose(held.name)
+    now, _ = hand.sim.asset_pose(held.name)
     return length(rotation.T @ (now - position) - held.offset) < LOST
 
 
@@ -353,7 +369,7 @@ def _load(hand: Hand, held: Held | None) -> tuple[float, float, tuple[str, ...]]
     if held is None:
         return FINGER_REACH, HAND_BESIDE, ()
     asset = hand.sim.assets[held.name]
-    position, rotation = hand.sim.body_pose(held.name)
+    position, rotation = hand.sim.asset_pose(held.name)
     below = float(hand.position[2] - position[2] - (rotation @ corners(asset))[2].min())
     return max(FINGER_REACH, below), max(HAND_BESIDE, asset.radius), (held.name,)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
@@ -364,6 +365,14 @@ class Simulation:
         """Return position (3,) and rotation (3, 3) of an instance or body."""
         body = self.data.body(name)
         return body.xpos.copy(), body.xmat.reshape(3, 3).copy()
+
+    def asset_pose(self, name: str) -> tuple[Array, Array]:
+        """Return position (3,) and rotation (3, 3) of an instance's frame as its `Asset` has it: upright, z is up."""
+        position, rotation = self.body_pose(name)
+        upright = self.assets[name].upright
+        if upright is None:
+            return position, rotation
+        return position, rotation @ Rotation.from_quat(upright, scalar_first=True).as_matrix()
 
     def site_pose(self, name: str) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of a site."""

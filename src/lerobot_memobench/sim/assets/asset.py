@@ -17,6 +17,8 @@ import numpy as np
 
 ALONG_X, ALONG_Y = 0.0, float(np.pi / 2)
 """Yaws of a grasp whose fingers close along x or y of the body [rad]."""
+Quaternion = tuple[float, float, float, float]
+"""wxyz."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,8 @@ class Asset:
     of anything else [m]; ``clear_radius``: radius of that surface [m].
     ``glow``: full names of visual geoms whose rgba is ``glow_on`` while the fixture is on, else ``glow_off``.
     ``round``: the outline from above is a circle about the origin.
+    ``upright``: from this asset's frame to its body's, where a body stands with another axis than z up; all numbers
+    here are of the asset's frame.
     ``seals``: body -> centre and half size in its frame of the board behind a drawer's front that closes its play [m].
     """
 
@@ -98,6 +102,7 @@ class Asset:
     glow_on: tuple[float, float, float, float] = (1.0, 0.12, 0.04, 1.0)
     glow_off: tuple[float, float, float, float] = (0.34, 0.34, 0.35, 1.0)
     round: bool = False
+    upright: Quaternion | None = None
     seals: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = field(
         default_factory=lambda: MappingProxyType({})
     )

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from math import nan, pi
 from typing import Literal
 
+from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Grasp
+
 Turn = tuple[str, float]
 """Axis (x, y or z) and angle, rad."""
 
@@ -54,23 +56,37 @@ class LiberoClass:
         mjcf: its file below the folder of assets.
         turns: drawn one after the other when a thing is set down. A fixture is turned as its task states.
         parts: pairs of the part's region, or "" where the fixture is the part's name, and the part.
+        grasps: how to hold it from above; where there are none, by the sides of the box around it.
+        floor, clear: height and radius of a container's floor, m; nan where things are put on its top.
+        round: whether its outline from above is a circle about its origin.
+        y_up: whether it stands with its y axis up. Grasps are in the frame whose z is up (`scene.Y_UP`).
     """
 
     mjcf: str
     turns: tuple[Turn, ...] = (("x", pi / 2),)
     parts: tuple[tuple[str, Part], ...] = ()
+    grasps: tuple[Grasp, ...] = ()
+    floor: float = nan
+    clear: float = nan
+    round: bool = False
+    y_up: bool = False
 
 
-def _scanned(name: str) -> LiberoClass:
-    return LiberoClass(f"stable_scanned_objects/{name}/{name}.xml")
+def _vessel(name: str, rim: Grasp, floor: float, clear: float) -> LiberoClass:
+    file = f"stable_scanned_objects/{name}/{name}.xml"
+    return LiberoClass(file, grasps=(rim,), floor=floor, clear=clear, round=True)
 
 
-def _grocery(name: str, *turns: Turn) -> LiberoClass:
-    return LiberoClass(f"stable_hope_objects/{name}/{name}.xml", turns or (("x", pi / 2),))
+def _grocery(name: str, *turns: Turn, grasps: tuple[Grasp, ...], y_up: bool = False) -> LiberoClass:
+    return LiberoClass(f"stable_hope_objects/{name}/{name}.xml", turns, grasps=grasps, y_up=y_up)
 
 
-def _modelled(name: str) -> LiberoClass:
-    return LiberoClass(f"turbosquid_objects/{name}/{name}.xml", (("x", 0.0),))
+def _modelled(name: str, grasps: tuple[Grasp, ...] = ()) -> LiberoClass:
+    return LiberoClass(f"turbosquid_objects/{name}/{name}.xml", (("x", 0.0),), grasps=grasps)
+
+
+def _rim(radius: float, height: float, width: float) -> Grasp:
+    return Grasp((radius, 0.0, height), ALONG_X, width, symmetric=True)
 
 
 _DRAWERS = {"top": 0.18393, "middle": 0.11041, "bottom": 0.04114}
@@ -85,7 +101,7 @@ def _drawer(level: str, height: float) -> Part:
         handle=(-0.00278, -0.10161, height),
         handle_size=(0.0889, 0.0154, 0.01634),
         clearance=0.015,
-        closed_q=0.005,
+        closed_q=0.0012,  # its front meets the cabinet at 0.0017
         open_q=-0.155,
         ranges={"open": (-0.16, -0.14), "close": (0.0, 0.005)},
         open_below=-0.14,
@@ -111,9 +127,10 @@ _KNOB = Part(
     kind="knob",
     joint="button",
     body="button",
-    handle=(0.0, 0.0, 0.0257),
+    handle=(0.0, 0.0, 0.029),
     handle_size=(0.069, 0.024, 0.049),
     clearance=0.03,
+    handle_quaternion=(0.5**0.5, 0.0, 0.0, 0.5**0.5),
     closed_q=-0.005,
     open_q=1.0,
     ranges={"turnon": (0.5, 2.1), "turnoff": (-0.005, 0.0)},
@@ -122,15 +139,38 @@ _KNOB = Part(
 )
 
 CLASSES: dict[str, LiberoClass] = {
-    "akita_black_bowl": _scanned("akita_black_bowl"),
-    "white_bowl": _scanned("white_bowl"),
-    "plate": _scanned("plate"),
-    "chefmate_8_frypan": _scanned("chefmate_8_frypan"),
-    "bbq_sauce": _grocery("bbq_sauce"),
-    "butter": _grocery("butter", ("x", 0.0)),
-    "milk": _grocery("milk", ("x", pi / 2), ("z", pi / 2)),
-    "ketchup": _grocery("ketchup", ("x", pi / 2), ("z", pi / 2)),
-    "moka_pot": _modelled("moka_pot"),
+    "akita_black_bowl": _vessel("akita_black_bowl", _rim(0.0498, 0.044, 0.006), floor=0.0068, clear=0.039),
+    "white_bowl": _vessel("white_bowl", _rim(0.0372, 0.0275, 0.005), floor=0.0042, clear=0.022),
+    "plate": _vessel("plate", _rim(0.0625, 0.0125, 0.012), floor=0.0061, clear=0.040),
+    "chefmate_8_frypan": LiberoClass(
+        "stable_scanned_objects/chefmate_8_frypan/chefmate_8_frypan.xml",
+        grasps=tuple(Grasp((x, 0.0, 0.0442 + 0.126 * (x - 0.1926)), ALONG_Y, 0.0254) for x in (0.145, 0.165, 0.195)),
+        floor=0.0128,
+        clear=0.072,
+    ),
+    "bbq_sauce": _grocery(
+        "bbq_sauce",
+        ("x", pi / 2),
+        grasps=(Grasp((0.0, 0.0, 0.0195), ALONG_Y, 0.0286), Grasp((0.0, 0.0, 0.0195), ALONG_X, 0.0362)),
+    ),
+    "butter": _grocery(
+        "butter", ("x", 0.0), grasps=(Grasp((0.0, 0.0, 0.0), ALONG_Y, 0.0396), Grasp((0.0, 0.0, 0.0), ALONG_X, 0.0762))
+    ),
+    "milk": _grocery(
+        "milk",
+        ("x", pi / 2),
+        ("z", pi / 2),
+        grasps=(Grasp((0.0, 0.0, 0.029), ALONG_X, 0.0526), Grasp((0.0, 0.0, 0.029), ALONG_Y, 0.0526)),
+        y_up=True,
+    ),
+    "ketchup": _grocery(
+        "ketchup",
+        ("x", pi / 2),
+        ("z", pi / 2),
+        grasps=(Grasp((0.0004, -0.0008, 0.0405), ALONG_Y, 0.0366), Grasp((0.0004, -0.0008, 0.0405), ALONG_X, 0.033)),
+        y_up=True,
+    ),
+    "moka_pot": _modelled("moka_pot", (Grasp((0.0, 0.0755, 0.045), ALONG_X, 0.0131),)),
     "wooden_two_layer_shelf": _modelled("wooden_two_layer_shelf"),
     "wooden_cabinet": LiberoClass(
         "articulated_objects/wooden_cabinet.xml",

@@ -15,14 +15,15 @@ from types import MappingProxyType
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.assets.asset import Articulation, Asset, Handle
+from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Articulation, Asset, Grasp, Handle, Quaternion
 from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.libero import mjcf
-from lerobot_memobench.sim.libero.classes import Part, parts_of
+from lerobot_memobench.sim.libero.classes import CLASSES, LiberoClass, Part, parts_of
 from lerobot_memobench.sim.libero.looks import drawn
 from lerobot_memobench.sim.raster.drawlist import DrawList
 from lerobot_memobench.sim.scene import (
@@ -48,6 +49,14 @@ GLOWING = {"flat_stove": "burner"}
 GLOW = "glow"
 """Name of the geom in its place, after the instance's."""
 GLOW_ON, GLOW_OFF = (0.9, 0.05, 0.05, 1.0), (0.9, 0.05, 0.05, 0.0)
+Y_UP = (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
+"""From the frame whose z is up to that of a body that stands with its y axis up, a quaternion wxyz."""
+FINGERS = 0.032
+"""How far under a thing's top it is held, m: fingers reach 4 cm below the palm."""
+WIDEST = 0.068
+"""Most between the fingers, m."""
+UNKNOWN = LiberoClass("")
+"""A scan: nothing is known of it but the box around it."""
 
 
 def build_scene(task: Task) -> Scene:
@@ -233,24 +242,45 @@ def _remove(root: ET.Element, unwanted: Callable[[ET.Element], bool]) -> None:
             parent.remove(child)
 
 
+Triple = tuple[float, float, float]
+
+
 def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Asset:
     """Return the facts about an instance."""
+    known = CLASSES.get(class_name, UNKNOWN)
+    upright = Y_UP if known.y_up else None
     root = model.body(name).id
-    low, high = _bounds(model, root)
+    low, high = _bounds(model, root, upright)
     mine = (model.body_rootid[model.site_bodyid] == root) & (model.site_type == mujoco.mjtGeom.mjGEOM_BOX)
     regions = [model.site(site).name for site in np.flatnonzero(mine)]
+    is_object = name in task.objects
+    contains = not np.isnan(known.floor)
     return Asset(
         name=name,
         class_name=class_name,
-        kind="object" if name in task.objects else "fixture",
+        kind="object" if is_object else "fixture",
         low=low,
         high=high,
+        grasps=(known.grasps or _by_the_sides(low, high)) if is_object else (),
         articulations=MappingProxyType({region: _articulation(name, part) for region, part in parts_of(class_name)}),
         regions=MappingProxyType({full.removeprefix(f"{name}_"): full for full in regions}),
-        supports=high[2],
+        supports=known.floor if contains else high[2],
+        clear_radius=known.clear if contains else 0.0,
+        round=known.round,
+        upright=upright,
         glow=(f"{name}_{GLOW}",) if class_name in GLOWING else (),
         glow_on=GLOW_ON,
         glow_off=GLOW_OFF,
+    )
+
+
+def _by_the_sides(low: Triple, high: Triple) -> tuple[Grasp, ...]:
+    """Return the ways to hold a box between two of its sides, the narrower first."""
+    x, y, z = (np.add(low, high) / 2).tolist()
+    place = (x, y, max(z, high[2] - FINGERS))
+    widths = {ALONG_X: high[0] - low[0], ALONG_Y: high[1] - low[1]}
+    return tuple(
+        Grasp(place, yaw, widths[yaw]) for yaw in sorted(widths, key=widths.__getitem__) if widths[yaw] <= WIDEST
     )
 
 
@@ -270,14 +300,13 @@ def _articulation(name: str, part: Part) -> Articulation:
     )
 
 
-Triple = tuple[float, float, float]
-
-
-def _bounds(model: mujoco.MjModel, root: int) -> tuple[Triple, Triple]:
-    """Return the corners of the box around a thing's collision geoms, in its frame, joints at zero."""
+def _bounds(model: mujoco.MjModel, root: int, upright: Quaternion | None) -> tuple[Triple, Triple]:
+    """Return the corners of the box around a thing's collision geoms, in its asset's frame, joints at zero."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     frame, origin = data.xmat[root].reshape(3, 3), data.xpos[root]
+    if upright is not None:
+        frame = frame @ Rotation.from_quat(upright, scalar_first=True).as_matrix()
     corners = []
     for geom in range(model.ngeom):
         if model.body_rootid[model.geom_bodyid[geom]] == root and model.geom_group[geom] == COLLISION_GROUP:
