@@ -181,7 +181,7 @@ def test_a_mirror_shows_what_is_above_it() -> None:
     model = textured_scene()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    listed = build_draw_list(model, sharp=True)
+    listed = build_draw_list(model, as_mujoco=True)
     with_mirror, without = (
         Rasterizer(model, each, 128, 128, 0).draw(model, data, "above").astype(int)
         for each in (listed, replace(listed, mirror=None))
