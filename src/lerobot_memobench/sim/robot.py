@@ -162,7 +162,7 @@ def robot_spec() -> mujoco.MjSpec:
     """Return a fresh spec that holds the arm and robosuite's physics options, for a scene to be added to."""
     spec = mujoco.MjSpec.from_string(robot_xml())
     _thin(spec)
-    draw_as_seen(spec)
+    hide_helpers(spec)
     return spec
 
 
@@ -176,7 +176,7 @@ def _thin(spec: mujoco.MjSpec) -> None:
             mesh.userface = arrays[f"f:{mesh.name}"].ravel().tolist()
 
 
-def draw_as_seen(spec: mujoco.MjSpec) -> None:
+def hide_helpers(spec: mujoco.MjSpec) -> None:
     """Draw nothing of the arm of a scene that a camera does not see, and let nothing touch what is drawn alone."""
     for geom in spec.geoms:
         if geom.meshname and "vis" not in geom.meshname and geom.group == 1:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from lerobot_memobench.sim.raster.shapes import Triangles, in_pieces, mesh_in_fi
 from lerobot_memobench.sim.raster.textures import LAYER_SIZE, resized
 
 Arrays = dict[str, NDArray[Any]]
-FORM = "5"
+FORM = "6"
 """Of the kept files; another one for each change of what they hold."""
 LEAST_THINNED, THINNED_TO = 6000, 4000
 """Triangles of meshes that are thinned, and to how many: things fill a thousandth of a picture each."""
@@ -48,14 +49,14 @@ def drawn(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
     for mesh in spec.meshes:
         if mesh.name not in seen and mesh.file:
             _stand_in(mesh)
-    files = {_key(part): part for part in [*spec.meshes, *spec.textures] if part.file}
-    kept = {key: _read(key) for key in files}
-    missing = {key: files[key] for key, arrays in kept.items() if arrays is None}
+    files = [(_key(part), part) for part in [*spec.meshes, *spec.textures] if part.file]
+    kept = {key: _read(key) for key, _ in files}
+    missing = {key: part for key, part in files if kept[key] is None}
     if missing:
         whole = spec.copy().compile()
         kept |= {key: _keep(key, _content(whole, part)) for key, part in missing.items()}
     meshes = {}
-    for key, part in files.items():
+    for key, part in files:
         arrays = kept[key]
         assert arrays is not None
         if isinstance(part, mujoco.MjsMesh):
@@ -84,7 +85,8 @@ def _path(key: str) -> Path:
 
 
 def _read(key: str) -> Arrays | None:
-    with contextlib.suppress(OSError, ValueError, KeyError, EOFError), np.load(_path(key), allow_pickle=False) as kept:
+    damaged = OSError, ValueError, EOFError, zipfile.BadZipFile
+    with contextlib.suppress(*damaged), np.load(_path(key), allow_pickle=False) as kept:
         return dict(kept)
     return None
 
@@ -128,10 +130,10 @@ def _thinned(shape: Triangles) -> Triangles:
         return shape
     import fast_simplification  # only the first picture on a machine needs it
 
-    spots, smooth, spot_uv, faces = welded((points, np.zeros_like(points), uv, triangles))
+    spots, _, spot_uv, same = welded((points, np.zeros_like(points), uv, np.arange(len(points))))
     smooth = np.zeros_like(spots)
-    _, _, _, same = welded((points, np.zeros_like(points), uv, np.arange(len(points))[:, None]))
-    np.add.at(smooth, same[:, 0], normals)
+    np.add.at(smooth, same, normals)
+    faces = same[triangles]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     _, _, collapses = fast_simplification.simplify(
         spots, faces, target_count=THINNED_TO, agg=5, return_collapses=True, preserve_border=True

@@ -105,7 +105,7 @@ def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
     # robosuite's files reserve room for 5,000 contacts, 1.3 GB of addresses per simulation; no scene uses 1 MB.
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
     if visuals:
-        robot.draw_as_seen(spec)
+        robot.hide_helpers(spec)
         _add_glow(spec, task)
     return spec
 
