@@ -45,6 +45,7 @@ def test_convert(call, monkeypatch):
         "source": Path("src"),
         "out": Path("ds"),
         "upside_down": True,
+        "world": "memobench",
         "workers": 1,
         "repo_id": "a/b",
     }
