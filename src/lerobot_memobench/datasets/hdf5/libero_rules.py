@@ -15,18 +15,16 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.hdf5.model_file import ModelFile
 from lerobot_memobench.datasets.hdf5.reading import Unusable
+from lerobot_memobench.protocol import UPSTREAM_EVALUATIONS
 from lerobot_memobench.sim.assets.kitchen import TABLE
+from lerobot_memobench.sim.libero.world import in_region, over_region
+from lerobot_memobench.sim.world import ON_DISTANCE
+from lerobot_memobench.tasks import progress
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
-HOLD_STEPS = 5
-"""Control steps for which a part of ``Then`` must hold: ten evaluations, two per step."""
-ON_DISTANCE = 0.03
-"""From above, between the origins of a thing and of the thing it is on, m."""
-SLACK_BELOW = 0.01
-"""How far below a region an origin may be, along the world's z, m."""
-ON_BELOW, ON_ABOVE = 0.005, 0.10
-"""Heights around the top of a site between which an origin counts as on it, m."""
+HOLD_STEPS = progress.HOLD_STEPS // UPSTREAM_EVALUATIONS
+"""Control steps for which a part of ``Then`` must hold there."""
 
 
 class LiberoRules:
@@ -67,12 +65,7 @@ class LiberoRules:
         return data.site_xpos[site], data.site_xmat[site].reshape(3, 3), self._scene.model.site_size[site]
 
     def _in(self, thing: str, region: str) -> bool:
-        """Whether the origin is in a box along the world's axes, from one end of the turned diagonal to the other."""
-        position, turned, half = self._site(region)
-        reach = np.abs(turned @ half)
-        away = self._position(thing) - position
-        low = -reach - [0.0, 0.0, SLACK_BELOW]
-        return bool(np.all(away > low) and np.all(away < reach))
+        return in_region(self._position(thing), *self._site(region))
 
     def _on_thing(self, thing: str, below: str) -> bool:
         above = self._position(thing) - self._position(below)
@@ -80,9 +73,8 @@ class LiberoRules:
         return bool(near) and self._scene.touching(thing, below)
 
     def _on_site(self, thing: str, region: str) -> bool:
-        """The site's rotation is applied where its inverse would be right: so does LIBERO. A table need not be felt."""
-        position, turned, half = self._site(region)
-        away = turned @ (self._position(thing) - position)
-        over = half[2] - ON_BELOW < away[2] < half[2] + ON_ABOVE and bool(np.all(np.abs(away[:2]) < half[:2]))
+        """Whether it is over the site and touches its owner; a table need not be felt."""
+        if not over_region(self._position(thing), *self._site(region)):
+            return False
         owner = max((name for name in self._instances if region.startswith(f"{name}_")), key=len, default="")
-        return bool(over) and (not owner or owner == TABLE or self._scene.touching(thing, owner))
+        return not owner or owner == TABLE or self._scene.touching(thing, owner)

@@ -12,16 +12,40 @@ from lerobot_memobench.sim.assets.kitchen import TABLE
 from lerobot_memobench.sim.world import IN_SLACK, ON_SITE_ABOVE, ON_SITE_BELOW, World
 from lerobot_memobench.tasks.task import Task
 
+Vector = NDArray[np.float64]
+
+
+def in_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
+    """Return whether an origin is in a region.
+
+    LIBERO takes the region for a box along the world's axes, whose half sides are |R·size|, and lets a thing be
+    `IN_SLACK` below it along the world's z.
+
+    Args:
+        place: the origin (3,), m.
+        position, rotation, size: of the region's site: (3,), (3, 3) and half sizes (3,).
+    """
+    half = np.abs(rotation @ size)
+    low, high = position - half, position + half
+    low[2] -= IN_SLACK
+    return bool(np.all(place > low) and np.all(place < high))
+
+
+def over_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
+    """Return whether an origin is on top of a region, touching or not; arguments as of `in_region`.
+
+    LIBERO applies the site's rotation where its inverse would be right.
+    """
+    offset = rotation @ (place - position)
+    above = size[2] - ON_SITE_BELOW < offset[2] < size[2] + ON_SITE_ABOVE
+    return bool(above and np.all(np.abs(offset[:2]) < size[:2]))
+
 
 class LiberoWorld(World):
     """What LIBERO's code would answer about one simulation, asked atom by atom.
 
-    Differences from `World`, read in LIBERO's `site_object.py` and `base_object_states.py`:
-
-    - `In` takes the region for a box along the world's axes, whose half sides are \\|R·size\\|, and lets a thing be
-      `IN_SLACK` below it along the world's z; R is the rotation of the region's site;
-    - `On` a region turns the distance by R, not by its transpose;
-    - `On` a region of the table needs no contact.
+    Differences from `World`, read in LIBERO's `site_object.py` and `base_object_states.py`: the formulas of `in_region`
+    and `over_region`, and `On` a region of the table needs no contact.
 
     Contacts are those of geoms of robosuite's collision group.
     """
@@ -32,26 +56,17 @@ class LiberoWorld(World):
 
     def _in(self, a: str, region: str) -> bool:
         self._index(a)
-        position, rotation, size = self._box_of(region)
-        half = np.abs(rotation @ size)
-        low, high = position - half, position + half
-        low[2] -= IN_SLACK
-        place = self._data.body(a).xpos
-        return bool(np.all(place > low) and np.all(place < high))
+        return in_region(self._data.body(a).xpos, *self._box_of(region))
 
     def _on_site(self, a: str, region: str) -> bool:
         self._index(a)
-        position, rotation, size = self._box_of(region)
-        offset = rotation @ (self._data.body(a).xpos - position)
-        inside = bool(np.all(np.abs(offset[:2]) < size[:2]))
-        above = bool(size[2] - ON_SITE_BELOW < offset[2] < size[2] + ON_SITE_ABOVE)
-        if not (inside and above):
+        if not over_region(self._data.body(a).xpos, *self._box_of(region)):
             return False
         declared = self._task.regions.get(region)
         on_table = declared is not None and declared.target == TABLE
         return on_table or self.touching(a, self._owner_of(region))
 
-    def _box_of(self, region: str) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _box_of(self, region: str) -> tuple[Vector, Vector, Vector]:
         """Return place (3,), rotation (3, 3) and half size (3,) of a region's site."""
         site = self._site(region)
         return (
