@@ -46,11 +46,13 @@ class Placed:
     Attributes:
         states: (T, D) of that scene.
         fixture_poses: where its fixtures stand.
-        scene: the scene that the states come from, where its shapes are others: it answers ``in`` and ``on``.
+        theirs: whether the states come from LIBERO's scenes, where its rules hold.
+        scene: that scene, where its shapes are not the task's: it answers ``in`` and ``on``.
     """
 
     states: NDArray[np.float64]
     fixture_poses: dict[str, Pose]
+    theirs: bool = False
     scene: ModelFile | None = None
 
 
@@ -85,7 +87,7 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
             ),
             success=bool(demo.extras.get("success", read_off.success or (bool(frames) and min(frames) >= 0))),
             fixture_poses=placed.fixture_poses,
-            model_xml=demo.model_file if placed.scene is None and task.world != LIBERO else "",
+            model_xml="" if placed.theirs else demo.model_file,
             scene_hash=str(demo.extras.get("scene_hash", "")),
             stand_ins=sim.stand_ins,
             objects=read_off.objects,
@@ -100,8 +102,8 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
 
 def _placed(sim: Simulation, task: Task, demo: PublishedDemo) -> Placed:
     """Return states and fixtures in the task's scene; where this package wrote them, they are in its own world's."""
-    if task.world == LIBERO and (is_ours(demo) or ModelFile(demo.model_file).name == OURS):
-        raise Unusable("its scenes are of world=memobench, not of LIBERO's assets; convert it without --world libero")
+    if is_ours(demo):
+        _check_world(task)
     if is_ours(demo) and "fixture_poses" in demo.extras:
         if demo.states.shape[1] != sim.state_dim:
             raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {task.name}")
@@ -109,8 +111,17 @@ def _placed(sim: Simulation, task: Task, demo: PublishedDemo) -> Placed:
     if not demo.model_file.strip():
         raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is not known")
     scene = ModelFile(demo.model_file)
+    theirs = scene.name != OURS
+    if not theirs:
+        _check_world(task)
     states, fixture_poses = place(task, sim, scene, demo.states)
-    return Placed(states, fixture_poses, None if scene.name == OURS or task.world == LIBERO else scene)
+    return Placed(states, fixture_poses, theirs, scene if theirs and task.world != LIBERO else None)
+
+
+def _check_world(task: Task) -> None:
+    """Raise where scenes of this package are to be LIBERO's."""
+    if task.world == LIBERO:
+        raise Unusable("its scenes are of world=memobench, not of LIBERO's assets; convert it without --world libero")
 
 
 def is_ours(demo: PublishedDemo) -> bool:
@@ -191,7 +202,7 @@ def _read_off(
     sim: Simulation, task: Task, demo: PublishedDemo, placed: Placed, exec_start: int, *, asked: bool
 ) -> ReadOff:
     """Show the states to the simulator one after the other; evaluate goals and checkpoints where they are ``asked``."""
-    hold_steps = HOLD_STEPS if placed.scene is None and task.world != LIBERO else libero_rules.HOLD_STEPS
+    hold_steps = libero_rules.HOLD_STEPS if placed.theirs else HOLD_STEPS
     evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)], hold_steps)
     holds = sim.holds if placed.scene is None else LiberoRules(task, placed.scene, sim.holds).holds
     look = ObjectSlots(sim)
