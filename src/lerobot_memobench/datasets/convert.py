@@ -41,12 +41,12 @@ from lerobot_memobench.datasets.staging import (
     remove_staging,
     staged,
 )
-from lerobot_memobench.envs.world_assets import check_assets
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, free_bytes, in_words, read_json, telling_of_the_disk, write_file
 from lerobot_memobench.jobs.executors import run_jobs
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
+from lerobot_memobench.sim.worlds import KINDS
 from lerobot_memobench.tasks.task import MEMOBENCH, World
 
 UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
@@ -104,7 +104,7 @@ def convert(
             finished stays).
     """
     source, out = Path(source).absolute(), Path(out)
-    check_assets(world)
+    KINDS[world].check()
     if not source.exists():
         raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")
     archive = Archive(source) if is_archive(source) else None

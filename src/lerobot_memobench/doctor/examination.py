@@ -17,11 +17,11 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.doctor.probe import TOLERANCE, run_probe
-from lerobot_memobench.envs.world_assets import check_assets
 from lerobot_memobench.errors import MemobenchError, unsupported_system
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.gl.context import BACKENDS, gl_backend
+from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
 from lerobot_memobench.tasks.task import LIBERO
 
@@ -263,7 +263,7 @@ def paper_world() -> Finding:
     """Look for what scenes of ``world=libero`` are built of; the package's own world needs none of it."""
     what = f"world {LIBERO}"
     try:
-        folder = check_assets(LIBERO)
+        folder = check_assets()
     except MemobenchError as error:
         detail, _, fix = str(error).partition("; ")
         return Finding(what, "ok", f"not here, and only world={LIBERO} needs it: {detail}", fix)

@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from lerobot.envs.configs import EnvConfig
 
     from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-    from lerobot_memobench.tasks.task import World
 
 ENVIRONMENT = "memobench"
 EXPERT = "memobench_expert"
@@ -264,13 +263,13 @@ def check_scenes(plan: EvaluationPlan) -> None:
 
 def _check_simulator(environment: MemobenchEnvConfig) -> None:
     """Refuse a machine on which every episode would fail: no arm, no assets, or nothing to draw with."""
-    from lerobot_memobench.envs.world_assets import check_assets
     from lerobot_memobench.sim.gl.context import gl_backend
     from lerobot_memobench.sim.rendering import RenderSettings
     from lerobot_memobench.sim.robot import robosuite_version
+    from lerobot_memobench.sim.worlds import KINDS
 
     robosuite_version()
-    check_assets(cast("World", environment.world))
+    KINDS[environment.world].check()
     if environment.draws and RenderSettings(quality=environment.render).needs_gl:
         gl_backend()
 

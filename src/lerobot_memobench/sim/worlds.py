@@ -10,6 +10,7 @@ from typing import Protocol
 import mujoco
 
 from lerobot_memobench.sim.assets.asset import Asset
+from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.libero.placement import LiberoPlacer
 from lerobot_memobench.sim.libero.scene import build_scene as build_libero_scene
 from lerobot_memobench.sim.libero.world import LiberoWorld
@@ -37,14 +38,19 @@ class Kind:
         build: compiles a task's scene.
         placer: places the things of a simulation: task, model, data, assets -> placer.
         predicates: answers atoms of a simulation: task, model, data, assets -> world.
+        check: raises where a file that its scenes are built of is missing or another one.
     """
 
     build: Callable[[Task], Scene]
     placer: Callable[[Task, mujoco.MjModel, mujoco.MjData, dict[str, Asset]], Places]
     predicates: Callable[[Task, mujoco.MjModel, mujoco.MjData, dict[str, Asset]], World]
+    check: Callable[[], object] = lambda: None
 
 
-KINDS = {MEMOBENCH: Kind(build_scene, Placer, World), LIBERO: Kind(build_libero_scene, LiberoPlacer, LiberoWorld)}
+KINDS: dict[str, Kind] = {
+    MEMOBENCH: Kind(build_scene, Placer, World),
+    LIBERO: Kind(build_libero_scene, LiberoPlacer, LiberoWorld, check_assets),
+}
 
 _scenes: OrderedDict[tuple[str, ...], Scene] = OrderedDict()
 

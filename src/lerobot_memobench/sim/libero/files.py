@@ -65,6 +65,17 @@ def asset(name: str) -> Path:
     return _checked(assets_folder(), name)
 
 
+def check_assets() -> Path:
+    """Check every file that scenes read; return their folder.
+
+    Raises:
+        MemobenchError: a file is missing, or its content is another one, with what to install.
+    """
+    for name in known_hashes():
+        asset(name)
+    return assets_folder()
+
+
 @cache
 def _checked(folder: Path, name: str) -> Path:
     path = folder / name
