@@ -632,3 +632,11 @@ def test_killed_in_assembly_and_in_encoding(tasks, recorded, tmp_path, holder, n
     assert is_dataset(tmp_path / "ds") == (after and name == "replace")
     run(tasks, tmp_path / "ds")
     assert tree_hash(tmp_path / "ds") == tree_hash(tmp_path / "undisturbed")
+
+
+def test_a_world_without_its_files_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("MEMOBENCH_LIBERO_ASSETS", str(tmp_path / "nothing"))
+    task = get_task("check_the_top_drawer_of_the_cabinet").in_world("libero")
+    with pytest.raises(MemobenchError, match=r"MEMOBENCH_LIBERO_ASSETS is .* which is no folder"):
+        generate([task], 1, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -45,10 +45,11 @@ from lerobot_memobench.datasets.staging import (
 )
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, telling_of_the_disk
-from lerobot_memobench.jobs.executors import Needs, check_executor, options_text, run_jobs
+from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
+from lerobot_memobench.sim.worlds import KINDS
 from lerobot_memobench.tasks.task import MEMOBENCH, Task, referent_text
 
 WEIGHTS = "model.safetensors"
@@ -133,6 +134,8 @@ def generate(
     options = options_text(executor, executor_options or {}, NEEDS)
     if finish:
         return _finish_early(plan, Path(out))
+    if executor not in ELSEWHERE:  # there, each part finds out
+        KINDS[plan.world].check()
     return _carry_out(plan, Path(out), workers, executor=executor, options=options, progress=progress, tell=tell)
 
 
