@@ -1,7 +1,7 @@
 """All that LeRobot and transformers are made to do beside their own: one list, one way in, one way out.
 
-A hook stands in the place of a function of theirs for as long as somebody needs it, an evaluation or a training, and
-calls that function with layers of ours around it. It goes with the last of those. A decorator that somebody else puts
+A hook stands in the place of a function of theirs for as long as a training needs it, and calls that function with
+layers of ours around it. It goes with the last of those. A decorator that somebody else puts
 around it, before or after, stays and is called too: whether a hook stands is told by the function itself, which is kept
 here, and by no attribute that a decorator could copy. What a layer does is beside the code that needs it.
 
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ast
 import functools
-import hashlib
 import importlib
 import importlib.util
 import inspect
@@ -21,7 +20,7 @@ import logging
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
@@ -79,31 +78,6 @@ class Hook:
         return f"{self.package} {', '.join(self.read)}"
 
 
-RUN_ONE = Hook(
-    "lerobot.scripts.lerobot_eval",
-    "run_one",
-    ("policy", "n_episodes", "max_episodes_rendered", "videos_dir", "start_seed", "recording_dir"),
-    "run given episodes of a task, and render none",
-    "LeRobot runs a task's episodes from the first on, and renders ten of them a second time",
-    caller="lerobot.scripts.lerobot_eval",
-    by_name=("policy", "n_episodes", "max_episodes_rendered", "videos_dir", "start_seed", "recording_dir"),
-)
-ROLLOUT = Hook(
-    "lerobot.scripts.lerobot_eval",
-    "rollout",
-    ("env", "policy", "seeds"),
-    "seed each batch of episodes by itself, and draw only the observations that a policy needs",
-    "LeRobot seeds once per run, so a resumed run would draw other numbers, and it draws every picture",
-    caller="lerobot.scripts.lerobot_eval",
-    by_name=("env", "policy", "seeds"),
-)
-INSIDE_SLURM = Hook(
-    "lerobot.scripts.lerobot_eval",
-    "inside_slurm",
-    (),
-    "leave progress bars out where the output is no terminal",
-    "LeRobot draws them into log files",
-)
 OPEN_DATASETS = Hook(
     "lerobot.datasets.factory",
     "make_train_eval_datasets",
@@ -171,7 +145,7 @@ GATHER_SHARDS = Hook(
     read=(LEROBOT,),
 )
 HOOKS = (
-    *(RUN_ONE, ROLLOUT, INSIDE_SLURM, OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND),
+    *(OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND),
     *(PREPARE, GATHER_SHARDS),
 )
 
@@ -296,11 +270,8 @@ def table() -> str:
     return "\n".join(["| function | is made to | because | read in |", "|---|---|---|---|", *rows])
 
 
-def check_version(part: str = "evaluation loop") -> None:
-    """Refuse a LeRobot beside those that are supported: it may run other episodes, or unseeded ones.
-
-    Args:
-        part: what is steered, for the message.
+def check_version() -> None:
+    """Refuse a LeRobot beside those that are supported: it may train on other frames.
 
     Raises:
         MemobenchError: it is installed.
@@ -308,7 +279,7 @@ def check_version(part: str = "evaluation loop") -> None:
     found = metadata.version("lerobot")
     if found not in SUPPORTED:
         raise MemobenchError(
-            f"lerobot {found} is installed, and the benchmark steers the {part} of lerobot{SUPPORTED}; install "
+            f"lerobot {found} is installed, and the benchmark steers the training of lerobot{SUPPORTED}; install "
             f"lerobot=={LEROBOT} (make setup)"
         )
     if found not in READ:
@@ -318,24 +289,6 @@ def check_version(part: str = "evaluation loop") -> None:
 @functools.cache
 def _say_unread(found: str) -> None:
     logger.warning("lerobot %s was not tried with this version; tried: %s", found, ", ".join(READ))
-
-
-def is_read(function: Function, known: Collection[str]) -> bool:
-    """Return whether a function is one that was read, whatever decorators lie around it.
-
-    Args:
-        known: `digest` of each that was.
-    """
-    return digest(function) in known
-
-
-def digest(function: Function) -> str | None:
-    """Return the first digits of the hash of a function's source; None where it has none."""
-    try:
-        source = inspect.getsource(inspect.unwrap(function))
-    except (OSError, TypeError):
-        return None
-    return hashlib.sha256(source.encode()).hexdigest()[:12]
 
 
 def _advice(hook: Hook) -> str:

@@ -1,117 +1,96 @@
-"""LeRobot's evaluation without LeRobot's policy and the simulator: what its loop would leave in the log."""
+"""The evaluation loop without a policy and a simulator: it writes the log that they would leave."""
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
-from lerobot_memobench.run.arguments import flag_value
+from lerobot_memobench.run.plan import Cell, EvaluationPlan
 from lerobot_memobench.tasks.catalogue import load_task
+from lerobot_memobench.tasks.task import Task
 
 
 class Killed(Exception):
     """The run ends here."""
 
 
-class FakeLeRobot:
-    """Stands for LeRobot's command and remembers what it was asked for.
+class FakeLoop:
+    """Stands for `run.evaluate.evaluate` and remembers what it was asked for.
 
     Attributes:
-        calls: flags of each call.
+        plans: of each call. cells: batches of each call.
         ran: (task, episode) simulated, in order.
         kill_after: the run ends when so many more episodes are logged.
         changed: fields that records get instead of their usual ones.
+        before: called with the plan when a call begins.
     """
 
     killed = Killed
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        from lerobot.scripts import lerobot_eval  # late: tests of other commands need not wait for it
-
-        self.calls: list[list[str]] = []
+    def __init__(self) -> None:
+        self.plans: list[EvaluationPlan] = []
+        self.cells: list[Sequence[Cell]] = []
         self.ran: list[tuple[str, int]] = []
         self.kill_after: int | None = None
         self.changed: dict[str, Any] = {}
+        self.before: Callable[[EvaluationPlan], object] = lambda plan: None
 
-        def main() -> None:
-            self.evaluate(sys.argv[1:])
+    def __call__(self, plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: Any) -> None:
+        self.plans.append(plan)
+        self.cells.append(cells)
+        begin()
+        self.before(plan)
+        log = EpisodeLog(plan.log, plan.environment.agreed_settings)
+        logged = read_episodes(plan.log) if has_log(plan.log) else []
+        skipped = {(record["task"], record["episode"]) for record in logged}
+        for cell in cells:
+            for name, episode in plan.grid.episodes(cell):
+                if (name, episode) in skipped:
+                    continue
+                if self.kill_after is not None:
+                    if self.kill_after == 0:
+                        raise Killed
+                    self.kill_after -= 1
+                self.ran.append((name, episode))
+                log.append(self.record(load_task(cell[0].folder), episode, plan.environment.seed_base + episode))
+            advance(cell[0], len(plan.grid.episodes(cell)))
 
-        main.__module__ = lerobot_eval.__name__
-        monkeypatch.setattr(lerobot_eval, "main", main)
-        monkeypatch.setattr(lerobot_eval, "run_one", self.run_one)
+    def value(self, key: str) -> str | None:
+        """Return what the last plan says of one of LeRobot's settings."""
+        plan = self.plans[-1]
+        return {"output_dir": str(plan.output), "env.log_dir": str(plan.log)}.get(key, plan.arguments.get(key))
 
-    def evaluate(self, flags: list[str]) -> None:
-        from lerobot.scripts import lerobot_eval
-
-        from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-
-        self.calls.append(flags)
-        names = {"horizon": int, "seed_base": int, "referent": str, "tasks": str, "task": str, "log_dir": str}
-        given = {name: flag_value(flags, f"env.{name}") for name in names}
-        config = MemobenchEnvConfig(**{key: names[key](value) for key, value in given.items() if value is not None})
-        self.log = EpisodeLog(config.resolved_log_dir(), config.agreed_settings)
-        self.resume = flag_value(flags, "env.resume") == "true"
-        self.base = config.seed_base
-        self.batch = int(flag_value(flags, "eval.batch_size") or 1)
-        output = Path(flag_value(flags, "output_dir") or "")
-        for suite, number, folder in config.selected():
-            self.task = load_task(folder)
-            lerobot_eval.run_one(
-                suite,
-                number,
-                None,
-                n_episodes=int(flag_value(flags, "eval.n_episodes") or 0),
-                start_seed=int(flag_value(flags, "seed") or 0),
-                videos_dir=output / "videos",
-            )
-        output.mkdir(parents=True, exist_ok=True)
-        (output / "eval_info.json").write_text("{}")
-
-    def run_one(self, suite: str, number: int, env: Any, **settings: Any) -> Any:
-        """Log the episodes of whole batches, but for those that the environment leaves out."""
-        count = -(-settings["n_episodes"] // self.batch) * self.batch
-        logged = read_episodes(self.log.directory) if self.resume and has_log(self.log.directory) else []
-        skipped = {record["episode"] for record in logged if record["task"] == self.task.name}
-        for seed in range(settings["start_seed"], settings["start_seed"] + count):
-            if seed - self.base in skipped:
-                continue
-            if self.kill_after is not None:
-                if self.kill_after == 0:
-                    raise Killed
-                self.kill_after -= 1
-            self.ran.append((self.task.name, seed - self.base))
-            self.log.append(self.record(seed))
-        return suite, number, {"successes": [True] * count}
-
-    def record(self, seed: int) -> dict[str, Any]:
+    def record(self, task: Task, episode: int, seed: int) -> dict[str, Any]:
         return {
-            "task": self.task.name,
-            "memory_type": self.task.memory_type,
-            "episode": seed - self.base,
+            "task": task.name,
+            "memory_type": task.memory_type,
+            "episode": episode,
             "seed": seed,
             "referent": "fixed",
             "replan_steps": None,
             "success": seed % 2 == 1,
             "steps": 100 + seed,
             "checkpoints": [
-                {"operation": c.operation, "first_step": seed, "ordered_step": seed} for c in self.task.checkpoints
+                {"operation": c.operation, "first_step": seed, "ordered_step": seed} for c in task.checkpoints
             ],
             "failure": None if seed % 2 else "storage_failure",
-            "scene_hash": f"{self.task.name[:4]}{seed:012d}",
+            "scene_hash": f"{task.name[:4]}{seed:012d}",
             "wall_s": 1.0,
             **self.changed,
         }
 
 
 @pytest.fixture
-def fake_lerobot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLeRobot:
-    """LeRobot is replaced, and the present folder is an empty one."""
+def fake_loop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLoop:
+    """The loop is replaced, and the present folder is an empty one."""
     import lerobot_policy_memobench  # noqa: F401 - what LeRobot would find by looking through all that is installed
 
     monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
     monkeypatch.chdir(tmp_path)
-    return FakeLeRobot(monkeypatch)
+    fake = FakeLoop()
+    monkeypatch.setattr("lerobot_memobench.run.run.evaluate", fake)
+    return fake

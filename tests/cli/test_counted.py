@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.sealed import RUN_FILE, user_ledger
 
 COMMAND = ["test-sealed", "policy=memobench_random", "tasks=turn_on_the_stove_and_turn_it_off", "episodes=2"]
 
 
 @pytest.fixture(autouse=True)
-def ledger(fake_lerobot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def ledger(fake_loop: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
 
@@ -30,20 +31,23 @@ def number(folder: str) -> int:
 
 
 def test_a_run_that_ends_before_its_first_scene_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_weights(*asked: object) -> None:
+        raise MemobenchError("the weights cannot be loaded")
+
     with monkeypatch.context() as patch:
-        patch.setattr("lerobot_memobench.run.run.call_lerobot", lambda command, flags: 1)
-        assert main([*COMMAND, "output_dir=a"]) == 1
+        patch.setattr("lerobot_memobench.run.run.evaluate", no_weights)
+        assert main([*COMMAND, "output_dir=a"]) == 2
     assert lines() == 0
     assert not Path("a").exists()
     assert main([*COMMAND, "output_dir=a"]) == 0
     assert (lines(), number("a")) == (1, 1)
 
 
-def test_going_on_is_the_same_start_and_running_again_another(fake_lerobot: Any) -> None:
-    fake_lerobot.kill_after = 1
-    with pytest.raises(fake_lerobot.killed):
+def test_going_on_is_the_same_start_and_running_again_another(fake_loop: Any) -> None:
+    fake_loop.kill_after = 1
+    with pytest.raises(fake_loop.killed):
         main([*COMMAND, "output_dir=a"])
-    fake_lerobot.kill_after = None
+    fake_loop.kill_after = None
     assert main([*COMMAND, "output_dir=a", "resume=true"]) == 0
     assert main([*COMMAND, "output_dir=a", "resume=true"]) == 0  # nothing is left to run
     assert (lines(), number("a")) == (1, 1)

@@ -32,7 +32,7 @@ def comparable(folder: str) -> list[dict[str, Any]]:
 # --- merge ---
 
 
-def test_merged_parts_are_the_whole(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_merged_parts_are_the_whole(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert lerobot([*COMMAND, "output_dir=whole"]) == 0
     assert lerobot([*COMMAND, "output_dir=out", "shard=1/2"]) == 0
     capsys.readouterr()
@@ -47,13 +47,13 @@ def test_merged_parts_are_the_whole(fake_lerobot: Any, capsys: pytest.CaptureFix
         == json.loads(Path("whole/card.json").read_text())["episodes"]
     )
     # What was merged can be gone on with like any other evaluation.
-    fake_lerobot.ran.clear()
+    fake_loop.ran.clear()
     assert lerobot([*COMMAND[:3], "episodes=6", "output_dir=out", "resume=true"]) == 0
-    assert fake_lerobot.ran == [(STOVE, 4), (STOVE, 5), (DRAWER, 4), (DRAWER, 5)]
+    assert fake_loop.ran == [(STOVE, 4), (STOVE, 5), (DRAWER, 4), (DRAWER, 5)]
     assert len(read_episodes("out")) == 12
 
 
-def test_folders_can_be_named(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folders_can_be_named(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     for number in (1, 2):
         assert lerobot([*COMMAND, f"output_dir=machine{number}", f"shard={number}/2"]) == 0
     folders = [f"machine{number}/shard-{number}-of-2" for number in (1, 2)]
@@ -61,7 +61,7 @@ def test_folders_can_be_named(fake_lerobot: Any, capsys: pytest.CaptureFixture[s
     assert len(read_episodes("out")) == 8
     assert memobench(["merge", "empty"]) == 2
     assert "name the folders" in capsys.readouterr().err
-    fake_lerobot.changed = {"scene_hash": "another"}
+    fake_loop.changed = {"scene_hash": "another"}
     assert lerobot([*COMMAND, "output_dir=wrong", "shard=2/2"]) == 0
     assert memobench(["merge", "out", folders[0], "wrong/shard-2-of-2"]) == 2
     assert "scene_hash" in capsys.readouterr().err
@@ -70,20 +70,20 @@ def test_folders_can_be_named(fake_lerobot: Any, capsys: pytest.CaptureFixture[s
 # --- rerun ---
 
 
-def test_a_card_is_repeated(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_card_is_repeated(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert lerobot([*COMMAND, "output_dir=out", "seed=9", "horizon=600"]) == 0
-    first = [flag for flag in fake_lerobot.calls[0] if "out" not in flag]
+    first = fake_loop.plans[0].portable_flags
     assert memobench(["rerun", "out/card.json", "--out", "again"]) == 0
     assert "repeated: 8 episodes, as on the card" in capsys.readouterr().out
-    assert [flag for flag in fake_lerobot.calls[1] if "again" not in flag] == first
+    assert fake_loop.plans[1].portable_flags == first
     assert memobench(["rerun", "out", "--out", "folder"]) == 0
-    fake_lerobot.changed = {"steps": 5}
+    fake_loop.changed = {"steps": 5}
     assert memobench(["rerun", "out", "--out", "changed"]) == 1
     out = capsys.readouterr().out.replace("\n", " ")
     assert f"not repeated: {DRAWER}, episode 0: steps is 109 on the card and 5 here" in out
 
 
-def test_without_pictures_nothing_to_draw_with_is_needed(fake_lerobot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pictures_nothing_to_draw_with_is_needed(fake_loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -92,11 +92,11 @@ def test_without_pictures_nothing_to_draw_with_is_needed(fake_lerobot: Any, monk
     assert memobench(["rerun", "out", "--out", "again"]) == 0
 
 
-def test_a_part_alone_is_repeated_as_a_part(fake_lerobot: Any) -> None:
+def test_a_part_alone_is_repeated_as_a_part(fake_loop: Any) -> None:
     assert lerobot([*COMMAND, "output_dir=out", "shard=2/2"]) == 0
-    fake_lerobot.ran.clear()
+    fake_loop.ran.clear()
     assert memobench(["rerun", "out/shard-2-of-2/card.json", "--out", "again"]) == 0
-    assert fake_lerobot.ran == [(DRAWER, k) for k in range(4)]
+    assert fake_loop.ran == [(DRAWER, k) for k in range(4)]
 
 
 INCOMPLETE = {
@@ -109,7 +109,7 @@ INCOMPLETE = {
 
 
 @pytest.mark.parametrize("change", INCOMPLETE)
-def test_a_card_is_repeated_only_with_the_outcome_of_every_episode(fake_lerobot: Any, change: str, capsys: Any) -> None:
+def test_a_card_is_repeated_only_with_the_outcome_of_every_episode(fake_loop: Any, change: str, capsys: Any) -> None:
     assert lerobot([*COMMAND, "output_dir=out"]) == 0
     card = json.loads(Path("out/card.json").read_text())
     card["episodes"] = INCOMPLETE[change](card["episodes"])
@@ -121,7 +121,7 @@ def test_a_card_is_repeated_only_with_the_outcome_of_every_episode(fake_lerobot:
     assert Path("again").exists() == (status == 1), "an incomplete card runs nothing"
 
 
-def test_other_versions_are_told(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_versions_are_told(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert lerobot([*COMMAND, "output_dir=out"]) == 0
     card = json.loads(Path("out/card.json").read_text())
     card["runs"][0]["versions"]["mujoco"] = "0.1"
@@ -130,7 +130,7 @@ def test_other_versions_are_told(fake_lerobot: Any, capsys: pytest.CaptureFixtur
     assert "note: the card's run used mujoco 0.1 (here " in capsys.readouterr().out
 
 
-def test_another_or_no_checkpoint_is_refused(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_or_no_checkpoint_is_refused(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     folder = Path("checkpoint")
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps({"type": "memobench_random", "device": "cpu"}))
@@ -149,9 +149,9 @@ def test_another_or_no_checkpoint_is_refused(fake_lerobot: Any, capsys: pytest.C
     assert not Path("other").exists()
 
 
-def test_a_card_of_an_unfinished_evaluation(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    fake_lerobot.kill_after = 1
-    with pytest.raises(fake_lerobot.killed):
+def test_a_card_of_an_unfinished_evaluation(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    fake_loop.kill_after = 1
+    with pytest.raises(fake_loop.killed):
         lerobot([*COMMAND, "output_dir=out"])
     assert memobench(["rerun", "out"]) == 2
     assert "has ended" in capsys.readouterr().err
@@ -161,14 +161,14 @@ def test_a_card_of_an_unfinished_evaluation(fake_lerobot: Any, capsys: pytest.Ca
 
 
 @pytest.fixture
-def here(fake_lerobot: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+def here(fake_loop: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Parts run in the process that asks for them."""
 
     def run(job: shards.ShardJob) -> None:
         assert lerobot(job.arguments) == 0
 
     monkeypatch.setattr(shards.ShardJob, "run", run)
-    return fake_lerobot
+    return fake_loop
 
 
 def test_parts_as_jobs(here: Any, capsys: pytest.CaptureFixture[str]) -> None:

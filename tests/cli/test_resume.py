@@ -23,12 +23,12 @@ def evaluate(*words: str) -> int:
     return main([*COMMAND, *words])
 
 
-def killed_after(fake_lerobot: Any, count: int, *words: str) -> None:
-    fake_lerobot.kill_after = count
-    with pytest.raises(fake_lerobot.killed):
+def killed_after(fake_loop: Any, count: int, *words: str) -> None:
+    fake_loop.kill_after = count
+    with pytest.raises(fake_loop.killed):
         evaluate(*words)
-    fake_lerobot.kill_after = None
-    fake_lerobot.ran.clear()
+    fake_loop.kill_after = None
+    fake_loop.ran.clear()
 
 
 def comparable(folder: str) -> list[dict[str, Any]]:
@@ -36,65 +36,62 @@ def comparable(folder: str) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 7])
-def test_only_the_missing_episodes_are_run(fake_lerobot: Any, count: int) -> None:
+def test_only_the_missing_episodes_are_run(fake_loop: Any, count: int) -> None:
     assert evaluate("output_dir=whole") == 0
-    killed_after(fake_lerobot, count, "output_dir=out")
+    killed_after(fake_loop, count, "output_dir=out")
     assert evaluate("output_dir=out", "resume=true") == 0
-    assert fake_lerobot.ran == ALL[count:]
+    assert fake_loop.ran == ALL[count:]
     assert comparable("out") == comparable("whole")
     whole, out = (json.loads(Path(name, "card.json").read_text()) for name in ("whole", "out"))
     assert out["episodes"] == whole["episodes"]
     assert json.loads(Path("out/report.json").read_text()) == json.loads(Path("whole/report.json").read_text())
-    # LeRobot's own files of the first run are not written over.
-    assert Path("out/continued-1/eval_info.json").is_file()
-    assert "--env.resume=true" in fake_lerobot.calls[-1]
+    whole_info, info = (json.loads(Path(name, "eval_info.json").read_text()) for name in ("whole", "out"))
+    assert info == whole_info
+    assert info["overall"]["n_episodes"] == len(ALL)
 
 
-def test_finished_tasks_are_not_opened_again(fake_lerobot: Any) -> None:
-    killed_after(fake_lerobot, 5, "output_dir=out")
+def test_finished_tasks_are_not_opened_again(fake_loop: Any) -> None:
+    killed_after(fake_loop, 5, "output_dir=out")
     assert evaluate("output_dir=out", "resume=true") == 0
-    assert f"--env.tasks={DRAWER}" in fake_lerobot.calls[-1]
+    assert {task.name for task, _ in fake_loop.cells[-1]} == {DRAWER}
 
 
-def test_a_complete_evaluation_only_prints_its_report(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_complete_evaluation_only_prints_its_report(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert evaluate("output_dir=out") == 0
-    calls, card = len(fake_lerobot.calls), Path("out/card.json").read_text()
+    calls, card = len(fake_loop.plans), Path("out/card.json").read_text()
     capsys.readouterr()
     assert evaluate("output_dir=out", "resume=true") == 0
-    assert len(fake_lerobot.calls) == calls
+    assert len(fake_loop.plans) == calls
     assert STOVE in capsys.readouterr().out
     assert json.loads(Path("out/card.json").read_text())["episodes"] == json.loads(card)["episodes"]
 
 
-def test_a_folder_without_an_evaluation_is_begun(fake_lerobot: Any) -> None:
+def test_a_folder_without_an_evaluation_is_begun(fake_loop: Any) -> None:
     assert evaluate("output_dir=out", "resume=true") == 0
-    assert fake_lerobot.ran == ALL
-    assert not Path("out/continued-1").exists()
+    assert fake_loop.ran == ALL
 
 
-def test_without_resume_an_earlier_evaluation_is_left_alone(
-    fake_lerobot: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    killed_after(fake_lerobot, 3, "output_dir=out")
+def test_without_resume_an_earlier_evaluation_is_left_alone(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    killed_after(fake_loop, 3, "output_dir=out")
     assert "resume=true output_dir=out" in capsys.readouterr().err
     assert evaluate("output_dir=out") == 2
     assert "resume=true" in capsys.readouterr().err
 
 
-def test_more_episodes_and_tasks_may_follow(fake_lerobot: Any) -> None:
+def test_more_episodes_and_tasks_may_follow(fake_loop: Any) -> None:
     assert evaluate("output_dir=out") == 0
-    fake_lerobot.ran.clear()
+    fake_loop.ran.clear()
     wider = "check_the_middle_drawer_of_the_cabinet"
     assert evaluate("output_dir=out", "resume=true", "episodes=6", f"tasks={DRAWER},{wider}") == 0
-    assert fake_lerobot.ran == [(DRAWER, 4), (DRAWER, 5), *((wider, k) for k in range(6))]
+    assert fake_loop.ran == [(DRAWER, 4), (DRAWER, 5), *((wider, k) for k in range(6))]
     card = json.loads(Path("out/card.json").read_text())
     assert card["protocol"]["tasks"] == sorted([STOVE, DRAWER, wider])
     assert card["protocol"]["episodes"] == 6
     assert "--eval.n_episodes=6" in card["flags"]
     assert f"--env.tasks={','.join(card['protocol']['tasks'])}" in card["flags"]
-    fake_lerobot.ran.clear()
+    fake_loop.ran.clear()
     assert evaluate("output_dir=out", "resume=true", "episodes=2") == 0  # less than is there: nothing to do, all stays
-    assert fake_lerobot.ran == []
+    assert fake_loop.ran == []
     assert len(json.loads(Path("out/card.json").read_text())["episodes"]) == 16
     assert len(Path("out/episodes.jsonl").read_text().splitlines()) == 16
 
@@ -115,22 +112,22 @@ def test_more_episodes_and_tasks_may_follow(fake_lerobot: Any) -> None:
     ],
 )
 def test_another_protocol_is_refused(
-    fake_lerobot: Any, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+    fake_loop: Any, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
-    killed_after(fake_lerobot, 3, "output_dir=out")
+    killed_after(fake_loop, 3, "output_dir=out")
     before = {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
     capsys.readouterr()
     assert evaluate("output_dir=out", "resume=true", *words) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
-    assert fake_lerobot.ran == []
+    assert fake_loop.ran == []
     assert before == {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
 
 
-def test_other_weights_are_refused(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_weights_are_refused(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     policy = random_checkpoint(Path("checkpoint"))
-    killed_after(fake_lerobot, 3, "output_dir=out", f"policy={policy}")
+    killed_after(fake_loop, 3, "output_dir=out", f"policy={policy}")
     save_file({"weight": torch.ones(1)}, policy / "model.safetensors")
     capsys.readouterr()
     assert evaluate("output_dir=out", "resume=true", f"policy={policy}") == 2
@@ -150,29 +147,29 @@ def random_checkpoint(folder: Path) -> Path:
     return folder
 
 
-def test_the_batch_size_is_kept(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    killed_after(fake_lerobot, 3, "output_dir=out")
+def test_the_batch_size_is_kept(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    killed_after(fake_loop, 3, "output_dir=out")
     words = [word for word in COMMAND if not word.startswith("batch_size")]
     assert main([*words, "output_dir=out", "resume=true"]) == 0
-    assert "--eval.batch_size=2" in fake_lerobot.calls[-1]
-    killed_after(fake_lerobot, 3, "output_dir=other")
+    assert fake_loop.plans[-1].batch == 2
+    killed_after(fake_loop, 3, "output_dir=other")
     capsys.readouterr()
     assert main([*words, "output_dir=other", "resume=true", "batch_size=1"]) == 0
     assert "batch_size: 2 and 1" in capsys.readouterr().err
 
 
-def test_a_log_of_plain_lerobot_eval_is_gone_on_with(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    killed_after(fake_lerobot, 3, "output_dir=out")
+def test_a_log_of_plain_lerobot_eval_is_gone_on_with(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    killed_after(fake_loop, 3, "output_dir=out")
     for name in ("card.json", "card.md"):
         Path("out", name).unlink()
     capsys.readouterr()
     assert evaluate("output_dir=out", "resume=true") == 0
     assert "cannot be checked" in capsys.readouterr().err
-    assert fake_lerobot.ran == ALL[3:]
+    assert fake_loop.ran == ALL[3:]
 
 
-def test_drafts_of_a_killed_run_are_removed(fake_lerobot: Any) -> None:
-    killed_after(fake_lerobot, 3, "output_dir=out")
+def test_drafts_of_a_killed_run_are_removed(fake_loop: Any) -> None:
+    killed_after(fake_loop, 3, "output_dir=out")
     drafts = [Path("out/.77-ab.part.card.json"), Path("out/videos/.77-ab.part.film.mp4")]
     drafts[-1].parent.mkdir(parents=True, exist_ok=True)
     for draft in drafts:
@@ -181,20 +178,13 @@ def test_drafts_of_a_killed_run_are_removed(fake_lerobot: Any) -> None:
     assert not [draft for draft in drafts if draft.exists()]
 
 
-def test_two_runs_in_one_folder(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_runs_in_one_folder(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     inner: list[int] = []
-    usual = fake_lerobot.evaluate
-
-    def both(flags: list[str]) -> None:
-        if not inner:
-            inner.append(evaluate("output_dir=out", "resume=true"))
-        usual(flags)
-
-    fake_lerobot.evaluate = both
+    fake_loop.before = lambda plan: inner.append(evaluate("output_dir=out", "resume=true"))
     assert evaluate("output_dir=out") == 0
     assert inner == [2]
     assert "another run is writing to out" in capsys.readouterr().err
-    assert fake_lerobot.ran == ALL
+    assert fake_loop.ran == ALL
 
 
 @pytest.mark.parametrize(
@@ -209,17 +199,17 @@ def test_two_runs_in_one_folder(fake_lerobot: Any, capsys: pytest.CaptureFixture
     ],
 )
 def test_what_cannot_be_asked_for(
-    fake_lerobot: Any, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+    fake_loop: Any, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
     assert evaluate(*words) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
-    assert not fake_lerobot.calls
+    assert not fake_loop.plans
     assert not Path("out").exists()
 
 
-def test_other_environments_are_not_ours_to_resume(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_environments_are_not_ours_to_resume(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", "env=pusht", "policy=act", "resume=true"]) == 2
     assert "env=memobench" in capsys.readouterr().err
 
@@ -227,32 +217,32 @@ def test_other_environments_are_not_ours_to_resume(fake_lerobot: Any, capsys: py
 # --- parts ---
 
 
-def test_parts_make_up_the_whole(fake_lerobot: Any) -> None:
+def test_parts_make_up_the_whole(fake_loop: Any) -> None:
     assert evaluate("output_dir=whole") == 0
     for number in (1, 2, 3):
-        fake_lerobot.ran.clear()
+        fake_loop.ran.clear()
         assert evaluate("output_dir=out", f"shard={number}/3") == 0
-        assert fake_lerobot.ran == [ALL[:2], ALL[2:4], ALL[4:]][number - 1]
+        assert fake_loop.ran == [ALL[:2], ALL[2:4], ALL[4:]][number - 1]
     assert [path.name for path in sorted(Path("out").iterdir())] == [f"shard-{k}-of-3" for k in (1, 2, 3)]
     assert json.loads(Path("out/shard-2-of-3/card.json").read_text())["shard"] == "2/3"
 
 
-def test_a_part_is_gone_on_with_as_well(fake_lerobot: Any) -> None:
-    killed_after(fake_lerobot, 1, "output_dir=out", "shard=2/2")
+def test_a_part_is_gone_on_with_as_well(fake_loop: Any) -> None:
+    killed_after(fake_loop, 1, "output_dir=out", "shard=2/2")
     assert evaluate("output_dir=out", "shard=2/2", "resume=true") == 0
-    assert fake_lerobot.ran == ALL[5:]
-    fake_lerobot.ran.clear()
+    assert fake_loop.ran == ALL[5:]
+    fake_loop.ran.clear()
     assert evaluate("output_dir=out", "shard=2/2", "resume=true") == 0
-    assert fake_lerobot.ran == []
+    assert fake_loop.ran == []
 
 
-def test_more_parts_than_batches(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_more_parts_than_batches(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert evaluate("output_dir=out", "shard=1/5") == 0
     assert "holds no episode" in capsys.readouterr().out
     assert not Path("out").exists()
 
 
-def test_parts_do_not_depend_on_the_cores_of_a_machine(fake_lerobot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_do_not_depend_on_the_cores_of_a_machine(fake_loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [word for word in COMMAND if not word.startswith("batch_size")]
     for cores in (2, 64):
         monkeypatch.setattr("lerobot_memobench.run.plan.cores", lambda cores=cores: cores)
@@ -260,7 +250,7 @@ def test_parts_do_not_depend_on_the_cores_of_a_machine(fake_lerobot: Any, monkey
     assert comparable("out2/shard-2-of-3") == comparable("out64/shard-2-of-3")
 
 
-def test_a_foreign_log_in_the_folder_of_a_part(fake_lerobot: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_foreign_log_in_the_folder_of_a_part(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     record = {"task": STOVE, "memory_type": "temporal", "episode": 0, "success": True, "checkpoints": []}
     EpisodeLog("out/shard-1-of-2").append(record)
     assert evaluate("output_dir=out", "shard=1/2") == 2

@@ -12,16 +12,14 @@ import draccus
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchBlindConfig, MemobenchRandomConfig
 from lerobot_memobench.policies.checkpoint import shipped_policies
-from lerobot_memobench.run.arguments import LerobotArguments, flag_value, read_arguments, split_arguments
+from lerobot_memobench.run.arguments import LerobotArguments, read_arguments, split_arguments
 from lerobot_memobench.run.card import card_of
 from lerobot_memobench.run.plan import (
     EvaluationPlan,
@@ -33,7 +31,6 @@ from lerobot_memobench.run.plan import (
     policy_config,
     take_run_options,
 )
-from lerobot_memobench.run.run import remainder
 from lerobot_memobench.run.shards import executor_options, plan_shards
 from lerobot_memobench.sim import robot
 
@@ -58,7 +55,6 @@ def test_a_plan_says_everything() -> None:
     assert plan.grid is not None
     assert [task.name for task in plan.grid.tasks] == [STOVE, DRAWER]
     assert (plan.grid.runs, plan.grid.batch, plan.grid.first) == (4, 2, 0)
-    assert flag_value(plan.lerobot_flags, "output_dir") == "out/shard-2-of-3"
     assert not any("out" in flag for flag in plan.portable_flags)
     assert not any(Path().iterdir())  # planning writes nothing
 
@@ -144,7 +140,7 @@ def test_only_high_needs_a_gl_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert plan_line([*LINE, "videos=1"]).draws
     plan = plan_line([*LINE, f"obs_type={OBJECTS}", "env.render=high"])
-    assert flag_value(plan.lerobot_flags, "env.videos") == "0"
+    assert plan.environment.videos == 0
     assert card_of(plan)["runs"][0]["gl"] == {}
     for words in (
         [],
@@ -197,22 +193,6 @@ def test_ten_episodes_are_filmed_unless_another_number_is_given() -> None:
         environment = plan_line([*LINE, *words]).environment
         assert environment is not None
         assert environment.videos == videos
-
-
-def test_what_is_left_is_a_plan_of_its_own() -> None:
-    plan = plan_line([*LINE, "output_dir=out", "resume=true"])
-    before = dataclasses.replace(plan)
-    record = {"task": STOVE, "memory_type": "temporal", "episode": 0, "success": True, "checkpoints": []}
-    EpisodeLog("out").append(record)
-    assert plan.grid is not None
-    drawer = plan.grid.tasks[1]
-    left = remainder(plan, {drawer.key: [(0, 4)]})
-    assert left.output == Path("out/continued-1")
-    assert left.log == Path("out")
-    assert flag_value(left.lerobot_flags, "env.tasks") == DRAWER
-    assert flag_value(left.lerobot_flags, "env.resume") == "true"
-    assert plan == before
-    assert remainder(plan, None) is plan
 
 
 def test_going_on_needs_a_folder() -> None:
@@ -370,7 +350,17 @@ def test_a_policy_of_another_package_is_known(tmp_path: Path, monkeypatch: pytes
 
 def evaluation(*flags: str) -> EvaluationPlan:
     return EvaluationPlan(
-        LerobotArguments(flags), None, None, None, Path("out"), Path("log"), 7, 1, RunOptions(), ("lerobot", "eval")
+        LerobotArguments(flags),
+        None,
+        None,
+        None,
+        None,
+        Path("out"),
+        Path("log"),
+        7,
+        1,
+        RunOptions(),
+        ("lerobot", "eval"),
     )
 
 
@@ -380,8 +370,6 @@ def test_flags_are_complete_but_for_what_is_written(tmp_path: Path, monkeypatch:
     asked = evaluation("--policy.path=checkpoint", "--seed=7", "--env.videos=-1")
     assert asked.portable_flags == ["--seed=7", "--env.videos=-1", f"--policy.path={tmp_path / 'checkpoint'}"]
     assert evaluation("--policy.path=user/name").portable_flags == ["--policy.path=user/name"]  # a repository stays one
-    given = ["--policy.path=checkpoint", "--seed=7", "--env.videos=-1"]
-    assert asked.lerobot_flags == [*given, "--output_dir=out", "--env.log_dir=log"]
 
 
 NAMES = ("run #2", "2026-11-28", "20261128", "007", "on", "run: 2", "obj [v2]", "1e3", "NaN", "!x", "'a'", " x ", "é")
@@ -390,11 +378,8 @@ NAMES = ("run #2", "2026-11-28", "20261128", "007", "on", "run: 2", "obj [v2]", 
 @pytest.mark.parametrize("name", [*NAMES, "included", "include x"])
 def test_a_name_arrives_as_it_is_typed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """As LeRobot's commands parse it: by YAML, and the settings of a checkpoint's policy by JSON."""
-    flags = plan_line([*LINE, f"output_dir={name}"]).lerobot_flags
-    monkeypatch.setattr("sys.argv", ["lerobot-eval", *flags])
-    found = draccus.parse(EvalPipelineConfig, args=flags)
-    assert isinstance(found.env, MemobenchEnvConfig)
-    assert (found.output_dir, Path(found.env.log_dir or "")) == (Path(name), Path(name))
+    plan = plan_line([*LINE, f"output_dir={name}", f"env.log_dir={name}"])
+    assert (plan.output, plan.log) == (Path(name), Path(name))
     Path(name).mkdir()
     line = ["policy=memobench_small", f"dataset={name}", f"output_dir={name}", f"policy.repo_id=user/{name}"]
     arguments = read_arguments("train", split_arguments(line))
@@ -469,20 +454,11 @@ def grid(tasks: str = "ab", runs: int = 10, batch: int = 4, first: int = 0) -> G
     return Grid(tuple(PlannedTask("temporal", k, Path(name)) for k, name in enumerate(tasks)), runs, batch, first)
 
 
-def test_a_whole_evaluation_is_one_range_per_task() -> None:
-    assert grid().ranges(grid().cells()) == {("temporal", 0): [(0, 10)], ("temporal", 1): [(0, 10)]}
-
-
 def test_batches_are_not_taken_apart() -> None:
     done = {("a", k) for k in range(10)} - {("a", 5)} | {("b", k) for k in range(4)}
     left = grid().missing(done)
     assert [(task.name, number) for task, number in left] == [("a", 1), ("b", 1), ("b", 2)]
-    assert grid().ranges(left) == {("temporal", 0): [(4, 4)], ("temporal", 1): [(4, 6)]}
-
-
-def test_holes_are_ranges_of_their_own() -> None:
-    done = {("a", k) for k in range(4, 8)}
-    assert grid("a").ranges(grid("a").missing(done)) == {("temporal", 0): [(0, 4), (8, 2)]}
+    assert [grid().runs_of(number) for _, number in left] == [range(4, 8), range(4, 8), range(8, 10)]
 
 
 def test_nothing_is_left_of_a_complete_evaluation() -> None:
@@ -508,14 +484,12 @@ def test_parts_make_up_the_whole(tasks: int, runs: int, batch: int, count: int, 
     assert episodes == [(name, k) for name in "abcde"[:tasks] for k in range(runs)]
     done = data.draw(st.sets(st.sampled_from(episodes)))
     run = {
-        (whole.tasks[key[1]].name, k)
+        episode
         for number in range(1, count + 1)
-        for key, ranges in whole.ranges(whole.missing(done, Shard(number, count))).items()
-        for start, length in ranges
-        for k in range(start, start + length)
+        for cell in whole.missing(done, Shard(number, count))
+        for episode in whole.episodes(cell)
     }
     assert run | done == set(episodes)
-    assert all(start % whole.batch == 0 for ranges in whole.ranges(whole.missing(done)).values() for start, _ in ranges)
 
 
 def test_parts_have_folders_that_sort() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from lerobot.configs import FeatureType
 from lerobot.envs import make_env_pre_post_processors
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval
+from numpy.typing import NDArray
 
 from lerobot_memobench.envs import episode
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
@@ -21,7 +23,7 @@ from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.memory_reads import find_reads
 from lerobot_memobench.run.memory_reads import ReadLog
-from lerobot_memobench.run.rollout import sparing
+from lerobot_memobench.run.rollout import Actor, roll
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.sim.rendering import close_renderers
 
@@ -72,9 +74,16 @@ def configured(name: str, config: MemobenchEnvConfig, **fields: Any) -> tuple[An
 
 
 def rolled(
-    rollout: Any, rows: int, log: Path, name: str, videos: int = 0, obs_type: str = PIXELS, **fields: Any
-) -> dict[str, torch.Tensor]:
-    """Return what a rollout of a fresh policy in fresh environments returns."""
+    lerobots: bool,
+    rows: int,
+    log: Path,
+    name: str,
+    videos: int = 0,
+    obs_type: str = PIXELS,
+    reads: ReadLog | None = None,
+    **fields: Any,
+) -> NDArray[np.float32]:
+    """Return the actions (rows, steps, 7) of a fresh policy in fresh environments, by LeRobot's loop or ours."""
     torch.manual_seed(7)
     config = MemobenchEnvConfig(
         tasks=HIGHLIGHT,
@@ -89,20 +98,20 @@ def rolled(
     policy, settings = configured(name, config, **fields)
     before, after = make_pre_post_processors(settings, dataset_stats=STATISTICS)
     env_before, env_after = make_env_pre_post_processors(env_cfg=config, policy_cfg=settings)
+    actions, step, seeds = [], env.step, list(range(7, 7 + rows))
+    env.step = lambda action: actions.append(action.copy()) or step(action)
     try:
-        found: dict[str, torch.Tensor] = rollout(
-            env=env,
-            policy=policy.eval(),
-            env_preprocessor=env_before,
-            env_postprocessor=env_after,
-            preprocessor=before,
-            postprocessor=after,
-            seeds=list(range(7, 7 + rows)),
-            render_callback=None,
-        )
+        if lerobots:
+            processors = {"env_preprocessor": env_before, "env_postprocessor": env_after}
+            processors |= {"preprocessor": before, "postprocessor": after}
+            lerobot_eval.rollout(env=env, policy=policy.eval(), seeds=seeds, render_callback=None, **processors)
+        else:
+            actor = Actor(policy.eval(), (env_before, before), (after, env_after))
+            with nullcontext() if reads is None else reads.noting(HIGHLIGHT, policy, seeds) as ended:
+                roll(env, actor, seeds, ended)
     finally:
         env.close()
-    return found
+    return np.stack(actions, axis=1)
 
 
 ACT = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
@@ -121,20 +130,23 @@ CASES: dict[str, tuple[str, dict[str, Any], list[int]]] = {
 }
 
 
+def logged(folder: Path) -> list[dict[str, Any]]:
+    return [{key: value for key, value in line.items() if key != "wall_s"} for line in read_episodes(folder)]
+
+
 @pytest.mark.parametrize("rows", [pytest.param(1, marks=pytest.mark.slow), 2])
 @pytest.mark.parametrize("case", [*CASES, "act"])
 def test_a_rollout_is_lerobots(case: str, rows: int, drawn: list[int], tmp_path: Path) -> None:
     name, fields, looked = CASES.get(case, ("act", ACT, []))
-    theirs = rolled(lerobot_eval.rollout, rows, tmp_path / "theirs", name, **fields)
+    theirs = rolled(True, rows, tmp_path / "theirs", name, **fields)
     everything = len(drawn)
     drawn.clear()
-    ours = rolled(sparing(lerobot_eval.rollout, lambda: True), rows, tmp_path / "ours", name, **fields)
-    assert list(ours) == list(theirs)
-    for key, values in theirs.items():
-        assert ours[key].dtype == values.dtype, key
-        assert torch.equal(ours[key], values), key
-    assert bool(theirs["action"].any())
-    assert everything == rows * (theirs["action"].shape[1] + 1)
+    ours = rolled(False, rows, tmp_path / "ours", name, **fields)
+    assert ours.dtype == theirs.dtype
+    np.testing.assert_array_equal(ours, theirs)
+    assert theirs.any()
+    assert everything == rows * (theirs.shape[1] + 1)
+    assert logged(tmp_path / "ours") == logged(tmp_path / "theirs")
     if case in CASES:
         assert sorted(drawn) == sorted(rows * looked)
     else:  # whether it sees the prompt is the environment's to say
@@ -171,21 +183,20 @@ DIFFUSION |= {"diffusion_step_embed_dim": 16, "crop_shape": (84, 84), "pretraine
 def test_a_rollout_on_objects_is_lerobots(
     name: str, fields: dict[str, Any], spares: bool, obs_type: str, drawn: list[int], found: list[int], tmp_path: Path
 ) -> None:
-    theirs = rolled(lerobot_eval.rollout, 2, tmp_path / "theirs", name, obs_type=obs_type, **fields)
-    everything = 2 * (theirs["action"].shape[1] + 1)
+    theirs = rolled(True, 2, tmp_path / "theirs", name, obs_type=obs_type, **fields)
+    everything = 2 * (theirs.shape[1] + 1)
     assert len(found) == everything
     assert len(drawn) == (0 if obs_type == OBJECTS else everything)
     found.clear()
-    ours = rolled(sparing(lerobot_eval.rollout, lambda: True), 2, tmp_path / "ours", name, obs_type=obs_type, **fields)
-    for key, values in theirs.items():
-        assert torch.equal(ours[key], values), key
-    assert bool(theirs["action"].any())
+    ours = rolled(False, 2, tmp_path / "ours", name, obs_type=obs_type, **fields)
+    np.testing.assert_array_equal(ours, theirs)
+    assert theirs.any()
     assert (len(found) < everything) == spares
 
 
 def test_a_memory_of_pictures_refuses_to_be_shown_objects_alone(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"no picture, .* set env.obs_type=pixels_agent_pos, or"):
-        rolled(lerobot_eval.rollout, 1, tmp_path, "memobench_mem", obs_type=OBJECTS, **MEMORY)
+        rolled(False, 1, tmp_path, "memobench_mem", obs_type=OBJECTS, **MEMORY)
 
 
 @pytest.mark.parametrize("use_async", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -213,7 +224,7 @@ def test_a_recorded_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> 
     from lerobot_memobench.envs.video import LAST_FRAMES
     from lerobot_memobench.evaluation.html.write import frame_count
 
-    rolled(sparing(lerobot_eval.rollout, lambda: True), 3, tmp_path, "memobench_random", videos=2)
+    rolled(False, 3, tmp_path, "memobench_random", videos=2)
     recorded = sorted((tmp_path / "videos").iterdir())
     assert [video.name for video in recorded] == [f"{HIGHLIGHT}.0.mp4", f"{HIGHLIGHT}.1.mp4"]
     assert {frame_count(video) for video in recorded} == {LAST + 1 + LAST_FRAMES}
@@ -233,9 +244,9 @@ def test_the_command_draws_and_records_no_more_than_asked(drawn: list[int], tmp_
 
 def test_what_chunks_read_is_noted_as_each_episode_ends(tmp_path: Path) -> None:
     name, fields, _ = CASES["memory of every fourth"]
-    plain = rolled(sparing(lerobot_eval.rollout, lambda: True), 2, tmp_path / "plain", name, **fields)
-    noting = sparing(lerobot_eval.rollout, lambda: True, ReadLog(tmp_path / "noted", 7, "fixed"))
-    assert torch.equal(rolled(noting, 2, tmp_path / "noted", name, **fields)["action"], plain["action"])
+    plain = rolled(False, 2, tmp_path / "plain", name, **fields)
+    noted = rolled(False, 2, tmp_path / "noted", name, reads=ReadLog(tmp_path / "noted", 7, "fixed"), **fields)
+    np.testing.assert_array_equal(noted, plain)
     records = read_episodes(tmp_path / "noted")
     found, notes = find_reads(tmp_path / "noted", records, {})
     assert notes == []

@@ -44,16 +44,14 @@ def demo(
     )
     from lerobot_memobench.run.run import VIDEOS, run_evaluation
 
-    def one_of_three(name: str, folder: Path) -> int:
-        return run_evaluation(memory_plan(name, folder), tell, say).status
+    def one_of_three(name: str, folder: Path) -> None:
+        run_evaluation(memory_plan(name, folder), tell, say)
 
-    status = make_demo(
+    make_demo(
         out,
         lambda folder: evaluate_here(demo_plan(folder), say_where=False),
         (lambda work, made: compare_memories(work, made, one_of_three)) if has_policies() else None,
     )
-    if status:
-        return status
     if (out / MEMORY_TABLE).is_file():
         console().print(Markdown((out / MEMORY_TABLE).read_text()))
     say(f"report:  {out / REPORT_MARKDOWN}")

@@ -15,7 +15,6 @@ from lerobot_memobench.cli.console import Suite, WhichSuite, console, say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
-from lerobot_memobench.run.arguments import recipe_file, recipes
 from lerobot_memobench.tasks.catalogue import (
     CATALOGUE_DIR,
     find_tasks,
@@ -119,6 +118,8 @@ def recipe(
     name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
 ) -> int:
     """Print the file of a training recipe. As in `lerobot-train --config_path=$(memobench recipe train_paper)`."""
+    from lerobot_memobench.run.arguments import recipe_file, recipes
+
     if name is not None:
         print(recipe_file(name))
         return 0

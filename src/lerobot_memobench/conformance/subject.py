@@ -24,7 +24,7 @@ from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import SHORT_FORMS, read_arguments, split_arguments
 from lerobot_memobench.run.plan import policy_config
-from lerobot_memobench.run.rollout import needs_observation
+from lerobot_memobench.run.rollout import has_planned_action, needs_observation
 from lerobot_memobench.run.training import take_training_options, trained_on
 
 REPLAN = 3
@@ -63,10 +63,11 @@ class Subject:
 
         Args:
             equal_noise: let every row and every call draw the same noise, so that actions can be compared.
-            sparing: give it earlier pictures and objects again where it says that it does not need those of the
-                present, as evaluations do.
+            sparing: give it earlier pictures and objects again where it does not need those of the present, and all
+                but the clock where its next action is planned, as evaluations do.
         """
-        needed, spared = needs_observation(self.policy), dict[str, Tensor]()
+        needed, planned = needs_observation(self.policy), has_planned_action(self.policy)
+        last: dict[str, Any] = {}
         answers = []
         self.policy.reset()
         with EqualNoise() if equal_noise else nullcontext():
@@ -74,9 +75,10 @@ class Subject:
                 batch = self._batch(streams, call)
                 begins = any(call in (0, stream.start) for stream in streams)
                 costly = [key for key in batch if key.startswith(("observation.images", OBJECTS_COLUMN))]
-                if sparing and call and not begins and not needed():
-                    batch |= {key: spared[key] for key in costly}
-                spared = {key: batch[key] for key in costly}
+                if sparing and not begins:
+                    kept = [key for key in batch if key not in CLOCK] if planned() else [] if needed() else costly
+                    batch |= {key: last[key] for key in kept}
+                last = batch
                 with torch.inference_mode():
                     action = self.postprocessor(self.policy.select_action(self.preprocessor(batch)))
                 answers.append(action.to("cpu", torch.float32).numpy().copy())

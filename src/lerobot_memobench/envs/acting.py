@@ -17,8 +17,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from lerobot_memobench.envs.command_line import in_file, quiet, training_runs
 from lerobot_memobench.envs.episode_log import INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
@@ -85,55 +83,33 @@ def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in facts.items() if value is not None}
 
 
-def acting(policy: Any | None, obs_type: str, oracle_memory: bool) -> Acting:
-    """Return who acts in environments that observe this, by the command line of the process.
+def acting(policy: Any | None, path: str | None, seeds: range | None, obs_type: str, oracle_memory: bool) -> Acting:
+    """Return who acts in environments that observe this.
 
     Args:
-        policy: as `command_line.policy_being_run` returns it.
+        policy: its configuration; where only its type is known, the class of it; None where nothing is.
+        path: of its checkpoint, None for a policy without one.
+        seeds: see `Acting`.
     """
     if policy is None:
         return NOBODY
     run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
-    return Acting(_identity(policy, run), policy_inputs(policy, obs_type, oracle_memory), run, _seeds())
-
-
-# --- the command line ---
-
-
-def _seeds() -> range | None:
-    """Return the seeds of the episodes of each task that were asked for, None where LeRobot draws without seeds."""
-    from lerobot.configs.default import EvalConfig
-    from lerobot.configs.eval import EvalPipelineConfig
-
-    count = _number("eval.n_episodes", EvalConfig.n_episodes)
-    first = _number("seed", EvalPipelineConfig.seed)
-    return range(first, first + count) if isinstance(first, int) and isinstance(count, int) else None
-
-
-def _number(name: str, default: int | None) -> Any:
-    from lerobot.configs import parser
-
-    told = parser.parse_arg(name)
-    if told is not None:
-        return yaml.safe_load(told)
-    found = in_file(*name.split("."))
-    return default if found is None else found
+    return Acting(_identity(policy, path, run), policy_inputs(policy, obs_type, oracle_memory), run, seeds)
 
 
 # --- identity ---
 
 
-def _identity(policy: Any, run: str) -> dict[str, Any]:
+def _identity(policy: Any, path: str | None, run: str) -> dict[str, Any]:
     """Return what tells a policy from others: its type, its checkpoint, and what was set otherwise than there.
 
     Of a policy in training, whose weights are nowhere else yet, the run is all there is to tell.
     """
-    from lerobot.configs import PreTrainedConfig, parser
+    from lerobot.configs import PreTrainedConfig
 
     kind = PreTrainedConfig.get_choice_name(policy if isinstance(policy, type) else type(policy))
     if training_runs():
         return {"type": kind, "identity": f"{kind} in training {run}"}
-    path = parser.get_path_arg("policy")
     weights = None if path is None else checkpoint_hash(path)
     with quiet():
         plain = _unchanged(policy, path)

@@ -96,3 +96,23 @@ def in_file(*keys: str, flags: Sequence[str] | None = None) -> Any | None:
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
         return None
     return found
+
+
+def asked_seeds() -> range | None:
+    """Return the seeds of each task's episodes on LeRobot's command line, None where it draws without seeds."""
+    from lerobot.configs.default import EvalConfig
+    from lerobot.configs.eval import EvalPipelineConfig
+
+    count = _number("eval.n_episodes", EvalConfig.n_episodes)
+    first = _number("seed", EvalPipelineConfig.seed)
+    return range(first, first + count) if isinstance(first, int) and isinstance(count, int) else None
+
+
+def _number(name: str, default: int | None) -> Any:
+    from lerobot.configs import parser
+
+    told = parser.parse_arg(name)
+    if told is not None:
+        return yaml.safe_load(told)
+    found = in_file(*name.split("."))
+    return default if found is None else found

@@ -20,8 +20,8 @@ import gymnasium as gym
 from lerobot.configs import PolicyFeature, PreTrainedConfig, parser
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_memobench.envs.acting import acting, parameters_of
-from lerobot_memobench.envs.command_line import policy_being_run, rename_map, training_runs
+from lerobot_memobench.envs.acting import Acting, acting, parameters_of
+from lerobot_memobench.envs.command_line import asked_seeds, policy_being_run, rename_map, training_runs
 from lerobot_memobench.envs.episode_log import SETTINGS, check_protocol, revision
 from lerobot_memobench.envs.observations import (
     AUTO,
@@ -43,10 +43,12 @@ from lerobot_memobench.envs.pacing import check_pacing, longest
 from lerobot_memobench.envs.upstream import upstream_settings
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.threads import ACTING, limit_torch, use_threads
-from lerobot_memobench.lerobot_hooks import ROLLOUT, installed
 from lerobot_memobench.protocol import BY_PAPER, CONTROL_HZ, EVALUATION_SEED, HORIZON, PROTOCOLS, UPSTREAM
 from lerobot_memobench.tasks.evidence import check_referent
 from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS, STRICT, SUITES, check_world
+
+Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
+"""Called with a task's folder, the number of rows, and whether each has a process of its own."""
 
 PolicyCheck = Callable[[str, PreTrainedConfig, dict[str, PolicyFeature], dict[str, str]], None]
 """Called with a checkpoint's path and configuration, what is shown by its names at the policy, and LeRobot's
@@ -228,33 +230,45 @@ class MemobenchEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset."""
-        from lerobot_memobench.envs.memobench_env import MemobenchEnv, SkipLogged
-
         policy = policy_being_run()
         self._check_checkpoint(policy)
         chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
         _check_recording(n_envs, self.obs_type)
         _use_threads(policy)
-        use_async_envs = use_async_envs and n_envs > 1
-        if use_async_envs:
-            # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
-            get_context("forkserver").set_forkserver_preload([MemobenchEnv.__module__])
-        log_dir = self.resolved_log_dir()
-        prompt = prompt_in(policy) if self.prompt_in == AUTO else self.prompt_in
-        by = acting(policy, self.obs_type, self.oracle_memory)
-        replan_steps = self._replan_steps(policy)
-        told = {"prompt_in": prompt, "replan_steps": replan_steps}
-        settings = {**self.gym_kwargs, **told, "acting": by}
-        protocol = {**self.agreed_settings, **told, **by.protocol}
-        check_protocol(log_dir, protocol)  # now, not when the first episode has been simulated
-        most = longest(self.horizon, self.pause_steps, self.speed, replan_steps)
+        by = acting(policy, parser.get_path_arg("policy"), asked_seeds(), self.obs_type, self.oracle_memory)
+        opened = self.opener(policy, by, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
-            make: Callable[[], gym.Env[Any, Any]] = partial(MemobenchEnv, str(folder), log_dir=str(log_dir), **settings)
+            suites.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
+        return suites
+
+    def opener(self, policy: Any, by: Acting, log_dir: Path) -> Opener:
+        """Return a function that opens the vector environment of a task for a policy.
+
+        Args:
+            policy: its configuration, or the class of it.
+            by: who acts, for the log.
+            log_dir: folder of the episode log.
+
+        Raises:
+            MemobenchError: the folder holds a log of another protocol.
+        """
+        from lerobot_memobench.envs.memobench_env import MemobenchEnv, SkipLogged
+
+        prompt = prompt_in(policy) if self.prompt_in == AUTO else self.prompt_in
+        replan_steps = self._replan_steps(policy)
+        told = {"prompt_in": prompt, "replan_steps": replan_steps}
+        settings = {**self.gym_kwargs, **told, "acting": by, "log_dir": str(log_dir)}
+        check_protocol(log_dir, {**self.agreed_settings, **told, **by.protocol})  # before an episode is simulated
+        most = longest(self.horizon, self.pause_steps, self.speed, replan_steps)
+
+        def opened(folder: Path, rows: int, use_async_envs: bool) -> gym.vector.VectorEnv:
+            make: Callable[[], gym.Env[Any, Any]] = partial(MemobenchEnv, str(folder), **settings)
             if self.resume:
                 make = partial(SkipLogged, make, log_dir, self.referent, self.seed_base)
-            suites.setdefault(memory_type, {})[task_id] = self._vector([make] * n_envs, use_async_envs, most)
-        return suites
+            return self._vector([make] * rows, use_async_envs and rows > 1, most)
+
+        return opened
 
     def get_env_processors(self) -> tuple[Any, Any]:
         """Return what LeRobot does to observations and actions of these environments."""
@@ -287,6 +301,8 @@ class MemobenchEnvConfig(EnvConfig):
         from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
         if use_async_envs:
+            # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
+            get_context("forkserver").set_forkserver_preload(["lerobot_memobench.envs.memobench_env"])
             # What a vector environment must know before its workers exist.
             space = observation_space(self.expert_action, self.render_every, self.obs_type, self.blind_action, most)
             return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
@@ -320,8 +336,6 @@ def _check_recording(rows: int, obs_type: str) -> None:
         MemobenchError: plain ``lerobot-eval`` was asked for it.
     """
     if (parser.parse_arg("eval.recording") or "").lower() != "true":
-        return
-    if ROLLOUT in installed():  # `lerobot eval`, which lays its loop around LeRobot's
         return
     episodes = parser.parse_arg("eval.n_episodes") or "50"
     if obs_type != OBJECTS or (episodes.isdecimal() and int(episodes) > rows):

@@ -24,6 +24,7 @@ from lerobot_memobench.experts.hand import (
     downward,
     frame,
     length,
+    rotation_vector,
     unit,
 )
 from lerobot_memobench.experts.travel import (
@@ -235,7 +236,7 @@ def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> St
     for _ in range(100):
         if reached() or hand.empty:
             break
-        angle = float(Rotation.from_matrix(hand.rotation @ grip.T).as_rotvec()[2])
+        angle = float(rotation_vector(hand.rotation @ grip.T)[2])
         lead = float(np.clip(aim - start - angle, -0.25, 0.25)) + angle
         goal = Rotation.from_rotvec([0.0, 0.0, lead]).as_matrix() @ grip
         yield hand.toward(_ridge(hand, articulation)[0], goal, CLOSED)

@@ -28,6 +28,7 @@ from lerobot_memobench.experts.hand import (
     downward,
     frame,
     length,
+    rotation_vector,
     unit,
 )
 from lerobot_memobench.experts.travel import (
@@ -281,7 +282,7 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
     hand, name = way.hand, way.name
     here, start = hand.sim.eef_pose()
     target, turn = way.pose(FULLY_OPEN)
-    wrist = length(Rotation.from_matrix(turn @ start.T).as_rotvec())
+    wrist = length(rotation_vector(turn @ start.T))
     cost = 0.3 * wrist + length(target - here) + crowding(hand, name, target, turn)
     if avoid is not None:
         cost += 2.0 * abs(float(turn[:, 0] @ avoid))

@@ -64,7 +64,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
 """Command -> short form -> the fields it sets, of which those that exist are set. `cli/lerobot_<command>.txt` explains
 them."""
 RUN_OPTIONS = (
-    *("split", "memory_reads", "verbose", "resume"),
+    *("split", "memory_reads", "resume"),
     *("shard", "shards", "workers", "executor", "executor_option"),
 )
 """Keys of `lerobot eval env=memobench` that are none of LeRobot's (`plan.RunOptions`)."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import os
 import sys
 import typing
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import cache
 from importlib import metadata
 from typing import Any
@@ -20,15 +19,6 @@ from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 PREFIX = "lerobot-"
 ROLES = {"eval": ACTING, "train": LEARNING}
 """What the processes of commands do that compute: `jobs.threads`."""
-OF_NO_CONCERN = ("No job name provided",)
-OF_WEIGHTS = (
-    "No pretrained path was provided",
-    "You are instantiating a policy from scratch and its features are parsed from an environment",
-)
-OF_THE_CPU = ("Using CPU, this will be slow",)
-"""How LeRobot's warnings begin that are none to who evaluates; that are none of a policy without weights; and that is
-none to who has nothing but a CPU.
-"""
 
 
 def lerobot_commands() -> dict[str, metadata.EntryPoint]:
@@ -103,40 +93,8 @@ def call_lerobot(command: str, flags: Sequence[str]) -> int:
 
 
 @contextmanager
-def without_chatter(trained: bool) -> Iterator[None]:
-    """Keep to ourselves what LeRobot's evaluation says beside its work: its configuration, its own tables, what is no
-    cause for alarm here. Its other warnings and its errors are shown.
-
-    Args:
-        trained: whether the policy has weights; that those of one without any are random is no news.
-    """
-    import lerobot
-    import torch
-
-    home, false_alarms = os.path.dirname(lerobot.__file__), OF_NO_CONCERN + (() if trained else OF_WEIGHTS)
-    if not trained or not torch.cuda.is_available():
-        false_alarms += OF_THE_CPU
-
-    def matters(record: logging.LogRecord) -> bool:
-        if not record.pathname.startswith(home):
-            return True
-        return record.levelno >= logging.WARNING and not record.getMessage().startswith(false_alarms)
-
-    named = logging.getLogger("lerobot")
-    before = named.level
-    named.setLevel(logging.WARNING)
-    try:
-        # LeRobot logs by the root's functions and by loggers of its modules' names; a filter holds for one alone.
-        with _filtered(matters, None, "lerobot.configs.eval", "lerobot.utils.device_utils"):
-            yield
-    finally:
-        named.setLevel(before)
-
-
-def without_configuration() -> AbstractContextManager[None]:
-    """Keep to ourselves the configuration of a hundred lines that LeRobot's training begins with: each checkpoint holds
-    it, as `train_config.json`. All else is shown.
-    """
+def without_configuration() -> Iterator[None]:
+    """Drop the log record of LeRobot's training with its whole configuration, which is in `train_config.json`."""
 
     def matters(record: logging.LogRecord) -> bool:
         # It is logged once, as a printed dictionary.
@@ -145,17 +103,8 @@ def without_configuration() -> AbstractContextManager[None]:
         logging.getLogger().removeFilter(matters)
         return False
 
-    return _filtered(matters, None)
-
-
-@contextmanager
-def _filtered(matters: Callable[[logging.LogRecord], bool], *names: str | None) -> Iterator[None]:
-    """Show of some loggers only the records that matter; None names the root."""
-    loggers = [logging.getLogger(name) for name in names]
-    for logger in loggers:
-        logger.addFilter(matters)
+    logging.getLogger().addFilter(matters)
     try:
         yield
     finally:
-        for logger in loggers:
-            logger.removeFilter(matters)
+        logging.getLogger().removeFilter(matters)

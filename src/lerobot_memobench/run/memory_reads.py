@@ -35,7 +35,7 @@ class ReadLog:
         return cls(plan.log, plan.environment.seed_base, plan.environment.referent)
 
     @contextmanager
-    def noting(self, env: Any, policy: Any, seeds: Sequence[int]) -> Iterator[Callable[[NDArray[np.bool_]], None]]:
+    def noting(self, task: str, policy: Any, seeds: Sequence[int]) -> Iterator[Callable[[NDArray[np.bool_]], None]]:
         """Watch a batch of rollouts; the function that is yielded writes the reads of episodes that are over (rows,).
 
         An episode that the log held already observes nothing, plans nothing, and keeps the file that it has.
@@ -44,7 +44,7 @@ class ReadLog:
             MemobenchError: the policy does not tell what it reads.
         """
         check_memory_reads(policy)
-        task, written = env.call("task")[0], np.zeros(len(seeds), bool)
+        written = np.zeros(len(seeds), bool)
 
         def ended(over: NDArray[np.bool_]) -> None:
             if (over == written).all():

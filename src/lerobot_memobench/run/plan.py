@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime as dt
 import itertools
 import shlex
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -45,6 +45,7 @@ from lerobot_memobench.run.arguments import (
 )
 
 if TYPE_CHECKING:
+    from lerobot.configs.default import EvalConfig
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.envs.configs import EnvConfig
 
@@ -72,8 +73,8 @@ class EvaluationPlan:
 
     Attributes:
         arguments: LeRobot's, complete but for the folders that are written.
-        policy: its configuration; None where LeRobot has to fetch it first.
-        environment: its configuration.
+        policy: its configuration. environment: its configuration.
+        eval_settings: LeRobot's section ``eval``.
         grid: the episodes it consists of.
         output: folder of LeRobot's own files.
         log: folder of the episode log, the report and the card.
@@ -84,12 +85,13 @@ class EvaluationPlan:
     """
 
     arguments: LerobotArguments
-    policy: PreTrainedConfig | None
+    policy: PreTrainedConfig
     environment: MemobenchEnvConfig
+    eval_settings: EvalConfig
     grid: Grid
     output: Path
     log: Path
-    seed: int | None
+    seed: int
     batch: int
     options: RunOptions
     command: tuple[str, ...]
@@ -132,11 +134,6 @@ class EvaluationPlan:
         folder = self.output if self.options.shard is None else self.output.parent
         kept = [word for word in joined(self.command) if not word.startswith(("resume=", f"{OUTPUT}="))]
         return shlex.join([*without_flags(kept, OUTPUT), "resume=true", f"{OUTPUT}={folder}"])
-
-    @property
-    def lerobot_flags(self) -> list[str]:
-        """What ``lerobot-eval`` is called with."""
-        return list(self.arguments.default(OUTPUT, self.output).default(LOG, self.log).for_parser)
 
     @property
     def portable_flags(self) -> list[str]:
@@ -197,21 +194,22 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     if obs_type_of(policy) not in (None, PIXELS):
         arguments = arguments.default("env.obs_type", obs_type_of(policy))
     arguments = with_protocol(arguments, options, log, policy)
-    if policy is not None:  # else LeRobot's process finds out
-        arguments = arguments.default("env.prompt_in", prompt_in(policy))
+    arguments = arguments.default("env.prompt_in", prompt_in(policy))
     environment = cast("MemobenchEnvConfig", env_config(arguments))
     check_observations(policy, environment)
     check_as_checkpoint(arguments, policy, environment)
-    if options.memory_reads and policy is not None:
+    if options.memory_reads:
         check_memory_reads(policy)
+    grid = make_grid(arguments, environment)
     plan = EvaluationPlan(
         arguments=arguments.without(OUTPUT, LOG),
         policy=policy,
         environment=environment,
-        grid=make_grid(arguments, environment),
+        eval_settings=eval_settings(arguments),
+        grid=grid,
         output=output,
         log=log,
-        seed=whole_number(arguments.get("seed")),
+        seed=environment.seed_base + grid.first,
         batch=whole_number(arguments.get("eval.batch_size")) or 1,
         options=options,
         command=tuple(command),
@@ -317,7 +315,7 @@ def with_policy(arguments: LerobotArguments) -> LerobotArguments:
 
 
 def with_protocol(
-    arguments: LerobotArguments, options: RunOptions, log: Path, policy: PreTrainedConfig | None
+    arguments: LerobotArguments, options: RunOptions, log: Path, policy: PreTrainedConfig
 ) -> LerobotArguments:
     """Return arguments with the protocol's seed and episodes, a batch, a device, the replan interval, videos."""
     import torch
@@ -375,20 +373,19 @@ def earlier_batch_size(log: Path) -> int | None:
 # --- the configurations of the policy and the environment, as LeRobot will build them ---
 
 
-def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
-    """Return the policy's configuration; None where none is chosen, or a configuration file has a say.
-
-    Its own checks run here: an unknown ``policy.align`` is told before anything starts.
+def policy_config(arguments: LerobotArguments) -> PreTrainedConfig:
+    """Return the policy's configuration; that of a repository is downloaded.
 
     Raises:
-        MemobenchError: the model checkpoint is not whole. Others come from the configuration's own checks.
+        MemobenchError: the checkpoint is not whole, or the type is not known. Others come from the configuration.
     """
     path = arguments.get("policy.path")
     if path is None:
-        return cast("PreTrainedConfig | None", _parsed(arguments, "policy"))
+        parsed = _parsed(arguments, "policy")
+        if parsed is None:
+            raise MemobenchError(f"policy.type={arguments.get('policy.type')} is not known; import what registers it")
+        return cast("PreTrainedConfig", parsed)
     check_checkpoint(path)
-    if not _is_known(arguments, "policy"):
-        return None
     from lerobot.configs.policies import PreTrainedConfig
 
     with quiet():
@@ -398,6 +395,24 @@ def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
 def env_config(arguments: LerobotArguments) -> EnvConfig | None:
     """Return the environment's configuration; None where none is chosen, or a configuration file has a say."""
     return cast("EnvConfig | None", _parsed(arguments, "env"))
+
+
+def eval_settings(arguments: LerobotArguments) -> EvalConfig:
+    """Return LeRobot's section ``eval``.
+
+    Raises:
+        MemobenchError: tasks were to run in threads.
+    """
+    import draccus
+    from lerobot.configs.default import EvalConfig
+
+    threads = arguments.get("env.max_parallel_tasks")
+    if threads not in (None, "1"):
+        raise MemobenchError(
+            f"env.max_parallel_tasks is {threads}; the tasks run one after another here. Leave it out, and ask for "
+            "processes by shards= and workers="
+        )
+    return draccus.parse(EvalConfig, args=overrides("eval", arguments.for_parser))
 
 
 def _is_known(arguments: LerobotArguments, key: str) -> bool:
@@ -476,7 +491,6 @@ class RunOptions:
     Attributes:
         split: whose seeds are run, one of `EVALUATED`; None: those that `seed=` says.
         memory_reads: how much each chunk reads of what the policy remembers is written beside the log.
-        verbose: LeRobot's own messages are shown, too.
         resume: go on with the evaluation in the output folder.
         shard: run this part alone.
         shards: run so many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
@@ -486,7 +500,6 @@ class RunOptions:
 
     split: str | None = None
     memory_reads: bool = False
-    verbose: bool = False
     resume: bool = False
     shard: Shard | None = None
     shards: int = 0
@@ -519,7 +532,6 @@ def take_run_options(given: Arguments) -> tuple[RunOptions, Arguments]:
     options = RunOptions(
         split=last.get("split"),
         memory_reads=is_true("memory_reads", last.get("memory_reads")),
-        verbose=is_true("verbose", last.get("verbose")),
         resume=is_true("resume", last.get("resume")),
         shard=Shard.parse(last["shard"]) if "shard" in last else None,
         shards=_count("shards", last.get("shards")),
@@ -549,9 +561,6 @@ def _count(key: str, text: str | None) -> int:
 
 
 # --- all episodes, in the batches in which they are run, and which of them a part or a run has left ---
-
-Range = tuple[int, int]
-"""First run of a task and how many: run k is LeRobot's k-th, of the seed ``seed`` + k."""
 
 
 @dataclass(frozen=True)
@@ -628,25 +637,15 @@ class Grid:
         found = [(task, number) for task in self.tasks for number in range(-(-self.runs // self.batch))]
         return found if shard is None else found[shard.of(len(found))]
 
+    def runs_of(self, number: int) -> range:
+        """Return the runs of a task's batch."""
+        return range(number * self.batch, min((number + 1) * self.batch, self.runs))
+
     def episodes(self, cell: Cell) -> list[tuple[str, int]]:
         """Return (task name, episode) of the runs in a batch."""
         task, number = cell
-        runs = range(number * self.batch, min((number + 1) * self.batch, self.runs))
-        return [(task.name, self.first + run) for run in runs]
+        return [(task.name, self.first + run) for run in self.runs_of(number)]
 
     def missing(self, done: Collection[tuple[str, int]], shard: Shard | None = None) -> list[Cell]:
         """Return the batches that hold an episode that is not in ``done``."""
         return [cell for cell in self.cells(shard) if not set(self.episodes(cell)) <= set(done)]
-
-    def ranges(self, cells: Iterable[Cell]) -> dict[tuple[str, int], list[Range]]:
-        """Return the runs of these batches, neighbours joined, by LeRobot's name of the task."""
-        found: dict[tuple[str, int], list[Range]] = {}
-        for task, number in cells:
-            start = number * self.batch
-            count = min(self.batch, self.runs - start)
-            mine = found.setdefault(task.key, [])
-            if mine and sum(mine[-1]) == start:
-                mine[-1] = (mine[-1][0], mine[-1][1] + count)
-            else:
-                mine.append((start, count))
-        return found

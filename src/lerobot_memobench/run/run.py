@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.memory_reads import MEMORY_READS
 from lerobot_memobench.evaluation.records import CARD_FILE, Run, read_card, read_protocol
 from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
-from lerobot_memobench.io import count_of, is_there, remove_drafts
+from lerobot_memobench.io import count_of, is_there, remove_drafts, write_file
 from lerobot_memobench.jobs.processes import locked
-from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.run.card import (
     CARD_MARKDOWN,
@@ -27,20 +26,18 @@ from lerobot_memobench.run.card import (
     with_episodes,
     write_card,
 )
-from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
-from lerobot_memobench.run.memory_reads import ReadLog
-from lerobot_memobench.run.plan import EvaluationPlan, Range
-from lerobot_memobench.run.rollout import calm_output, steered
+from lerobot_memobench.run.evaluate import evaluate, lerobot_summary
+from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
 from lerobot_memobench.run.sealed import RUN_FILE, counted
 
-VIDEOS = "videos"
-"""Folder of the videos, in that of the log."""
+VIDEOS, LEROBOT_INFO = "videos", "eval_info.json"
+"""Folder of the videos, in that of the log; rates in the form of LeRobot's evaluation."""
 
 Tell = Callable[[str], None]
 """Told what a user should know and what stops nothing."""
 
-Ranges = Mapping[tuple[str, int], list[Range]]
-"""LeRobot's name of a task -> the runs of it that are made."""
+Advance = Callable[[PlannedTask, int], None]
+"""Called with the task and the number of episodes of each batch that has ended."""
 
 
 @dataclass(frozen=True)
@@ -61,31 +58,21 @@ class EvaluationReport:
         return self.run.folder / REPORT_MARKDOWN
 
 
-@dataclass(frozen=True)
-class Ended:
-    """How an evaluation ended.
-
-    Attributes:
-        status: exit status of LeRobot's command.
-        report: None when it failed, or when a part holds no episode.
-    """
-
-    status: int
-    report: EvaluationReport | None = None
-
-
-def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: None) -> Ended:
-    """Run what is missing, write report and card.
+def run_evaluation(
+    plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: None, advance: Advance = lambda task, episodes: None
+) -> EvaluationReport | None:
+    """Run what is missing, write report and card; return None for a part that holds no episode.
 
     Args:
         tell: told what matters and stops nothing, and how to go on when a run breaks off.
         begin: told what is about to be run: the first episode takes a while.
+        advance: called after each batch with its task and its number of episodes.
 
     Raises:
         MemobenchError: the batch is none, the folder holds another evaluation, or weights are missing. Whatever
             LeRobot raises.
     """
-    if plan.policy is not None and plan.policy_path is not None:
+    if plan.policy_path is not None:
         check_weights(plan.policy_path, plan.policy)
     with held(plan):
         if not plan.options.resume:
@@ -94,11 +81,11 @@ def run_evaluation(plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: 
         card = card_of(plan)
         if plan.options.resume:
             card = resumed_card(plan.log, card, tell)
-        ranges = missing(plan)
-        if ranges != {}:
+        cells = missing(plan)
+        if cells:
             begin(_what_is_run(plan))
-            return _run_lerobot(plan, card, ranges, tell)
-        return Ended(0, _finish(plan, card) if has_log(plan.log) else None)
+            return _run(plan, card, cells, tell, advance)
+        return _finish(plan, card) if has_log(plan.log) else None
 
 
 def _what_is_run(plan: EvaluationPlan) -> str:
@@ -109,28 +96,24 @@ def _what_is_run(plan: EvaluationPlan) -> str:
     return f"evaluating {who} on {what}, into {plan.output}"
 
 
-def _run_lerobot(plan: EvaluationPlan, card: dict[str, Any], ranges: Ranges | None, tell: Tell) -> Ended:
-    """Run LeRobot's evaluation on what is left."""
-    status, trained = 1, not isinstance(plan.policy, UntrainedConfig)
+def _run(
+    plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], tell: Tell, advance: Advance
+) -> EvaluationReport:
+    """Run the batches that are left."""
+    ended = False
 
     def begin() -> None:
         nonlocal card
         card = counted(plan, with_checkpoint(card, plan.policy_path), tell)
         write_card(plan.log, card)
 
+    write_card(plan.log, card)
     try:
-        with (
-            nullcontext() if plan.options.verbose else without_chatter(trained),
-            calm_output(),
-            steered(plan.seed, ranges, ReadLog.of(plan), begin),
-        ):
-            write_card(plan.log, card)
-            left = remainder(plan, ranges)
-            with made(left.output, hold=False):  # LeRobot makes it for videos of its own only
-                status = call_lerobot("eval", left.lerobot_flags)
-            return Ended(status, None if status else _finish(plan, card))
+        evaluate(plan, cells, begin, advance)
+        ended = True
+        return _finish(plan, card)
     finally:
-        if status and has_log(plan.log):
+        if not ended and has_log(plan.log):
             tell(
                 f"the episodes that ended are in {plan.log}; `memobench report {plan.log}` reports them, "
                 f"`{plan.going_on}` goes on"
@@ -141,11 +124,12 @@ def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     """Write the report of the log, and what was found onto the card."""
     protocol = {**card["protocol"], **read_protocol_file(plan.log)}
     protocol.pop(POLICY, None)  # a card says more of it; the file has what `auto` came to in LeRobot's process
-    # LeRobot runs whole batches: episodes beyond those asked for are no part of the report.
+    # A log of plain lerobot-eval holds whole batches: episodes beyond those asked for are no part of the report.
     limit = plan.grid.first + max(plan.grid.runs, protocol["episodes"])
     records = [record for record in read_log(plan.log) if record["episode"] < limit]
     card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
     write_card(plan.log, with_episodes(card, records))
+    write_file(plan.output / LEROBOT_INFO, json.dumps(lerobot_summary(records, plan.grid.tasks), indent=2) + "\n")
     return EvaluationReport(write_report(plan.log, limit))
 
 
@@ -199,29 +183,11 @@ def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
     return found
 
 
-def missing(plan: EvaluationPlan) -> Ranges | None:
-    """Return the runs that are to be made, in whole batches; None for all of them."""
+def missing(plan: EvaluationPlan) -> list[Cell]:
+    """Return the batches that are to be run; a batch of which the log holds a part is run whole, but for that part."""
     options = plan.options
-    if not (options.resume or options.shard is not None):
-        return None
-    done = logged(plan.log, plan.environment.referent)
-    return plan.grid.ranges(plan.grid.missing(done, options.shard))
-
-
-def remainder(plan: EvaluationPlan, ranges: Ranges | None) -> EvaluationPlan:
-    """Return the plan of what is left: tasks that are done are not opened, episodes that are there are left out."""
-    if ranges is None:
-        return plan
-    arguments, output = plan.arguments, plan.output
-    names = [task.name for task in plan.grid.tasks if task.key in ranges]
-    if len(names) < len(plan.grid.tasks) and not arguments.has("env.task_dir"):
-        arguments = arguments.changed("env.task" if arguments.has("env.task") else "env.tasks", ",".join(names))
-    if has_log(plan.log):
-        arguments = arguments.changed("env.resume", True)
-        # LeRobot would write over the first run's own files.
-        others = (plan.output / f"continued-{k}" for k in itertools.count(1))
-        output = next(folder for folder in others if not folder.exists())
-    return replace(plan, arguments=arguments, output=output)
+    done = logged(plan.log, plan.environment.referent) if options.resume or options.shard is not None else set()
+    return plan.grid.missing(done, options.shard)
 
 
 # --- the folder: whether it may be written to, held while a run lasts, left clean behind it ---

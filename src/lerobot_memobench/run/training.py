@@ -546,7 +546,7 @@ def trained_on(prompt_frames: bool | None, obs_type: str | None = None) -> Itera
 
 def steer(prompt_frames: bool | None, obs_type: str | None = None) -> Callable[[], None]:
     """As `trained_on`, until the function returned is called."""
-    check_version("training")
+    check_version()
     return install(OPEN_DATASETS, lambda make: _steered(make, prompt_frames, obs_type))
 
 

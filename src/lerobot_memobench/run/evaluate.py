@@ -1,0 +1,158 @@
+"""The evaluation loop: a policy, the environments of each task, and the batches of episodes that are missing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.envs import make_env_pre_post_processors
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.device_utils import get_safe_torch_device
+from lerobot.utils.random_utils import set_seed
+
+from lerobot_memobench.envs.acting import acting
+from lerobot_memobench.envs.command_line import quiet, read_rename_map
+from lerobot_memobench.envs.configuration_memobench import Opener
+from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.jobs.threads import limit_torch
+from lerobot_memobench.run.memory_reads import ReadLog
+from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
+from lerobot_memobench.run.recording import Recorder
+from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
+
+RECORDINGS = "recordings"
+"""Folder of rollouts that are recorded as datasets, in that of the evaluation."""
+
+Advance = Callable[[PlannedTask, int], None]
+"""Called with the task and the number of episodes of each batch that has ended."""
+
+
+def evaluate(plan: EvaluationPlan, cells: Iterable[Cell], begin: Callable[[], None], advance: Advance) -> None:
+    """Run batches of episodes; the environments write the log.
+
+    Args:
+        cells: the batches, those of one task in succession.
+        begin: called once, after the policy is loaded and before the first scene.
+
+    Raises:
+        MemobenchError: the policy and the environment do not fit. Whatever LeRobot raises.
+    """
+    policy: Any = plan.policy
+    device = get_safe_torch_device(policy.device)
+    torch.backends.cudnn.benchmark = True
+    torch.backends.cuda.matmul.allow_tf32 = True
+    set_seed(plan.seed)
+    actor = load_actor(plan)
+    limit_torch(sum(parameter.numel() for parameter in actor.policy.parameters()))
+    begin()
+    environment = replace(plan.environment, resume=has_log(plan.log))
+    asked = range(plan.seed, plan.seed + plan.grid.runs)
+    by = acting(policy, plan.policy_path, asked, environment.obs_type, environment.oracle_memory)
+    environments = Environments(environment.opener(policy, by, plan.log), plan.eval_settings.use_async_envs)
+    reads, seeds = ReadLog.of(plan), BatchSeeds(actor.policy, plan.seed)
+    amp = torch.autocast(device_type=device.type) if policy.use_amp else nullcontext()
+    with amp, closing(environments):
+        for task, number in cells:
+            runs = plan.grid.runs_of(number)
+            batch = range(plan.seed + runs.start, plan.seed + runs.stop)
+            env = environments.of(task, len(batch))
+            seeds.begin(task.name, batch.start)
+            with _noting(reads, actor.policy, task, batch) as ended, _recording(plan, task, env) as recorder:
+                roll(env, actor, batch, ended, recorder)
+            advance(task, len(batch))
+
+
+class Environments:
+    """The vector environment of one task and batch size at a time.
+
+    Args:
+        opened: makes one. use_async: gives each row a process of its own.
+    """
+
+    def __init__(self, opened: Opener, use_async: bool) -> None:
+        self._opened, self._use_async = opened, use_async
+        self._key: tuple[PlannedTask, int] | None = None
+        self._env: Any = None
+
+    def of(self, task: PlannedTask, rows: int) -> Any:
+        """Return the environment of a task with so many rows, after closing any other."""
+        if self._key != (task, rows):
+            self.close()
+            self._env, self._key = self._opened(task.folder, rows, self._use_async), (task, rows)
+        return self._env
+
+    def close(self) -> None:
+        """Close the environment that is open."""
+        if self._env is not None:
+            self._env.close()
+        self._env = self._key = None
+
+
+def load_actor(plan: EvaluationPlan) -> Actor:
+    """Return the plan's policy and its processors, as LeRobot makes them."""
+    policy, environment = copy(plan.policy), plan.environment
+    policy.pretrained_path = None if plan.policy_path is None else Path(plan.policy_path)
+    renamed = read_rename_map(plan.arguments.get("rename_map"))
+    with quiet() if plan.policy_path is None else nullcontext():  # it has no weights: a warning says so
+        loaded = make_policy(cfg=policy, env_cfg=environment, rename_map=renamed).eval()
+    before, after = make_pre_post_processors(
+        policy_cfg=policy,
+        pretrained_path=policy.pretrained_path,
+        preprocessor_overrides={
+            "device_processor": {"device": str(loaded.config.device)},
+            "rename_observations_processor": {"rename_map": renamed},
+        },
+    )
+    env_before, env_after = make_env_pre_post_processors(env_cfg=environment, policy_cfg=policy)
+    return Actor(loaded, (env_before, before), (after, env_after))
+
+
+def _noting(reads: ReadLog | None, policy: Any, task: PlannedTask, seeds: Sequence[int]) -> AbstractContextManager[Any]:
+    return nullcontext() if reads is None else reads.noting(task.name, policy, seeds)
+
+
+def _recording(plan: EvaluationPlan, task: PlannedTask, env: Any) -> AbstractContextManager[Recorder | None]:
+    """Return the recorder of a batch, None where none was asked for; leaving it completes its datasets."""
+    settings = plan.eval_settings
+    if not settings.recording:
+        return nullcontext()
+    name = f"{task.suite}_{task.number}"
+    repository = None if settings.recording_repo_id is None else f"{settings.recording_repo_id}_{name}"
+    folder: Path = plan.output / RECORDINGS / name
+    fps = env.unwrapped.metadata["render_fps"]
+    return closing(
+        Recorder(folder, plan.environment.features, env.num_envs, fps, repository, settings.recording_private)
+    )
+
+
+def lerobot_summary(records: Iterable[Mapping[str, Any]], tasks: Iterable[PlannedTask]) -> dict[str, Any]:
+    """Return the rates of a log in the form of LeRobot's ``eval_info.json``; an episode's reward is its success."""
+    solved: dict[str, list[bool]] = {}
+    for record in records:
+        solved.setdefault(record["task"], []).append(bool(record["success"]))
+    there = [task for task in tasks if task.name in solved]
+    groups: dict[str, list[bool]] = {}
+    for task in there:
+        groups.setdefault(task.suite, []).extend(solved[task.name])
+    return {
+        "per_task": [
+            {"task_group": task.suite, "task_id": task.number, "metrics": _metrics(solved[task.name])} for task in there
+        ],
+        "per_group": {name: _mean(found) for name, found in groups.items()},
+        "overall": _mean([value for found in groups.values() for value in found]),
+    }
+
+
+def _metrics(solved: Sequence[bool]) -> dict[str, Any]:
+    rewards = [float(value) for value in solved]
+    return {"sum_rewards": rewards, "max_rewards": rewards, "successes": [*solved], "video_paths": []}
+
+
+def _mean(solved: Sequence[bool]) -> dict[str, Any]:
+    mean = sum(solved) / len(solved)
+    return {"avg_sum_reward": mean, "avg_max_reward": mean, "pc_success": 100 * mean, "n_episodes": len(solved)}
