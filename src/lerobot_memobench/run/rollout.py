@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import logging
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -94,8 +93,7 @@ KNOWN: dict[tuple[str, str], ChunkPolicy] = {
 
 @contextmanager
 def calm_output() -> Iterator[None]:
-    """Keep progress bars out of log files, and a library's farewell out of the end of a run."""
-    logging.getLogger("OpenGL").setLevel(logging.WARNING)
+    """Keep progress bars out of log files."""
     # The bar is redrawn at every step. LeRobot leaves it out where it takes itself to be in a batch job.
     with nullcontext() if sys.stderr.isatty() else hooked(INSIDE_SLURM, lambda _: lambda: True):
         yield

@@ -28,6 +28,7 @@ from lerobot_memobench.run.card import (
     write_card,
 )
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_chatter
+from lerobot_memobench.run.machine import drawn_with
 from lerobot_memobench.run.memory_reads import ReadLog
 from lerobot_memobench.run.plan import EvaluationPlan, Range
 from lerobot_memobench.run.rollout import calm_output, steered
@@ -192,11 +193,9 @@ def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
     found = []
     if earlier["batch_size"] != now["batch_size"]:
         found.append(f"batch_size: {earlier['batch_size']} and {now['batch_size']}")
-    for part in ("versions", "gl"):
-        there, here = earlier[part], now[part]
-        changed = [f"{key}: {there[key]} and {here[key]}" for key in here if there.get(key, here[key]) != here[key]]
-        found += changed[:1]
-    return found
+    there, here = drawn_with(earlier), drawn_with(now)
+    changed = [f"{key}: {there[key]} and {here[key]}" for key in here if there.get(key, here[key]) != here[key]]
+    return found + changed[:1]
 
 
 def missing(plan: EvaluationPlan) -> Ranges | None:

@@ -75,7 +75,7 @@ def test_things_are_seen_as_object_slots() -> None:
 
 @needs_assets
 @pytest.mark.slow
-def test_things_are_drawn(gl: str) -> None:
+def test_things_are_drawn() -> None:
     sim = simulate(SHELF)
     sim.reset(7)
     geoms, model = sim.geoms(), sim._drawing()[0]
