@@ -12,6 +12,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 os.environ["MEMOBENCH_PROMPT_CACHE"] = "off"  # tests simulate what they check, and leave nothing in the user's cache
 
+import ctypes.util
 import functools
 import gc
 
@@ -43,18 +44,9 @@ def log_handlers_end_with_the_test() -> Iterator[None]:
 
 
 @pytest.fixture
-def gl() -> Iterator[str]:
-    """Skip without a GL library; free what was opened afterwards."""
-    from lerobot_memobench.errors import MemobenchError
-    from lerobot_memobench.sim.gl.context import gl_backend
-    from lerobot_memobench.sim.rendering import close_renderers
-
-    try:
-        backend = gl_backend()
-    except MemobenchError as error:
-        pytest.skip(str(error))
-    before = os.environ.get("MUJOCO_GL")
-    yield backend
-    close_renderers()
-    if before is None:
-        os.environ.pop("MUJOCO_GL", None)
+def gl() -> str:
+    """Return with what MuJoCo's own renderer draws here; skip without its library."""
+    backend = os.environ.get("MUJOCO_GL", "egl")
+    if ctypes.util.find_library({"egl": "EGL", "osmesa": "OSMesa"}.get(backend, backend)) is None:
+        pytest.skip(f"MuJoCo's own renderer has no {backend} here")
+    return backend

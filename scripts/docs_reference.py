@@ -211,7 +211,7 @@ def spaces_page() -> str:
     slots = {
         "present": "1; 0 for an empty slot, all zeros",
         "class": "index of the class, `memobench objects` lists them",
-        "position": "origin in the world, m",
+        "position": "origin in the world, m; of LIBERO's drawers and knob the handle's",
         "rotation": "first two columns of the rotation matrix",
         "joint": "drawer m, door and knob rad, else 0",
         "highlighted": "1 while it stands in the prompt's highlight",

@@ -14,7 +14,7 @@ from tests.support.labelled_images import BOWLS, synthetic
 
 
 @pytest.mark.slow
-def test_an_episode_is_made_once_and_the_same_again(gl: str, tmp_path: Path) -> None:
+def test_an_episode_is_made_once_and_the_same_again(tmp_path: Path) -> None:
     pictures = DetectorData([BOWLS], 30_000, 1, 2).pictures(tmp_path, TRAINED)
     assert PER_FRAME <= len(pictures) <= 2 * PER_FRAME
     (file,) = tmp_path.glob("*.npy")

@@ -199,7 +199,7 @@ def test_a_detector_is_not_trained_on_the_evaluation(tmp_path: Path, capsys: pyt
 
 
 @pytest.mark.slow
-def test_the_package_detector_detects_and_its_tokens_are_white(gl: str, tmp_path: Path) -> None:
+def test_the_package_detector_detects_and_its_tokens_are_white(tmp_path: Path) -> None:
     detector = load_detector(SHIPPED)
     assert SHIPPED.stat().st_size <= 6_000_000
     assert detector.kinds == kinds()

@@ -15,7 +15,7 @@ from tests.support.labelled_images import BOWLS, DRAWERS, simulation
 
 
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_geoms_are_those_that_rays_meet(gl: str, camera: str) -> None:
+def test_geoms_are_those_that_rays_meet(camera: str) -> None:
     sim = simulation(DRAWERS)
     geoms, row = sim.geoms(camera), Labeller(sim).take(camera)
     group, hit = np.zeros(6, np.uint8), np.zeros(1, np.int32)
@@ -29,7 +29,7 @@ def test_geoms_are_those_that_rays_meet(gl: str, camera: str) -> None:
     assert (geoms[pixels[:, 0], pixels[:, 1]] == met).mean() > 0.98  # but for some on edges
 
 
-def test_drawing_geoms_leaves_pictures_as_they_are(gl: str) -> None:
+def test_drawing_geoms_leaves_pictures_as_they_are() -> None:
     sim = simulation(BOWLS)
     before = sim.render()
     sim.data.joint("butter_1_joint0").qpos[0] += 0.1
@@ -43,7 +43,7 @@ def test_drawing_geoms_leaves_pictures_as_they_are(gl: str) -> None:
 
 
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_the_mask_covers_what_is_projected(gl: str, camera: str) -> None:
+def test_the_mask_covers_what_is_projected(camera: str) -> None:
     """Butter is convex and lies free: its origin projects to the middle of what shows it."""
     sim = simulation(BOWLS)
     row = Labeller(sim).take(camera)
@@ -58,7 +58,7 @@ def test_the_mask_covers_what_is_projected(gl: str, camera: str) -> None:
     assert 0.05 < depth < 1.5
 
 
-def test_rays_undo_projection(gl: str) -> None:
+def test_rays_undo_projection() -> None:
     sim = simulation(BOWLS)
     row = Labeller(sim).take("agentview")
     points = row["things"]["position"][: row["count"]].astype(float)
@@ -66,7 +66,7 @@ def test_rays_undo_projection(gl: str) -> None:
     assert np.allclose(row["eye"] + rays(places, row) * depths[:, None], points, atol=1e-6)
 
 
-def test_drawers_are_told_apart_and_say_how_far_they_are_open(gl: str) -> None:
+def test_drawers_are_told_apart_and_say_how_far_they_are_open() -> None:
     sim = simulation(DRAWERS)
     sim.data.joint("wooden_cabinet_1_middle_level").qpos[0] = -0.1
     mujoco.mj_fwdPosition(sim.model, sim.data)
@@ -77,7 +77,7 @@ def test_drawers_are_told_apart_and_say_how_far_they_are_open(gl: str) -> None:
     assert np.isnan(joints["wooden_cabinet"])
 
 
-def test_what_is_out_of_sight_is_not_labelled(gl: str) -> None:
+def test_what_is_out_of_sight_is_not_labelled() -> None:
     sim = simulation(BOWLS)
     sim.data.joint("butter_1_joint0").qpos[2] = -3
     mujoco.mj_fwdPosition(sim.model, sim.data)

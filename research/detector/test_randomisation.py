@@ -83,7 +83,7 @@ def test_a_held_thing_is_between_the_fingers() -> None:
     assert np.allclose(turned[:, 2], -rotation[:, 2], atol=1e-6)
 
 
-def test_a_moment_looks_the_same_until_things_are_put(gl: str) -> None:
+def test_a_moment_looks_the_same_until_things_are_put() -> None:
     sim = simulation(DRAWERS)
     sim.step(np.full(7, 0.5))
     crowd = with_distractors(sim, np.random.default_rng(0))
@@ -101,7 +101,7 @@ def test_a_moment_looks_the_same_until_things_are_put(gl: str) -> None:
         assert (far > 8).mean() < 0.002  # floats of other models differ in a last bit, and pixels of edges with it
 
 
-def test_all_classes_come_alike(gl: str) -> None:
+def test_all_classes_come_alike() -> None:
     sim, rng = simulation(DRAWERS), np.random.default_rng(0)
     own = {asset.class_name for asset in sim.assets.values()}
     chosen = [
@@ -112,7 +112,7 @@ def test_all_classes_come_alike(gl: str) -> None:
     assert len(set.union(*chosen) | own) > 0.9 * len(object_classes())
 
 
-def test_some_are_seen_when_they_are_put(gl: str) -> None:
+def test_some_are_seen_when_they_are_put() -> None:
     sim, rng = simulation(DRAWERS), np.random.default_rng(0)
     crowd = with_distractors(sim, rng)
     randomise, labeller, seen = DomainRandomisation(crowd, rng), Labeller(crowd), []

@@ -42,7 +42,7 @@ def test_where_the_hand_stands_is_no_answer_and_rest_is_as_long_as_the_goal_says
 PAN = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
 
 
-def test_the_arm_comes_home_and_the_simulation_goes_on_as_if_it_had_not(gl: None) -> None:
+def test_the_arm_comes_home_and_the_simulation_goes_on_as_if_it_had_not() -> None:
     task = get_task(PAN)
     runs = []
     for look in (False, True):
@@ -109,7 +109,7 @@ def relaxed(goal: Formula) -> Formula:
     ids=["a tally", "a look"],
 )
 def test_the_search_finds_notes_and_looks_that_goals_allow(
-    gl: None, name: str, variants: list[int], answers: list[str], without: float
+    name: str, variants: list[int], answers: list[str], without: float
 ) -> None:
     asked = [get_task(name).variant(k) for k in variants]
     found = {}

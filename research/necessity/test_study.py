@@ -256,7 +256,7 @@ def test_the_command_shows_a_table_and_names_its_files(
 
 
 @pytest.mark.slow
-def test_stove_and_pan_in_the_simulator(gl: None, tmp_path: Path) -> None:
+def test_stove_and_pan_in_the_simulator(tmp_path: Path) -> None:
     """The dark stove asks for two answers; putting the pan on the lit burner is a way that needs no memory."""
     result = study(get_task(PAN), "fixed", Settings(episodes=1, budget=3000), tmp_path)
     assert result["expert"] == {"n": 1, "success": 1}
@@ -273,7 +273,7 @@ def test_stove_and_pan_in_the_simulator(gl: None, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_two_cartons_in_the_simulator(gl: None, tmp_path: Path) -> None:
+def test_two_cartons_in_the_simulator(tmp_path: Path) -> None:
     """Which carton was highlighted cannot be seen when the policy may act, and a wrong one stays on the plate."""
     result = study(get_task(MILK), "random", Settings(episodes=1, budget=1500), tmp_path)
     assert result["in_order"]["chance"] == 0.5
@@ -286,7 +286,7 @@ def test_two_cartons_in_the_simulator(gl: None, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_counting_in_the_simulator(gl: None, tmp_path: Path) -> None:
+def test_counting_in_the_simulator(tmp_path: Path) -> None:
     """The dark stove comes back with the hand at home; who does not count stops by chance, and no map ever stops."""
     task = get_task("turn_the_stove_on_and_off_a_given_number_of_times")
     result = study(task, "drawn", Settings(episodes=1), tmp_path)
@@ -299,7 +299,7 @@ def test_counting_in_the_simulator(gl: None, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_hidden_thing_in_the_simulator(gl: None, tmp_path: Path) -> None:
+def test_a_hidden_thing_in_the_simulator(tmp_path: Path) -> None:
     """Three starts look the same, and a wrong drawer ends the search for the thing."""
     task = get_task("find_the_artichoke_hidden_in_one_of_the_drawers")
     result = study(task, "drawn", Settings(episodes=1), tmp_path)

@@ -30,8 +30,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
 from lerobot_memobench.sim.controller import MASS_BY_DATA
-from lerobot_memobench.sim.gl.context import gl_backend, renderer_name
-from lerobot_memobench.sim.rendering import RenderSettings, close_renderers
+from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
@@ -39,12 +38,16 @@ from research.speed.threads import by_the_libraries
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 """What is measured unless another task is named: its bowls have the most contacts of the catalogue's usual scenes."""
+STOCK_GL = os.environ.get("MUJOCO_GL", "egl")
+"""With what stock robosuite draws."""
 
 
 @cache
 def machine() -> str:
-    """Return processor, cores, GL device and versions, for a reader to compare with."""
-    return f"{_processor()}, {cores()} cores, {_gl_device()}, {platform.system()}, mujoco {mujoco.__version__}"
+    """Return processor, cores, versions and what draws stock's pictures, for a reader to compare with."""
+    return (
+        f"{_processor()}, {cores()} cores, {platform.system()}, mujoco {mujoco.__version__}, stock drawn by {STOCK_GL}"
+    )
 
 
 def _processor() -> str:
@@ -54,12 +57,6 @@ def _processor() -> str:
     except OSError:
         return model
     return names[0].split(":", 1)[1].strip() if names else model
-
-
-def _gl_device() -> str:
-    device = renderer_name()
-    close_renderers()
-    return f"stock drawn by {gl_backend()} on {device}"
 
 
 # --- the sides ---
@@ -144,7 +141,7 @@ def stock_robosuite(images: bool = True) -> Any:
     """
     if MASS_BY_DATA:
         raise MemobenchError(f"robosuite's controllers need MuJoCo before 3.10, found {mujoco.__version__}")
-    os.environ["MUJOCO_GL"] = gl_backend()
+    os.environ["MUJOCO_GL"] = STOCK_GL
     logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -232,7 +229,6 @@ def _serve(opened: Callable[[], AbstractContextManager[Any]], pipe: Any) -> None
 @contextmanager
 def stock_open(images: bool) -> Iterator[Apart]:
     """Yield stock robosuite in a process of its own, whose libraries take the threads that they take by themselves."""
-    machine()  # asks GL now, not while something is drawn
     side = Apart(partial(_stock, images), by_the_libraries())
     try:
         yield side

@@ -32,7 +32,6 @@ def test_the_policy_looks_as_often_as_it_is_told() -> None:
             assert [number for number in range(1, 7) if policy.needs_observation()] == looks
 
 
-@pytest.mark.usefixtures("gl")
 def test_both_sides_draw_the_same_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """The environment alone, and the whole of LeRobot's evaluation."""
     import lerobot_memobench.registration  # noqa: F401
@@ -109,7 +108,6 @@ def test_the_rule_is_shown_as_a_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("gl")
 def test_the_rule_is_measured() -> None:
     one, two = evaluation.thread_rule(rounds=1, steps=5)
     assert one.ours > 0

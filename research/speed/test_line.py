@@ -31,7 +31,7 @@ def test_table_names_machine_and_ratio() -> None:
     assert "| step with images | 2 ms | 20 ms | 10× |  |  |  | quality fast |" in text
 
 
-def test_a_line_states_both_clocks_as_medians_of_pairs(gl: str) -> None:
+def test_a_line_states_both_clocks_as_medians_of_pairs() -> None:
     """The wall's ratio is the claim; a round in which another program computed moves neither clock's median."""
     quiet = Times(0.010, 0.012), Times(0.100, 0.156)
     disturbed = Times(0.050, 0.012), Times(0.100, 0.156)

@@ -36,7 +36,7 @@ def test_waiting_is_no_work() -> None:
     assert taken.cpu < taken.wall
 
 
-def test_the_vector_environment_is_lerobots(gl: str) -> None:
+def test_the_vector_environment_is_lerobots() -> None:
     side = Vectored()
     [inner] = side.env.envs
     side.step(np.zeros(7))
@@ -46,7 +46,7 @@ def test_the_vector_environment_is_lerobots(gl: str) -> None:
     side.close()
 
 
-def test_our_side_steps_as_the_environment_does(gl: str) -> None:
+def test_our_side_steps_as_the_environment_does() -> None:
     ours = Ours(images=True)
     assert [image.shape for image in ours.look()] == [(256, 256, 3)] * 2
     ours.step(np.zeros(7))

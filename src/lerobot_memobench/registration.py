@@ -1,6 +1,6 @@
 """Make the environment ``memobench`` and the policies ``memobench_*`` known to LeRobot.
 
-The configuration modules register themselves when imported; they import neither simulator nor model code nor GL.
+The configuration modules register themselves when imported; they import neither simulator nor model code.
 """
 
 import lerobot_memobench.envs.configuration_memobench

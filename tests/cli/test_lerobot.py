@@ -560,12 +560,6 @@ def test_a_dataset_folder_that_is_not_there(training: Called, capsys: pytest.Cap
     assert "memobench generate" in refused(["train", "policy=act", "dataset=nothing"], training, capsys)
 
 
-def test_no_gl_library(evaluation: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
-    assert "libegl1" in refused(["eval", "env=memobench", "env.render=high"], evaluation, capsys)
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

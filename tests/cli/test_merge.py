@@ -83,15 +83,6 @@ def test_a_card_is_repeated(fake_loop: Any, capsys: pytest.CaptureFixture[str]) 
     assert f"not repeated: {DRAWER}, episode 0: steps is 109 on the card and 5 here" in out
 
 
-def test_without_pictures_nothing_to_draw_with_is_needed(fake_loop: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MUJOCO_GL", "glfw")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    assert lerobot([*COMMAND, "output_dir=pictures", "env.render=high"]) == 2
-    assert lerobot([*COMMAND, "output_dir=out", "env.render=high", "obs_type=environment_state_agent_pos"]) == 0
-    assert memobench(["rerun", "out", "--out", "again"]) == 0
-
-
 def test_a_part_alone_is_repeated_as_a_part(fake_loop: Any) -> None:
     assert lerobot([*COMMAND, "output_dir=out", "shard=2/2"]) == 0
     fake_loop.ran.clear()

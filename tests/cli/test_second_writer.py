@@ -96,7 +96,7 @@ def test_a_second_writer_changes_nothing(
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("of the first run")
     parts: dict[str, Any] = {"protocol": {"tasks": [STOVE], "episodes": 2}, "policy": {}, "checkpoint": None}
-    started = [run_facts(["lerobot", "eval"], 1, {})]
+    started = [run_facts(["lerobot", "eval"], 1)]
     write_card(Path("out"), new_card(**parts, trained_on=None, task_files={}, flags=[], runs=started))
     for name in ("ds/.staging/episodes/.tmp-000000", "html/videos/run", f"data/{FOLDER}"):
         Path(name).mkdir(parents=True)

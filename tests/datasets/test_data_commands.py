@@ -45,7 +45,6 @@ def test_convert(call, monkeypatch):
         "source": Path("src"),
         "out": Path("ds"),
         "upside_down": True,
-        "world": "memobench",
         "workers": 1,
         "repo_id": "a/b",
     }

@@ -322,6 +322,11 @@ def test_what_cannot_be_asked_for(tasks, recorded, tmp_path, arguments, message)
     assert not (tmp_path / "ds").exists()
 
 
+def test_hdf5_is_of_this_packages_own_world(tasks, recorded, tmp_path):
+    with pytest.raises(MemobenchError, match=r"'hdf5' was asked for with world=libero"):
+        run([task.in_world("libero") for task in tasks], tmp_path / "ds", formats=["hdf5"])
+
+
 @needs_datatrove
 def test_datatroves_local_executor_makes_the_same(tasks, recorded, tmp_path):
     heard = []

@@ -44,7 +44,7 @@ def test_the_module_may_stand_before_the_id() -> None:
 
 
 @pytest.mark.parametrize("name", [STOVE, STRICT])
-def test_it_passes_gymnasiums_checker_without_a_warning(gl: str, name: str) -> None:
+def test_it_passes_gymnasiums_checker_without_a_warning(name: str) -> None:
     env = make(name, obs_type=BOTH, reward=CHECKPOINTS)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -58,7 +58,7 @@ def test_prompts_have_one_length_in_strict_tasks_alone(suite: str) -> None:
 
 @pytest.mark.parametrize("name", [STOVE, HIGHLIGHT])
 def test_actions_have_no_effect_and_nothing_is_simulated_while_it_idles(
-    name: str, monkeypatch: pytest.MonkeyPatch, gl: str
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = {"step": 0, "render": 0}
 

@@ -25,9 +25,6 @@ HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_t
 SEEDS = [7, 8, 9, 10]
 
 
-pytestmark = pytest.mark.usefixtures("gl")  # every observation holds images
-
-
 def make(name: str, **settings: Any) -> MemobenchEnv:
     return MemobenchEnv(name, **settings)
 

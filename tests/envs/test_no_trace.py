@@ -62,7 +62,7 @@ def check_state(sim: Simulation, joints: dict[str, float], places: dict[str, NDA
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow) if name in ALIKE else name for name in EVENTS]
 )
-def test_an_event_leaves_no_trace(name: str, seed: int, gl: str) -> None:
+def test_an_event_leaves_no_trace(name: str, seed: int) -> None:
     env = MemobenchEnv(name, obs_type=BOTH, prompt_in=RESET)
     first, _ = env.reset(seed=seed)
     assert first["step"] == [NO_CLOCK]
@@ -148,9 +148,7 @@ QUICK = {
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in DRAWN]
 )
-def test_every_variant_of_a_seed_begins_its_execution_alike(
-    name: str, monkeypatch: pytest.MonkeyPatch, gl: str
-) -> None:
+def test_every_variant_of_a_seed_begins_its_execution_alike(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures, objects, arm and clock: what was shown, hidden or asked for is in none of them, to the bit."""
     task = get_task(name)
     env = MemobenchEnv(task.name, obs_type=BOTH, referent="random", prompt_in=RESET)
@@ -175,7 +173,7 @@ def test_every_variant_of_a_seed_begins_its_execution_alike(
     env.close()
 
 
-def test_a_hidden_thing_is_out_of_sight_and_the_rest_is_as_it_was(gl: str) -> None:
+def test_a_hidden_thing_is_out_of_sight_and_the_rest_is_as_it_was() -> None:
     name = "find_the_tomato_or_the_biscuit_hidden_in_two_of_the_drawers"
     sim = Simulation(get_task(name))
     sim.reset(20_000)

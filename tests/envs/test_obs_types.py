@@ -105,7 +105,7 @@ def test_a_prompt_within_reset_ends_with_the_objects_of_the_execution() -> None:
 
 @pytest.mark.slow  # of pictures alone it is no slow test: test_memobench_env.py
 @pytest.mark.parametrize("obs_type", [OBJECTS, BOTH])
-def test_batches_of_one_and_three_sync_and_async(obs_type: str, gl: str, tmp_path: Path) -> None:
+def test_batches_of_one_and_three_sync_and_async(obs_type: str, tmp_path: Path) -> None:
     def roll(env: gym.vector.VectorEnv, seeds: list[int]) -> dict[str, Any]:
         env.reset(seed=seeds)
         for plan in np.stack([moves(seed, 8) for seed in seeds], axis=1):
@@ -148,7 +148,7 @@ def test_objects_that_nobody_looks_at_are_those_seen_last() -> None:
 
 
 def test_a_film_shows_every_step_and_other_episodes_are_not_drawn(
-    gl: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[int] = []
     images = Episode.images

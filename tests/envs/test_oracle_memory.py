@@ -19,9 +19,6 @@ SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_i
 SEED = 10_000
 
 
-pytestmark = pytest.mark.usefixtures("gl")
-
-
 def expected(name: str, referent: str) -> list[str]:
     """Instructions that training reads for a demonstration's frames."""
     demo = record_demonstration(get_task(name), SEED, images=False, referent=referent)

@@ -124,7 +124,7 @@ def seed_that_idles_little(name: str) -> int:
     ],
 )
 def test_a_rollout_is_the_same_without_the_cache_while_it_is_written_and_from_it(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, longest: int | None, gl: str
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, longest: int | None
 ) -> None:
     if longest is not None:
         monkeypatch.setattr(episode_module, "PROMPT_HORIZON", longest)

@@ -139,7 +139,6 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A command that takes a name out of a file for a path would leave something in one of these folders."""
     (tmp_path / "whole").mkdir()
     monkeypatch.chdir(tmp_path / "whole")
-    monkeypatch.setattr(again, "gl_facts", lambda _render: {"GL backend": "egl"})
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -66,7 +66,7 @@ def test_views_are_the_cameras(camera: str) -> None:
 
 
 @pytest.mark.parametrize("task", [BOWLS, DRAWERS, STOVE])
-def test_perfect_detections_are_the_simulators_slots(gl: str, localizer: ObjectLocalizer, task: str) -> None:
+def test_perfect_detections_are_the_simulators_slots(localizer: ObjectLocalizer, task: str) -> None:
     sim = bent(simulation(task))
     sim.highlights = (highlight_of(sim, next(name for name, asset in sim.assets.items() if asset.kind == "object")),)
     labeller = Labeller(sim)
@@ -168,7 +168,7 @@ def test_a_kind_that_this_version_does_not_know_is_passed_over() -> None:
         assert len(objects_of(foreign.slots({"agentview": detected, "wrist": detected[:0]}, views_of(state)))) == count
 
 
-def test_the_package_detector_detects_what_stands_on_a_table(gl: str) -> None:
+def test_the_package_detector_detects_what_stands_on_a_table() -> None:
     sim = simulation(BOWLS)
     pictures = {name: torch.from_numpy(sim.render(name)).permute(2, 0, 1)[None] / 255 for name in MJCF_CAMERAS}
     found = ObjectLocalizer(load_detector(PACKAGE))(pictures, torch.from_numpy(sim.proprio())[None])

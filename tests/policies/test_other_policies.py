@@ -265,7 +265,7 @@ class Watched:
 
 
 @pytest.fixture
-def lerobot_eval(gl: str, tmp_path: Path) -> Any:
+def lerobot_eval(tmp_path: Path) -> Any:
     """Two episodes with prompts of different lengths in one batch, by LeRobot's own command."""
     import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
 

@@ -55,7 +55,7 @@ def with_card(folder: Path, shard: str, policy: str = "act", task_hash: str = "1
         trained_on=None,
         task_files={"a": task_hash},
         flags=["--env.tasks=a"],
-        runs=[run_facts(["lerobot", "eval", f"shard={shard}"], 1, {})],
+        runs=[run_facts(["lerobot", "eval", f"shard={shard}"], 1)],
         shard=shard,
     )
     write_card(folder, card)

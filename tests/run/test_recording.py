@@ -24,7 +24,6 @@ COMMAND = ["eval", "env=memobench", f"tasks={TASK}", "policy=memobench_random", 
 COMMAND += ["demonstration_prompt=false", "eval.use_async_envs=false", "eval.recording=true"]
 
 
-@pytest.mark.usefixtures("gl")
 def test_batches_of_several_rows_go_on_with_their_datasets(tmp_path: Path) -> None:
     """Four episodes in two batches of two rows, with pictures; then the fifth and sixth by resume=true."""
     out = tmp_path / "out"

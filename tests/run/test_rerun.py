@@ -23,7 +23,7 @@ from lerobot_memobench.run.arguments import field_types, without_none
 from lerobot_memobench.run.card import checkpoint_files, new_card, tree_hash, with_episodes, write_card
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.rerun import allowed_flags, check_policy, plan_of_card, repeatable_card
+from lerobot_memobench.run.rerun import allowed_flags, check_policy, differences_here, plan_of_card, repeatable_card
 
 STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
@@ -53,7 +53,7 @@ def make_checkpoint(folder: Path, kind: str = "memobench_random") -> None:
 def card(flags: Any, **changes: Any) -> dict[str, Any]:
     asked = {"tasks": [STOVE], "episodes": 1}
     parts: dict[str, Any] = {"protocol": asked, "policy": {}, "checkpoint": None, "trained_on": None}
-    runs = [run_facts(["lerobot", "eval"], 1, {})]
+    runs = [run_facts(["lerobot", "eval"], 1)]
     return with_episodes(new_card(**{**parts, "task_files": {}, "flags": [], "runs": runs}), [RECORD]) | {
         "flags": flags,
         **changes,
@@ -181,6 +181,14 @@ def test_a_card_runs_no_more_than_its_episodes(flags: list[str], said: str) -> N
     write_card(Path(), card([*BENCHMARK, *flags]))
     with pytest.raises(MemobenchError, match=said):
         rerun.repeat(Path("card.json"), None, None, lambda plan: pytest.fail("it was run"), print)
+
+
+def test_a_card_says_where_opengl_drew_its_pictures() -> None:
+    plain = card(BENCHMARK)
+    (run,) = plain["runs"]
+    assert differences_here({"runs": [run, {**run, "gl": {"GL backend": "none, drawn on the CPU"}}]}) == []
+    (note,) = differences_here({"runs": [{**run, "gl": {"GL backend": "egl", "GL renderer": "llvmpipe"}}]})
+    assert "used GL backend egl (here none, drawn on the CPU)" in note
 
 
 def test_a_repetition_records_nothing() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from lerobot_memobench.evaluation.memory_reads import find_reads
 from lerobot_memobench.run.memory_reads import ReadLog
 from lerobot_memobench.run.rollout import Actor, roll
 from lerobot_memobench.sim.object_layout import SIZE
-from lerobot_memobench.sim.rendering import close_renderers
 
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 PROMPT, HORIZON, PLAN = 6, 9, 4
@@ -37,11 +35,9 @@ STATISTICS = {
 
 
 @pytest.fixture(autouse=True)
-def short_prompts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def short_prompts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut prompt videos off after some steps."""
     monkeypatch.setattr(episode, "PROMPT_HORIZON", PROMPT)
-    yield
-    close_renderers()
 
 
 @pytest.fixture

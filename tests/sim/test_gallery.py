@@ -34,7 +34,7 @@ def test_long_labels_are_wrapped_and_not_cut() -> None:
     assert max(ImageFont.load_default(10).getlength(line) for line in wrapped) <= 60
 
 
-def test_tasks_stand_under_their_memory_type(gl: str) -> None:
+def test_tasks_stand_under_their_memory_type() -> None:
     one = gallery.draw_tasks([STOVE], size=64)
     two = gallery.draw_tasks([STOVE, BOWLS], size=64)
     assert (one.width, two.width) == (64 + 12, 64 + 12)
@@ -57,7 +57,7 @@ def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
         gallery.save(Image.new("RGB", (4, 4)), tmp_path / "file" / "figure.png")
 
 
-def test_sheets(gl: str) -> None:
+def test_sheets() -> None:
     objects = gallery.draw_objects(["butter", "milk"], size=32)
     assert objects.width == 2 * 4 * 32 + 18
     closed_and_open = np.asarray(gallery.draw_fixtures(["microwave"], size=64)).astype(int)

@@ -108,7 +108,6 @@ def seen_pixels(sim: Simulation, name: str) -> int:
     return int((pictures[0] != pictures[1]).any(axis=-1).sum())
 
 
-@pytest.mark.usefixtures("gl")
 @pytest.mark.parametrize("name", [pytest.param(NINE, marks=pytest.mark.slow), DRAWERS])
 def test_what_shows_many_pixels_is_there_and_what_shows_none_is_not(name: str) -> None:
     episode = Episode(get_task(name), demonstration_prompt=False, render=RenderSettings(256, 256, "fast"))

@@ -13,12 +13,13 @@ from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.task import MEMOBENCH
 
 
-def drawn_steps(task_name: str, seed: int, frames: int, exec_start: int = 0) -> Demonstration:
+def drawn_steps(task_name: str, seed: int, frames: int, exec_start: int = 0, world: str = MEMOBENCH) -> Demonstration:
     """Return as many steps of drawn actions; ``exec_start`` of them are of the prompt."""
     actions = np.random.default_rng(seed).uniform(-1, 1, (frames, 7)).astype(np.float32)
-    return resimulate(get_task(task_name), seed, actions, exec_start)
+    return resimulate(get_task(task_name).in_world(world), seed, actions, exec_start)
 
 
 def beginning(demo: Demonstration, frames: int) -> Demonstration:

@@ -174,7 +174,6 @@ def convert(
     upside_down: Annotated[
         bool, typer.Option("--upside-down", help="The images are stored bottom row first: turn them up.")
     ] = False,
-    world: WhichWorld = World.MEMOBENCH,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
 ) -> int:
@@ -193,7 +192,6 @@ def convert(
             source,
             out,
             upside_down=upside_down,
-            world=world.value,
             workers=workers,
             progress=advance,
             tell=partial(screen.print, soft_wrap=True),

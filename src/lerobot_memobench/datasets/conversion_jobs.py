@@ -7,11 +7,12 @@ from pathlib import Path
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5.reading import Problem, PublishedDemo, PublishedFile, Unusable, usable_or_named
-from lerobot_memobench.datasets.hdf5.restore import NO_SEED, other_scene, restore, task_of, unlike_the_catalogue
+from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore, task_of, unlike_the_catalogue, world_of
 from lerobot_memobench.datasets.lerobot_format.layout import EpisodeRecord
 from lerobot_memobench.datasets.staging import EpisodeStage, StagedJob, episode_info, stage_failure
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, World
+from lerobot_memobench.sim.worlds import KINDS
+from lerobot_memobench.tasks.task import World
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,6 @@ class ConversionJob(StagedJob):
     image_size: tuple[int, int]
     frames: int
     upside_down: bool = False
-    world: World = MEMOBENCH
 
     @property
     def task_name(self) -> str:
@@ -60,7 +60,7 @@ class ConversionJob(StagedJob):
                     f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
                     f"demonstration {self.image_size[0]}×{self.image_size[1]}"
                 )
-            demo = restore(task_of(file, found).in_world(self.world), found)
+            demo = restore(task_of(file, found), found)
             EpisodeRecord.model_validate(episode_info(demo))  # here it ends one episode, when the tables are made all
             return demo
 
@@ -72,23 +72,26 @@ class Plan:
     Attributes:
         folder: where episodes are staged.
         upside_down: whether pictures are stored bottom row first.
-        world: of the scenes that states are put into.
         jobs: one per demonstration that looks as it should.
         problems: files and groups that cannot be used, and why.
         notes: differences of the others to what this package writes.
-        image_size: (height, width) of the first demonstration, which all have.
+        image_size, world: (height, width) and world of the first demonstration, which all have.
     """
 
     folder: Path
     upside_down: bool
-    world: World = MEMOBENCH
     jobs: list[ConversionJob] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
     notes: list[Problem] = field(default_factory=list)
     image_size: tuple[int, int] | None = None
+    world: World | None = None
 
     def add(self, path: Path) -> None:
-        """Look through a file."""
+        """Look through a file.
+
+        Raises:
+            MemobenchError: its world's files are not installed.
+        """
         try:
             with PublishedFile(path) as file, usable_or_named():
                 self.problems += _miscounted(file)
@@ -101,23 +104,31 @@ class Plan:
     def _add_group(self, file: PublishedFile, group: str) -> None:
         try:
             demo = file.read(group)
+            self._check_world(demo)
             self.add_job(file.path, group, demo.image_size, len(demo.states))
-            self.notes += _notes(file, demo, self.world)
+            self.notes += _notes(file, demo)
         except Unusable as error:
             self.problems.append(Problem(str(file.path), f"data/{group}", str(error)))
+
+    def _check_world(self, demo: PublishedDemo) -> None:
+        world = world_of(demo)
+        self.world = self.world or world
+        if world != self.world:
+            raise Unusable(f"its scenes are of world={world}, those before of {self.world}; convert each by itself")
+        KINDS[world].check()
 
     def add_job(self, path: Path, group: str, image_size: tuple[int, int], frames: int) -> None:
         """Add a demonstration; its job refuses pictures that have not the size of the first one's."""
         self.image_size = self.image_size or image_size
         folder = self.folder / f"{len(self.jobs):06d}"
-        self.jobs.append(ConversionJob(path, group, folder, self.image_size, frames, self.upside_down, self.world))
+        self.jobs.append(ConversionJob(path, group, folder, self.image_size, frames, self.upside_down))
 
 
-def _notes(file: PublishedFile, demo: PublishedDemo, world: World) -> list[Problem]:
+def _notes(file: PublishedFile, demo: PublishedDemo) -> list[Problem]:
     """Return how a demonstration differs from this package's; nothing where it makes no task or scene."""
     try:
         task = task_of(file, demo).variant(0)
-        reasons = [unlike_the_catalogue(task), None if world == LIBERO else other_scene(demo)]
+        reasons = [unlike_the_catalogue(task)]
     except MemobenchError:  # named when it is converted
         return []
     if file.lacks_its_text:

@@ -46,8 +46,6 @@ from lerobot_memobench.io import Count, free_bytes, in_words, read_json, telling
 from lerobot_memobench.jobs.executors import run_jobs
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
-from lerobot_memobench.sim.worlds import KINDS
-from lerobot_memobench.tasks.task import MEMOBENCH, World
 
 UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
 """Bytes of a frame's pictures in the published files, which do not pack them."""
@@ -81,7 +79,6 @@ def convert(
     *,
     repo_id: str = DEFAULT_REPO_ID,
     upside_down: bool = False,
-    world: World = MEMOBENCH,
     workers: int = 1,
     progress: ProgressCallback | None = None,
     tell: Callable[[str], None] = lambda _: None,
@@ -93,18 +90,16 @@ def convert(
         out: absent, empty, or a conversion of the same files that was not finished.
         repo_id: name of the dataset.
         upside_down: the images are stored as robosuite's renderer gives them, bottom row first: turn them up.
-        world: of the scenes that states are put into: this package's, or ``libero``, which keeps those of LIBERO.
         workers: processes.
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number.
             Of an archive its ``total`` is estimated from the files so far.
         tell: called, before the first episode, with the size of the dataset, and with each file of an archive.
 
     Raises:
-        MemobenchError: there is nothing to convert, ``out`` holds something else, or its disk has no room (what is
-            finished stays).
+        MemobenchError: there is nothing to convert, ``out`` holds something else, its disk has no room (what is
+            finished stays), or LIBERO's assets are not installed, which files of its scenes need.
     """
     source, out = Path(source).absolute(), Path(out)
-    KINDS[world].check()
     if not source.exists():
         raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")
     archive = Archive(source) if is_archive(source) else None
@@ -114,7 +109,6 @@ def convert(
         if archive is None
         else [[member.name, member.size, member.checksum] for member in archive.members],
         "upside_down": upside_down,
-        **({} if world == MEMOBENCH else {"world": world}),
     }
     if is_dataset(out):
         return _finished(out, request)
@@ -124,7 +118,7 @@ def convert(
         telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
         episodes_folder(out, request) as folder,
     ):
-        plan = Plan(folder, upside_down, world)
+        plan = Plan(folder, upside_down)
         if archive is None:
             for path in files:
                 plan.add(path)

@@ -129,7 +129,7 @@ def generate(
     if perturb and policy is not None:
         raise MemobenchError("the arm is to be moved both at random and by a policy; leave out --perturb or --policy")
     settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb, policy)
-    formats = _checked_formats(formats, settings)
+    formats = _checked_formats(formats, settings, tasks)
     plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, formats, repo_id)
     options = options_text(executor, executor_options or {}, NEEDS)
     if finish:
@@ -283,7 +283,7 @@ def _check_seeds(seeds: range) -> None:
             )
 
 
-def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> tuple[str, ...]:
+def _checked_formats(formats: Collection[str], settings: RecordingSettings, tasks: Sequence[Task]) -> tuple[str, ...]:
     """Return the formats in their order, each once."""
     given = [formats] if isinstance(formats, str) else list(formats)
     for name in given:
@@ -298,6 +298,11 @@ def _checked_formats(formats: Collection[str], settings: RecordingSettings) -> t
         )
     if HDF5 in given and not settings.images:
         raise MemobenchError("format 'hdf5' was asked for without images, which its layout holds; record them as well")
+    if HDF5 in given and any(task.world != MEMOBENCH for task in tasks):
+        raise MemobenchError(
+            f"format 'hdf5' was asked for with world={tasks[0].world}, but it holds scenes of world={MEMOBENCH} "
+            "alone; write format lerobot"
+        )
     return tuple(name for name in FORMATS if name in given)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 import subprocess
@@ -10,7 +9,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
-from pathlib import Path
 from typing import Literal
 
 from packaging.requirements import Requirement
@@ -20,7 +18,6 @@ from lerobot_memobench.doctor.probe import TOLERANCE, run_probe
 from lerobot_memobench.errors import MemobenchError, unsupported_system
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
-from lerobot_memobench.sim.gl.context import BACKENDS, gl_backend
 from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
 from lerobot_memobench.tasks.task import LIBERO
@@ -33,14 +30,6 @@ SHOWN = ("lerobot", "torch", "transformers", "mujoco", "robosuite", "numpy", "gy
 
 EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av-dep")
 """Parts of LeRobot that are installed with this project."""
-
-SYSTEM_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri libgles2 libopengl0 libosmesa6"
-
-GL_BACKEND = "GL backend"
-ONLY_HIGH = " (only for env.render=high: other pictures are drawn on the CPU)"
-
-#: GL renderers that run on the CPU.
-SOFTWARE = ("llvmpipe", "softpipe", "swrast", "swiftshader")
 
 
 Status = Literal["ok", "warning", "failed"]
@@ -70,7 +59,6 @@ def examine() -> list[Finding]:
         physics(),
         opencv(),
         plugin(),
-        *rendering(),
         golden_frame(),
         paper_world(),
         ffmpeg(),
@@ -200,54 +188,8 @@ def _installed(name: str) -> str | None:
         return None
 
 
-def rendering() -> Iterator[Finding]:
-    """Yield what each GL backend really does here: `env.render=high` draws with one, everything else without."""
-    if sys.platform != "linux":
-        return
-    wanted = os.environ.get("MUJOCO_GL", "").lower()
-    try:
-        chosen = gl_backend()
-    except MemobenchError as error:
-        chosen = ""
-        fix = SYSTEM_PACKAGES if wanted in ("", *BACKENDS) else "unset MUJOCO_GL, or set it to egl or osmesa"
-        yield Finding(GL_BACKEND, "warning", str(error), fix + ONLY_HIGH)
-    else:
-        origin = "MUJOCO_GL" if wanted else "the first whose library is installed"
-        yield Finding(GL_BACKEND, "ok", f"{chosen} ({origin})")
-    for backend in BACKENDS:
-        yield _backend(backend, used=backend == chosen)
-
-
-def _backend(backend: str, used: bool) -> Finding:
-    """Let a backend draw a sphere."""
-    answer = run_probe("gl", backend)
-    what = f"GL {backend}" + (" (used)" if used else "")
-    if "error" not in answer and answer["sphere"]:
-        return _renderer(what, answer["renderer"], answer["version"])
-    problem = answer["error"] if "error" in answer else f"{answer['renderer']} draws a wrong picture"
-    return Finding(what, "warning", problem, _gl_fix(backend, used) + ONLY_HIGH)
-
-
-def _gl_fix(backend: str, used: bool) -> str:
-    other = next(name for name in BACKENDS if name != backend)
-    return SYSTEM_PACKAGES + (f", or set MUJOCO_GL={other}" if used else "")
-
-
-def _renderer(what: str, renderer: str, version: str) -> Finding:
-    software = any(name in renderer.lower() for name in SOFTWARE)
-    detail = f"{renderer}, {version}" + (" (software, on the CPU)" if software else "")
-    if software and "egl" in what and Path("/dev/nvidia0").exists():
-        return Finding(
-            what,
-            "warning",
-            detail + ", though there is an NVIDIA GPU",
-            "install the driver's GL libraries (in containers: NVIDIA_DRIVER_CAPABILITIES=all)",
-        )
-    return Finding(what, "ok", detail)
-
-
 def golden_frame() -> Finding:
-    """Compare a frame of the benchmark, which is drawn on the CPU, with the one that ships."""
+    """Compare a frame of the benchmark with the one that ships."""
     answer = run_probe("golden")
     if "error" in answer:
         return Finding("golden frame", "failed", answer["error"], "mend what failed above first")

@@ -1,7 +1,7 @@
 """Try one thing that may crash the process, in a process of its own; among them the golden frame.
 
-A driver that is broken ends the process with a signal, which only its parent can report. The child is
-``python -m lerobot_memobench.doctor.probe gl egl`` and prints JSON.
+A library that is broken ends the process with a signal, which only its parent can report. The child is
+``python -m lerobot_memobench.doctor.probe golden`` and prints JSON.
 
 The golden frame is what the benchmark's scene looks like when it is rendered right; one small image ships with the
 package. Pictures are drawn to equal bits everywhere; a machine whose frame differs by more than the tolerance draws
@@ -11,7 +11,6 @@ something else. ``python -m lerobot_memobench.doctor.probe --write-golden`` make
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -28,12 +27,6 @@ from lerobot_memobench.io import draft_of
 
 PROBE = "lerobot_memobench.doctor.probe"
 
-SCENE = """
-<mujoco><worldbody><light pos='0 0 3'/><camera name='eye' pos='0 -1 0' xyaxes='1 0 0 0 0 1'/>
-<geom type='sphere' size='.2' rgba='.9 .2 .1 1'/></worldbody></mujoco>
-"""
-
-
 Frame = NDArray[np.uint8]
 
 GOLDEN_FILE = Path(__file__).with_name("golden.png")
@@ -46,9 +39,9 @@ TOLERANCE = 2.0
 """Largest mean absolute difference, of 255: versions of MuJoCo settle a scene in ways that differ by far less."""
 
 
-def run_probe(*words: str, timeout_s: float = 180.0) -> dict[str, Any]:
+def run_probe(name: str, timeout_s: float = 180.0) -> dict[str, Any]:
     """Run a probe in a process of its own; return its answer, or {"error": …} however it ended."""
-    command = [sys.executable, "-m", PROBE, *words]
+    command = [sys.executable, "-m", PROBE, name]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
     except subprocess.TimeoutExpired:
@@ -62,26 +55,6 @@ def run_probe(*words: str, timeout_s: float = 180.0) -> dict[str, Any]:
     answer = json.loads(lines[-1])
     assert isinstance(answer, dict)
     return answer
-
-
-def gl(backend: str) -> dict[str, Any]:
-    """Render a sphere with a backend; return the GL strings and whether the sphere is there."""
-    # MuJoCo has set PyOpenGL's platform to the backend in use where the parent imported it, and refuses any other.
-    os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_string(SCENE)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    with mujoco.Renderer(model, 64, 64) as renderer:
-        from OpenGL import GL
-
-        renderer.update_scene(data, "eye")
-        image = renderer.render()
-        names = {"renderer": GL.GL_RENDERER, "vendor": GL.GL_VENDOR, "version": GL.GL_VERSION}
-        found = {key: GL.glGetString(name).decode() for key, name in names.items()}
-    centre = image[32, 32].astype(int)
-    return {**found, "sphere": bool(centre[0] > centre[1] + 40)}
 
 
 def golden() -> dict[str, Any]:
@@ -133,7 +106,7 @@ def write_golden() -> Path:
     return GOLDEN_FILE
 
 
-PROBES: dict[str, Callable[..., dict[str, Any]]] = {"gl": gl, "golden": golden, "torchcodec": torchcodec}
+PROBES: dict[str, Callable[[], dict[str, Any]]] = {"golden": golden, "torchcodec": torchcodec}
 
 
 if __name__ == "__main__":
@@ -141,6 +114,6 @@ if __name__ == "__main__":
         print(write_golden())
     else:
         try:
-            print(json.dumps(PROBES[sys.argv[1]](*sys.argv[2:])))
+            print(json.dumps(PROBES[sys.argv[1]]()))
         except Exception as error:
             print(json.dumps({"error": " ".join(f"{type(error).__name__}: {error}".split())[:300]}))

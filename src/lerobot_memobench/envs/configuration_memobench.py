@@ -86,7 +86,7 @@ class MemobenchEnvConfig(EnvConfig):
             first observation; `auto`: in steps for a policy that reads prompts, else in reset.
         horizon: execution steps per episode.
         render: `fast` (no shadows), `default`, or `high` (four samples per pixel, finer shadows, the arm's
-            whole meshes: for films, at ten times the cost; it alone needs a GL library).
+            whole meshes: for films, at ten times the cost).
         render_every: draw images every so many execution steps and repeat the last in between. Set it to the number
             of actions a policy executes per prediction: it looks at nothing else. A policy that remembers the frames
             in between refuses it; `observation.picture_age` has the control steps since the pictures were drawn.
@@ -178,11 +178,6 @@ class MemobenchEnvConfig(EnvConfig):
             path = parser.get_path_arg("policy")
             for check in PATH_CHECKS if path else ():
                 check(path)
-
-    @property
-    def draws(self) -> bool:
-        """Whether a picture is ever asked for, to be observed or to be recorded."""
-        return self.obs_type != OBJECTS or bool(self.videos)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -192,12 +192,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._warned: set[str] = set()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy is made of: all but the running episode, with its scene, generators and GL context."""
+        """Return what a copy is made of: all but the running episode, with its scene and generators."""
         return {**vars(self), "_episode": None, "_video": None, "_began": False}
 
     @property
     def episode(self) -> Episode:
-        """The running episode; its scene is compiled and its GL context opened in the process that first asks."""
+        """The running episode; its scene is compiled in the process that first asks."""
         if self._episode is None:
             self._episode = Episode(self._task, **self._settings)
         return self._episode

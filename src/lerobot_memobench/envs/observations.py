@@ -1,6 +1,6 @@
 """What a policy observes and what it answers: `obs_type`, names, shapes and units, and when frames are drawn.
 
-Cheap to import: no simulator, no GL, no LeRobot.
+Cheap to import: no simulator, no LeRobot.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class Start(TypedDict):
         versions: of Python and packages.
         git_commit: of a checkout of this package.
         machine: processor, cores, GPU, system.
-        gl: what drew the pictures; {} where none were drawn.
+        gl: what drew the pictures, of cards from when OpenGL could; {} where none were drawn.
         times: starts that were alike.
     """
 
@@ -101,7 +101,7 @@ class Start(TypedDict):
     versions: dict[str, str]
     git_commit: str | None
     machine: dict[str, Any]
-    gl: dict[str, Any]
+    gl: NotRequired[dict[str, Any]]
     times: NotRequired[Count]
 
 

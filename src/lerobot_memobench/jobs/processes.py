@@ -112,7 +112,7 @@ def _is_dead_worker(error: BaseException) -> bool:
 @contextlib.contextmanager
 def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     """Processes that end with the one that started them; what still waits when the context ends is dropped."""
-    # Processes are spawned: a forked child would share GL contexts and threads with its parent.
+    # Processes are spawned: a forked child would have locks of its parent's threads, but not the threads.
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
     try:
         yield pool

@@ -7,7 +7,7 @@
     checkpoint    where it was, hash of each file;  trained_on: the dataset it was trained on
     task_files    hash of each task's files
     flags         LeRobot's flags, complete but for folders: `memobench rerun` repeats them;  shard: the part, or null
-    runs          each start, on each machine: command line, versions, commit, machine, GL
+    runs          each start, on each machine: command line, versions, commit, machine
     sealed        on the sealed seeds alone: how often this policy was run on them with this release, and when
     episodes      what was found: outcome, checkpoints' steps and scene hash of every episode
 
@@ -36,7 +36,7 @@ from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
 from lerobot_memobench.protocol import UPSTREAM
 from lerobot_memobench.run.arguments import without_flags
-from lerobot_memobench.run.machine import gl_facts, run_facts
+from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.plan import EvaluationPlan
 
 FORMAT = 1
@@ -46,12 +46,8 @@ CARD_MARKDOWN = "card.md"
 # --- the card of a plan, before anything has been found ---
 
 
-def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
-    """Return the card of an evaluation that is about to begin. Hashes the checkpoint, opens a GL context if need be.
-
-    Args:
-        here: whether it is run on this machine, and what it draws with then counts.
-    """
+def card_of(plan: EvaluationPlan) -> dict[str, Any]:
+    """Return the card of an evaluation that is about to begin. Hashes the checkpoint."""
     shard = plan.options.shard
     card = new_card(
         protocol=_protocol_of(plan),
@@ -60,7 +56,7 @@ def card_of(plan: EvaluationPlan, *, here: bool = True) -> dict[str, Any]:
         trained_on=None,
         task_files=_task_files(plan),
         flags=_flags_of(plan),
-        runs=[run_facts(plan.command, plan.batch, gl_facts(plan.environment.render) if plan.draws and here else {})],
+        runs=[run_facts(plan.command, plan.batch)],
         shard=None if shard is None else str(shard),
     )
     return with_checkpoint(card, plan.policy_path)
@@ -358,8 +354,8 @@ def _run_lines(number: int, run: Mapping[str, Any]) -> list[str]:
     command = " ".join(" ".join(run["command"]).split())
     lines = [f"## Run {number}" + (f" (started {times} times)" if times > 1 else ""), ""]
     lines += [f"    {command}", "", "| | |", "|---|---|"]  # indented: no text ends such a block
-    facts = {"commit": run["git_commit"], "batch size": run["batch_size"]}
-    return lines + [_row(*fact) for fact in ({**run["versions"], **facts, **run["machine"], **run["gl"]}).items()]
+    facts = {"commit": run["git_commit"], "batch size": run["batch_size"], **run["machine"], **run.get("gl", {})}
+    return lines + [_row(*fact) for fact in {**run["versions"], **facts}.items()]
 
 
 # --- whether an episode was drawn as it is drawn here ---

@@ -1,4 +1,4 @@
-"""One start of an evaluation on this machine: versions, commit, processor, what draws the pictures."""
+"""One start of an evaluation on this machine: versions, commit, processor."""
 
 from __future__ import annotations
 
@@ -14,19 +14,14 @@ from lerobot_memobench.jobs.threads import cores, cpu_model
 PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "robosuite", "torch", "transformers", "numpy", "gymnasium")
 
 
-def run_facts(command: Sequence[str], batch: int, gl: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is known of one start of an evaluation on this machine.
-
-    Args:
-        gl: what draws the pictures.
-    """
+def run_facts(command: Sequence[str], batch: int) -> dict[str, Any]:
+    """Return what is known of one start of an evaluation on this machine."""
     return {
         "command": list(command),
         "batch_size": batch,
         "versions": versions(),
         "git_commit": git_commit(),
         "machine": {"cpu": cpu_model(), "cores": cores(), "gpu": gpu_model(), "system": platform.platform()},
-        "gl": dict(gl),
     }
 
 
@@ -70,11 +65,6 @@ def gpu_model() -> str | None:
     return str(torch.cuda.get_device_name(0)) if torch.cuda.is_available() else None
 
 
-def gl_facts(render: str) -> dict[str, str]:
-    """Return what draws pictures of a quality here; opens a GL context where GL does."""
-    from lerobot_memobench.sim.gl.context import gl_backend, renderer_name
-    from lerobot_memobench.sim.rendering import RenderSettings
-
-    if not RenderSettings(quality=render).needs_gl:
-        return {"GL backend": "none, drawn on the CPU"}
-    return {"GL backend": gl_backend(), "GL renderer": renderer_name()}
+def drawn_with(run: Mapping[str, Any]) -> dict[str, str]:
+    """Return the versions of a card's run and what drew its pictures: the CPU, or OpenGL on an older card."""
+    return {**run["versions"], "GL backend": "none, drawn on the CPU", **run.get("gl", {})}

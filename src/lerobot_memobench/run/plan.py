@@ -124,11 +124,6 @@ class EvaluationPlan:
         return {task.name: len(load_task(task.folder).random_variants) for task in self.grid.tasks}
 
     @property
-    def draws(self) -> bool:
-        """Whether pictures are drawn."""
-        return self.environment.draws
-
-    @property
     def going_on(self) -> str:
         """The command line that goes on with it, ready to be typed."""
         folder = self.output if self.options.shard is None else self.output.parent
@@ -260,16 +255,12 @@ def check_scenes(plan: EvaluationPlan) -> None:
 
 
 def _check_simulator(environment: MemobenchEnvConfig) -> None:
-    """Refuse a machine on which every episode would fail: no arm, no assets, or nothing to draw with."""
-    from lerobot_memobench.sim.gl.context import gl_backend
-    from lerobot_memobench.sim.rendering import RenderSettings
+    """Refuse a machine on which every episode would fail: no arm or no assets."""
     from lerobot_memobench.sim.robot import robosuite_version
     from lerobot_memobench.sim.worlds import KINDS
 
     robosuite_version()
     KINDS[environment.world].check()
-    if environment.draws and RenderSettings(quality=environment.render).needs_gl:
-        gl_backend()
 
 
 def _output(arguments: LerobotArguments, options: RunOptions) -> Path:

@@ -38,7 +38,7 @@ from lerobot_memobench.run.arguments import PLAIN, checked_value, chosen_class, 
 from lerobot_memobench.run.arguments import settings as settings_of
 from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_otherwise, tree_hash
 from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
-from lerobot_memobench.run.machine import PACKAGES, gl_facts, versions
+from lerobot_memobench.run.machine import PACKAGES, drawn_with, versions
 from lerobot_memobench.run.plan import ENVIRONMENT, EvaluationPlan, plan_line
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -218,14 +218,12 @@ def check_policy(card: Mapping[str, Any]) -> None:
 
 def differences_here(card: Mapping[str, Any]) -> list[str]:
     """Return in what this machine differs from those that a card's runs were made on."""
-    drawn = any(run["gl"] for run in card["runs"])
-    here = {**versions(), **(gl_facts(card["protocol"]["render"]) if drawn else {})}
+    here = drawn_with({"versions": versions()})
     notes = []
     for run in card["runs"]:
-        told = {**run["versions"], **run["gl"]}
         changed = [
             f"{name} {version} (here {here[name]})"
-            for name, version in told.items()
+            for name, version in drawn_with(run).items()
             if here.get(name, version) != version
         ]
         if changed:

@@ -27,6 +27,7 @@ from lerobot_memobench.run.card import (
     write_card,
 )
 from lerobot_memobench.run.evaluate import evaluate, lerobot_summary
+from lerobot_memobench.run.machine import drawn_with
 from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
 from lerobot_memobench.run.sealed import RUN_FILE, counted
 
@@ -176,11 +177,9 @@ def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
     found = []
     if earlier["batch_size"] != now["batch_size"]:
         found.append(f"batch_size: {earlier['batch_size']} and {now['batch_size']}")
-    for part in ("versions", "gl"):
-        there, here = earlier[part], now[part]
-        changed = [f"{key}: {there[key]} and {here[key]}" for key in here if there.get(key, here[key]) != here[key]]
-        found += changed[:1]
-    return found
+    there, here = drawn_with(earlier), drawn_with(now)
+    changed = [f"{key}: {there[key]} and {here[key]}" for key in here if there.get(key, here[key]) != here[key]]
+    return found + changed[:1]
 
 
 def missing(plan: EvaluationPlan) -> list[Cell]:

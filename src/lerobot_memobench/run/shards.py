@@ -17,7 +17,7 @@ from typing import Any
 from lerobot_memobench.envs.acting import parameters_of
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_text, run_jobs
+from lerobot_memobench.jobs.executors import Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.threads import LARGE, sharing
 from lerobot_memobench.protocol import SEALED
@@ -165,7 +165,7 @@ def _check_folders(plan: EvaluationPlan, out: Path, jobs: Sequence[ShardJob], te
     """Refuse to mix an evaluation with another one in its folder or in those of its parts."""
     check_folder(out)
     if plan.options.resume:
-        card = card_of(plan, here=plan.options.executor not in ELSEWHERE)
+        card = card_of(plan)
         for folder in (out, *(job.folder for job in jobs)):
             resumed_card(folder, card, tell)
     else:

@@ -133,7 +133,6 @@ def _cells(class_name: str, views: Sequence[View], size: int) -> list[tuple[str,
     for label, opened in zip(labels, (False, True), strict=False):
         _open(asset, model, data, opened)
         cells.append((label, np.hstack([renderer.draw(model, data, camera) for camera in cameras])))
-    renderer.free()
     return cells
 
 

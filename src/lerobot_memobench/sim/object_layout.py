@@ -12,7 +12,8 @@ FIELDS = {"present": 1, "class": 1, "position": 3, "rotation": 6, "joint": 1, "h
 """Numbers of a slot, in order.
 
 ``present``: 1, or 0 for an empty slot, which is all zeros. ``class``: index into `object_slots.classes`.
-``position``: of the thing's origin in the world, m. ``rotation``: the first two columns of its rotation matrix.
+``position``: of the thing's origin in the world, m; of its handle where a part has no origin of its own, as LIBERO's
+drawers and knob. ``rotation``: the first two columns of its rotation matrix.
 ``joint``: position of a drawer (m), door or knob (rad), else 0. ``highlighted``: 1 while it stands in a highlight of
 the prompt.
 """

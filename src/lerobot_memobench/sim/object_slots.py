@@ -4,6 +4,9 @@ The observation is a fixed number of slots, flat, float32. A slot is an object, 
 (a drawer, a door, a knob). Slots hold only what a camera of the benchmark sees at this moment:
 rays run from both cameras to points of each thing, and what none of them reaches is absent. They carry no identity:
 they are sorted by class and place, so exchanging two equal objects changes nothing; and no goal, progress or history.
+
+LIBERO's three drawers have one origin, their cabinet's. There a drawer is where its handle is, and a cabinet's drawers
+follow one another from the top, pulled or not. Their heights show as much, so this order adds nothing.
 """
 
 from __future__ import annotations
@@ -56,11 +59,15 @@ class Thing:
 
     Attributes:
         kind: index of its class. body: whose pose it has. joint: address of its joint in qpos, None without one.
+        site: whose position it has instead of the body's, None where it has the body's.
+        ordered_by: the body by whose position it is sorted.
     """
 
     kind: int
     body: int
     joint: int | None
+    site: int | None
+    ordered_by: int
 
 
 class ObjectSlots:
@@ -78,10 +85,14 @@ class ObjectSlots:
         self.things: list[Thing] = []
         self._owner = np.full(sim.model.nbody, -1)
         for name, asset in sim.assets.items():
-            self._add(split_class(asset.class_name)[0], sim.model.body(name).id)
-            for articulation in asset.articulations.values():
-                joint = sim.model.joint(articulation.joint)
-                self._add(articulation.kind, int(sim.model.jnt_bodyid[joint.id]), int(joint.qposadr[0]))
+            root = sim.model.body(name).id
+            self._add(Thing(number(split_class(asset.class_name)[0]), root, None, None, root))
+            for part in asset.articulations.values():
+                joint = sim.model.joint(part.joint)
+                body = int(sim.model.jnt_bodyid[joint.id])
+                site = sim.model.site(part.handle_site).id if part.shares_origin else None
+                ordered_by = root if part.shares_origin else body
+                self._add(Thing(number(part.kind), body, int(joint.qposadr[0]), site, ordered_by))
         if len(self.things) > SLOTS:
             raise MemobenchError(
                 f"task {sim.task.name} has {len(self.things)} objects and moving parts, more than the {SLOTS} that "
@@ -104,14 +115,13 @@ class ObjectSlots:
     def observe(self) -> NDArray[np.float32]:
         """Return the slots (SIZE,) of what is visible in the present state."""
         seen = self._visible()
-        rows = [self._row(thing) for thing, visible in zip(self.things, seen, strict=True) if visible]
-        return in_slots(np.array(rows).reshape(-1, WIDTH))
+        things = [thing for thing, visible in zip(self.things, seen, strict=True) if visible]
+        rows = np.array([self._row(thing) for thing in things]).reshape(-1, WIDTH)
+        return in_slots(rows, rounded(self._sim.data.xpos[[thing.ordered_by for thing in things]]))
 
-    def _add(self, kind: str, body: int, joint: int | None = None) -> None:
-        if kind not in classes():
-            raise MemobenchError(f"object observations know no class {kind!r}; use env.obs_type=pixels_agent_pos")
-        self._owner[body] = len(self.things)
-        self.things.append(Thing(classes().index(kind), body, joint))
+    def _add(self, thing: Thing) -> None:
+        self._owner[thing.body] = len(self.things)
+        self.things.append(thing)
 
     def _surface(self, index: int, body: int) -> Array:
         """Return POINTS points of a thing's opaque geoms, far apart, a little inside, in its body's frame."""
@@ -156,11 +166,11 @@ class ObjectSlots:
 
     def _row(self, thing: Thing) -> Array:
         data = self._sim.data
-        position = data.xpos[thing.body]
+        position = data.xpos[thing.body] if thing.site is None else data.site_xpos[thing.site]
         turned = data.xmat[thing.body].reshape(3, 3)
         joint = 0.0 if thing.joint is None else data.qpos[thing.joint]
         lit = float(is_lit(position, self._sim.highlights))
-        pose = np.round(np.array([*position, *turned[:, 0], *turned[:, 1], joint]) / QUANTUM) * QUANTUM
+        pose = rounded(np.array([*position, *turned[:, 0], *turned[:, 1], joint]))
         return np.array([1.0, thing.kind, *pose, lit]) + 0.0  # no negative zeros
 
 
@@ -169,10 +179,30 @@ def is_lit(position: Array, highlights: Iterable[Highlight]) -> bool:
     return any(np.hypot(*(position[:2] - np.array(mark.position[:2]))) < mark.radius for mark in highlights)
 
 
-def in_slots(things: Array) -> NDArray[np.float32]:
-    """Return things (n, WIDTH) as an observation (SIZE,): in the order of class and place, before empty slots."""
+def number(kind: str) -> int:
+    """Return the index of a class.
+
+    Raises:
+        MemobenchError: there is none of that name.
+    """
+    if kind not in classes():
+        raise MemobenchError(f"object observations know no class {kind!r}; use env.obs_type=pixels_agent_pos")
+    return classes().index(kind)
+
+
+def rounded(values: Array) -> Array:
+    """Return values as multiples of QUANTUM."""
+    return np.round(values / QUANTUM) * QUANTUM
+
+
+def in_slots(things: Array, places: Array | None = None) -> NDArray[np.float32]:
+    """Return things (n, WIDTH) as an observation (SIZE,): in the order of class and place, before empty slots.
+
+    ``places`` (n, 3): None for where the things are. Of one class and place they stay in the order given.
+    """
     slots = np.zeros((SLOTS, WIDTH), np.float32)
-    x, y, z = things[:, STARTS["position"] : STARTS["position"] + 3].T
+    start = STARTS["position"]
+    x, y, z = (things[:, start : start + 3] if places is None else places).T
     slots[: len(things)] = things[np.lexsort((z, y, x, things[:, STARTS["class"]]))]
     return slots.reshape(-1)
 

@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.sim.gl.context import close_context
 from lerobot_memobench.sim.raster.drawlist import DrawList, Image, build_draw_list
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.raster.shapes import Triangles, mesh_in_file
@@ -27,19 +26,18 @@ if TYPE_CHECKING:
 class Quality:
     """What a frame is drawn with.
 
-    ``shadow_map``: its side in pixels; 0 leaves shadows out. ``samples``: per pixel, by OpenGL; 0 is one in its middle,
-    drawn on the CPU without GL. ``whole_arm``: the arm's meshes with all their faces, not thinned.
+    ``shadow_map``: its side in pixels; 0 leaves shadows out. ``smooth``: whether a pixel is the mean of four.
+    ``whole_arm``: the arm's meshes with all their faces, not thinned.
     """
 
     shadow_map: int
-    samples: int = 0
+    smooth: bool = False
     whole_arm: bool = False
 
 
-QUALITIES = {"fast": Quality(0), "default": Quality(1024), "high": Quality(2048, samples=4, whole_arm=True)}
+QUALITIES = {"fast": Quality(0), "default": Quality(1024), "high": Quality(2048, smooth=True, whole_arm=True)}
 """Textures and light are the same in all. ``fast`` leaves out shadows. ``high`` is for pictures and videos: it smooths
-edges, sharpens shadows and draws the arm whole. It alone needs a GL library, and costs ten times as much.
-Scenes that are drawn as by MuJoCo need none for ``high`` either."""
+edges, sharpens shadows and draws the arm whole, at ten times the cost."""
 
 ROOM = ("room", "kitchen_table")
 """Bodies that cast no shadow: what theirs would fall on is under or behind them."""
@@ -59,11 +57,6 @@ class RenderSettings:
         if self.height < 1 or self.width < 1:
             raise MemobenchError(f"frames of {self.height}×{self.width} pixels cannot be drawn; both must be 1 or more")
 
-    @property
-    def needs_gl(self) -> bool:
-        """Whether frames are drawn by OpenGL."""
-        return QUALITIES[self.quality].samples > 0
-
 
 class Renderer(Protocol):
     """What draws the frames of a scene at one size and quality."""
@@ -74,14 +67,10 @@ class Renderer(Protocol):
         """Return what a camera sees, (height, width, 3) uint8, first row on top."""
         ...
 
-    def free(self) -> None:
-        """Give back kept pictures, or the driver's objects."""
-        ...
-
 
 @dataclass(frozen=True)
 class Supersampled:
-    """Draw frames of twice the width and height, and take the mean of four pixels: smooth edges without GL."""
+    """Draw frames of twice the width and height, and take the mean of four pixels."""
 
     renderer: Rasterizer
 
@@ -93,10 +82,6 @@ class Supersampled:
         height, width, channels = fine.shape
         total = fine.reshape(height // 2, 2, width // 2, 2, channels).sum(axis=(1, 3), dtype=np.uint16)
         return ((total + 2) // 4).astype(np.uint8)
-
-    def free(self) -> None:
-        """Give back kept pictures."""
-        self.renderer.free()
 
 
 CACHED_RENDERERS = 4
@@ -130,7 +115,7 @@ def get_renderer(
     full = (key, settings)
     if full not in renderers:
         while len(renderers) >= CACHED_RENDERERS:
-            renderers.popitem(last=False)[1].free()
+            renderers.popitem(last=False)
         renderers[full] = make_renderer(model, settings, draw_list)
     renderers.move_to_end(full)
     return renderers[full]
@@ -141,27 +126,22 @@ def get_rasterizer(
 ) -> Rasterizer:
     """Return this thread's renderer for a scene that also maps pixels to geoms.
 
-    It is the one of `get_renderer`; where GL draws the frames, one of the same size.
+    It is the one of `get_renderer`; where a pixel is the mean of four, another of the same size.
     """
-    settings = replace(settings, quality="fast") if settings.needs_gl else settings
+    settings = replace(settings, quality="fast") if QUALITIES[settings.quality].smooth else settings
     return cast("Rasterizer", get_renderer(key, model, settings, draw_list))
 
 
 def make_renderer(model: mujoco.MjModel, settings: RenderSettings, draw_list: DrawList | None = None) -> Renderer:
-    """Return a renderer of one's own for a scene, to be freed by `Renderer.free`; see `get_renderer`."""
-    quality, size = QUALITIES[settings.quality], (settings.width, settings.height)
+    """Return a renderer of one's own for a scene; see `get_renderer`."""
+    quality = QUALITIES[settings.quality]
     if draw_list is None:
         draw_list = build_draw_list(model, ROOM, _whole_arm_meshes() if quality.whole_arm else None)
-    # PyOpenGL and numba are loaded with the first frame.
-    if settings.needs_gl and not draw_list.as_mujoco:
-        from lerobot_memobench.sim.gl.rasterizer import MultisampleRasterizer
+    from lerobot_memobench.sim.raster.rasterizer import Rasterizer  # loads numba
 
-        return MultisampleRasterizer(model, draw_list, *size, quality.samples, quality.shadow_map)
-    from lerobot_memobench.sim.raster.rasterizer import Rasterizer
-
-    if settings.needs_gl:
-        return Supersampled(Rasterizer(model, draw_list, 2 * settings.width, 2 * settings.height, 0))
-    return Rasterizer(model, draw_list, *size, quality.shadow_map)
+    fine = 2 if quality.smooth else 1
+    rasterizer = Rasterizer(model, draw_list, fine * settings.width, fine * settings.height, quality.shadow_map)
+    return Supersampled(rasterizer) if quality.smooth else rasterizer
 
 
 @cache
@@ -169,13 +149,3 @@ def _whole_arm_meshes() -> dict[str, Triangles]:
     """Return the meshes of the whole arm by name."""
     arm = whole_arm()
     return {arm.mesh(mesh).name: mesh_in_file(arm, mesh) for mesh in range(arm.nmesh)}
-
-
-def close_renderers() -> None:
-    """Free the calling thread's renderers and GL context; the next frame makes new ones.
-
-    A thread that has drawn with `high` calls this before it ends; for the main thread it happens at exit.
-    """
-    while _thread.renderers:
-        _thread.renderers.popitem()[1].free()
-    close_context()

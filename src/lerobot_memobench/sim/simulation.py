@@ -83,7 +83,7 @@ class Simulation:
 
     Args:
         task: what stands where; its goal does not matter here.
-        render: size and quality of frames. No GL context is opened before the first `render`.
+        render: size and quality of frames.
     """
 
     def __init__(self, task: Task, render: RenderSettings | None = None) -> None:

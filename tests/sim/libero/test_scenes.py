@@ -5,6 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
@@ -74,12 +75,39 @@ def test_things_are_seen_as_object_slots() -> None:
 
 @needs_assets
 @pytest.mark.slow
-def test_things_are_drawn(gl: str) -> None:
+def test_things_are_drawn() -> None:
     sim = simulate(SHELF)
     sim.reset(7)
-    geoms, (model, _) = sim.geoms(), sim._drawing()
+    geoms, model = sim.geoms(), sim._drawing()[0]
     drawn = {model.body(model.body_rootid[model.geom_bodyid[geom]]).name for geom in np.unique(geoms[geoms >= 0])}
     assert set(sim.assets) <= drawn
+
+
+@needs_assets
+def test_drawers_are_seen_apart_and_keep_their_slots() -> None:
+    sim = simulate("check_the_middle_drawer_of_the_cabinet")
+    sim.reset(7)
+    parts = sim.assets["wooden_cabinet_1"].articulations
+    look = ObjectSlots(sim)
+    shut = drawers(look)
+    heights = field(shut, "position")[:, 2]
+    assert len(shut) == len(parts)
+    assert np.all(np.diff(heights) < -0.05), "from the top, each at its own height"
+    for region, part in parts.items():
+        pulled = sim.data.joint(part.joint).qpos
+        pulled[:] = part.open_q
+        mujoco.mj_forward(sim.model, sim.data)
+        drawn, seen = list(parts).index(region), drawers(look)
+        pulled[:] = 0.0
+        at = {round(float(height), 3): row for height, row in zip(field(seen, "position")[:, 2], seen, strict=True)}
+        assert field(at[round(float(heights[drawn]), 3)], "joint")[0] == np.float32(part.open_q)
+        assert list(at) == sorted(at, reverse=True)
+
+
+def drawers(look: ObjectSlots) -> NDArray[np.float32]:
+    """Return the slots (n, WIDTH) of the drawers that are seen."""
+    seen = look.observe().reshape(SLOTS, WIDTH)
+    return seen[(field(seen, "present")[:, 0] > 0) & (field(seen, "class")[:, 0] == classes().index("drawer"))]
 
 
 def classes_seen(sim: Simulation) -> set[str]:

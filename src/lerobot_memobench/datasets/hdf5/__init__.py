@@ -12,8 +12,8 @@
 completed in order) and ``timestep_exec_start_idx`` (the frame at which execution starts) filled in. Frame t shows
 the observation before ``actions[t]``.
 
-The authors' files are of LIBERO's scenes. Their states have another order, other frames and other shapes than ours:
-``frames`` puts them into ours, ``libero_rules`` evaluates predicates in theirs, ``archive`` reads them out of a zip.
+The authors' files are of LIBERO's scenes, and so are the tasks that ``restore`` makes of them; ``placing`` puts their
+states in the order of the task's joints, ``archive`` reads them out of a zip.
 
 What this package knows beyond the layout is in further attributes, so that every reader of the layout finds what
 it expects and nothing else among the arrays: of ``data`` ``task_metadata``; of a demonstration ``seed``,

@@ -1,8 +1,7 @@
 """Read the scene of a demonstration from the MJCF of its attribute ``model_file``, which strangers write.
 
-Only what a state needs is taken: bodies, joints, sites and shapes that can touch, as numbers that were checked. They
-are compiled as a text of our own, so that nothing in a file names another file, a plugin or more than there is room
-for.
+Only what a state needs is taken: bodies and joints, as numbers that were checked. They are compiled as a text of our
+own, so that nothing in a file names another file, a plugin or more than there is room for.
 """
 
 from __future__ import annotations
@@ -23,23 +22,17 @@ LONGEST_TEXT = 8 * 2**20
 """Characters of a model file; LIBERO's have some 70,000."""
 MOST_ELEMENTS, DEEPEST = 20_000, 60
 """Elements of a model file, and how deep they may lie; LIBERO's have up to 500, 16 deep."""
-MOST_SHAPES = 3_000
-"""Shapes that can touch; each state asks for all their pairs. LIBERO's have up to 130."""
 LONGEST_NAME = 200
 LARGEST_NUMBER = 1e6
 
-SHAPES = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box")
-"""Types of geoms that a model file describes by itself; the others are files."""
 PLACE = {"pos": 3, "quat": 4, "euler": 3, "axisangle": 4, "xyaxes": 6, "zaxis": 3}
 KEPT: dict[str, dict[str, int]] = {
     "body": PLACE,
     "joint": {"pos": 3, "axis": 3, "ref": 1},
     "freejoint": {},
-    "geom": {**PLACE, "size": 3, "fromto": 6, "contype": 1, "conaffinity": 1, "margin": 1, "gap": 1},
-    "site": {**PLACE, "size": 3},
 }
 """Element -> attribute -> most numbers that it may have."""
-LEFT_OUT = ("inertial", "camera", "light")
+LEFT_OUT = ("inertial", "camera", "light", "geom", "site")
 BY_DEFAULTS = ("class", "childclass")
 """Attributes that point to defaults elsewhere in the file; MuJoCo leaves them out of scenes that it saves."""
 JOINT_TYPES = ("free", "ball", "slide", "hinge")
@@ -108,13 +101,13 @@ def joints_of(model: mujoco.MjModel) -> dict[str, Joint]:
 
 
 class ModelFile:
-    """The scene that a model file describes, without shapes that cannot touch.
+    """The bodies and joints that a model file describes.
 
     Attributes:
         name: of the model.
         joints: by name, in the order of the state.
         state_dim: length of a state: 1 + nq + nv.
-        model, data: the scene compiled; inertias are invented.
+        model: the scene compiled; inertias are invented.
 
     Raises:
         Unusable: the text is no scene, or a place in it is not understood.
@@ -126,12 +119,9 @@ class ModelFile:
         world = root.find("worldbody")
         if root.tag != "mujoco" or world is None:
             raise Unusable("model_file is no MJCF: it has no <mujoco> with a <worldbody>")
-        self._meshes: set[str] = set()
         self.model = self._compiled(world, _angles(root))
-        self.data = mujoco.MjData(self.model)
         self.joints = joints_of(self.model)
         self.state_dim = 1 + self.model.nq + self.model.nv
-        self._roots = [self.model.body(int(root)).name for root in self.model.body_rootid[self.model.geom_bodyid]]
 
     # --- reading ---
 
@@ -139,27 +129,24 @@ class ModelFile:
         scene = ElementTree.Element("mujoco")
         ElementTree.SubElement(scene, "compiler", {"inertiafromgeom": "false", "autolimits": "false", **angles})
         copy = ElementTree.SubElement(scene, "worldbody")
-        waiting = [(world, copy, "")]
+        waiting = [(world, copy)]
         while waiting:
-            source, target, top = waiting.pop()
+            source, target = waiting.pop()
             for element in source:
-                made = self._copied(element, top)
+                made = self._copied(element)
                 if made is None:
                     continue
                 target.append(made)
                 if element.tag == "body":
                     ElementTree.SubElement(made, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
-                    waiting.append((element, made, top or made.get("name", "")))
-        shapes = sum(1 for _ in copy.iter("geom"))
-        if shapes > MOST_SHAPES:
-            raise Unusable(f"model_file has {shapes:,} shapes that can touch, more than {MOST_SHAPES:,}")
+                    waiting.append((element, made))
         try:
             return mujoco.MjModel.from_xml_string(ElementTree.tostring(scene, encoding="unicode"))
         except (ValueError, mujoco.FatalError) as error:
             raise Unusable(f"model_file is no scene that MuJoCo takes ({first_line(error)})") from None
 
-    def _copied(self, element: ElementTree.Element, top: str) -> ElementTree.Element | None:
-        """Return the kept part of an element, None for one that is left out. ``top``: the outermost body around it."""
+    def _copied(self, element: ElementTree.Element) -> ElementTree.Element | None:
+        """Return the kept part of an element, None for one that is left out."""
         tag, name = element.tag, element.get("name", "")
         if tag in LEFT_OUT:
             return None
@@ -168,12 +155,7 @@ class ModelFile:
         what = f"model_file's {tag} {name[:LONGEST_NAME]!r}"
         if len(name) > LONGEST_NAME:
             raise Unusable(f"{what}… has a name of {len(name):,} characters")
-        if tag == "geom" and _is_untouchable(element):
-            return None
-        kind = element.get("type", {"geom": "sphere", "joint": "hinge"}.get(tag, ""))
-        if tag == "geom" and kind not in SHAPES:
-            self._meshes.add(top)
-            return None
+        kind = element.get("type", "hinge")
         if tag == "joint" and kind not in JOINT_TYPES:
             raise Unusable(f"{what} is of type {kind[:40]!r}, expected one of {', '.join(JOINT_TYPES)}")
         unread = next((key for key in BY_DEFAULTS if key in element.attrib), None)
@@ -183,11 +165,8 @@ class ModelFile:
             )
         kept = {key: _numbers_text(element.attrib[key], most, f"{what}: {key}") for key, most in KEPT[tag].items()
                 if key in element.attrib}  # fmt: skip
-        if tag in ("geom", "joint"):
+        if tag == "joint":
             kept["type"] = kind
-        elif tag == "site":
-            kept["type"] = "box" if kind == "box" else "sphere"
-            kept.setdefault("size", "0.01")
         return ElementTree.Element(tag, {**kept, **({"name": name} if name else {})})
 
     # --- asking ---
@@ -208,29 +187,6 @@ class ModelFile:
         body = self.model.body(self.body_of(instance))
         return np.concatenate([body.pos, body.quat])
 
-    def show(self, state: NDArray[np.float64]) -> None:
-        """Put the scene into a state (state_dim,): poses and contacts are its own afterwards."""
-        self.data.qpos[:] = state[1 : 1 + self.model.nq]
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_comPos(self.model, self.data)
-        mujoco.mj_collision(self.model, self.data)
-
-    def touching(self, a: str, b: str) -> bool:
-        """Return whether two instances are in contact.
-
-        Raises:
-            Unusable: the shape of one is in another file.
-        """
-        pair = {self.body_of(a), self.body_of(b)}
-        unknown = sorted(pair & self._meshes)
-        if unknown:
-            raise Unusable(
-                f"model_file leaves the shape of {unknown[0]!r} to another file, so its contacts are not known: "
-                "write its checkpoints' key frames into meta_data"
-            )
-        contacts: NDArray[np.int32] = self.data.contact.geom if self.data.ncon else np.empty((0, 2), np.int32)
-        return any({self._roots[one], self._roots[other]} == pair for one, other in contacts)
-
 
 def _angles(root: ElementTree.Element) -> dict[str, str]:
     """Return the attributes of a scene's <compiler> that give the unit and order of angles."""
@@ -240,10 +196,6 @@ def _angles(root: ElementTree.Element) -> dict[str, str]:
     if angles["angle"] not in ("degree", "radian") or not re.fullmatch("[xyzXYZ]{3}", angles["eulerseq"]):
         raise Unusable(f"model_file states angles by {angles}, which is not understood")
     return angles
-
-
-def _is_untouchable(geom: ElementTree.Element) -> bool:
-    return geom.get("contype", "1").strip() == "0" and geom.get("conaffinity", "1").strip() == "0"
 
 
 def _numbers_text(text: str, most: int, what: str) -> str:

@@ -1,10 +1,9 @@
 """Restore a demonstration from a group of the published layout: its task, its execution, its checkpoints.
 
-The layout holds states, not what the arm felt or which predicates held. States of LIBERO's scenes are put into ours
-first (`frames`), unless the task is in their world. Proprioception and visible objects are read off them in the
-simulator; where a stranger's demonstration prompt highlights something is not known. Checkpoint columns come from the
-key frames; where one is missing (-1) its predicate is evaluated on the states, with the latches and orders that a
-rollout has, and in LIBERO's scenes by LIBERO's own shapes and rules (`libero_rules`).
+The layout holds states, not what the arm felt or which predicates held. Proprioception and visible objects are read
+off them in the simulator, in the world that they are of; where a stranger's demonstration prompt highlights something
+is not known. Checkpoint columns come from the key frames; where one is missing (-1) its predicate is evaluated on the
+states, with the latches and orders that a rollout has.
 """
 
 from __future__ import annotations
@@ -19,63 +18,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
-from lerobot_memobench.datasets.hdf5 import libero_rules
-from lerobot_memobench.datasets.hdf5.frames import OURS, place
-from lerobot_memobench.datasets.hdf5.libero_rules import LiberoRules
-from lerobot_memobench.datasets.hdf5.model_file import ModelFile, Pose
+from lerobot_memobench.datasets.hdf5.model_file import ModelFile, Pose, parse
+from lerobot_memobench.datasets.hdf5.placing import States, place
 from lerobot_memobench.datasets.hdf5.reading import SUFFIX, PublishedDemo, PublishedFile, Unusable, truth_from_intervals
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name
+from lerobot_memobench.protocol import UPSTREAM_EVALUATIONS
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
 from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
-from lerobot_memobench.tasks.task import BDDL_FILE, LIBERO, MEMORY_TYPES, METADATA_FILE, Task
+from lerobot_memobench.tasks.task import BDDL_FILE, LIBERO, MEMOBENCH, MEMORY_TYPES, METADATA_FILE, Task, World
 
 NO_SEED = -1
 """Seed of a demonstration that does not say it."""
 UNKNOWN = "tasks"
 """Folder of a task whose memory type nothing tells."""
-
-
-@dataclass(frozen=True)
-class Placed:
-    """A demonstration in the task's scene.
-
-    Attributes:
-        states: (T, D) of that scene.
-        fixture_poses: where its fixtures stand.
-        theirs: whether the states come from LIBERO's scenes, where its rules hold.
-        scene: that scene, where its shapes are not the task's: it answers ``in`` and ``on``.
-    """
-
-    states: NDArray[np.float64]
-    fixture_poses: dict[str, Pose]
-    theirs: bool = False
-    scene: ModelFile | None = None
+OURS = "memobench"
+"""Name of the models that this package writes of its own world."""
 
 
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     """Return the demonstration of a checked group, without images.
 
     Raises:
-        Unusable: the group contradicts itself or the task, or is of a scene that cannot be placed in ours.
+        Unusable: the group contradicts itself or the task, or is of another scene than the task's.
     """
     sim = _simulation(task)
-    placed = _placed(sim, task, demo)
+    states, fixture_poses = _placed(sim, demo)
     exec_start = execution_start(task, demo)
     _check_clock(demo.states, exec_start)
     frames = key_frames(task, demo, exec_start)
     written = demo.extras.get("satisfied_intervals")
-    read_off = _read_off(sim, task, demo, placed, exec_start, asked=written is None and (not frames or min(frames) < 0))
+    asked = written is None and (not frames or min(frames) < 0)
+    read_off = _read_off(sim, task, states, fixture_poses, exec_start, ours=is_ours(demo), asked=asked)
     try:
         restored = Demonstration(
             task=task,
             seed=int(demo.extras.get("seed", NO_SEED)),
             referent=str(demo.extras.get("referent", "fixed")),
             variant=int(demo.extras.get("variant", 0)),
-            states=placed.states,
+            states=states,
             actions=demo.actions,
             proprio=read_off.proprio,
             images=None,
@@ -86,8 +70,8 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
                 else _known_or_read_off(frames, read_off.satisfied)
             ),
             success=bool(demo.extras.get("success", read_off.success or (bool(frames) and min(frames) >= 0))),
-            fixture_poses=placed.fixture_poses,
-            model_xml="" if placed.theirs else demo.model_file,
+            fixture_poses=fixture_poses,
+            model_xml="" if task.world == LIBERO else demo.model_file,
             scene_hash=str(demo.extras.get("scene_hash", "")),
             stand_ins=sim.stand_ins,
             objects=read_off.objects,
@@ -100,28 +84,19 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     return restored
 
 
-def _placed(sim: Simulation, task: Task, demo: PublishedDemo) -> Placed:
-    """Return states and fixtures in the task's scene; where this package wrote them, they are in its own world's."""
-    if is_ours(demo):
-        _check_world(task)
-    if is_ours(demo) and "fixture_poses" in demo.extras:
-        if demo.states.shape[1] != sim.state_dim:
-            raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {task.name}")
-        return Placed(demo.states, {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()})
+def _placed(sim: Simulation, demo: PublishedDemo) -> tuple[States, dict[str, Pose]]:
+    """Return states and poses of the fixtures in the simulation's scene."""
+    if not is_ours(demo) or "fixture_poses" not in demo.extras:
+        return place(sim, ModelFile(_model_text(demo)), demo.states)
+    if demo.states.shape[1] != sim.state_dim:
+        raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {sim.task.name}")
+    return demo.states, {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()}
+
+
+def _model_text(demo: PublishedDemo) -> str:
     if not demo.model_file.strip():
         raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is not known")
-    scene = ModelFile(demo.model_file)
-    theirs = scene.name != OURS
-    if not theirs:
-        _check_world(task)
-    states, fixture_poses = place(task, sim, scene, demo.states)
-    return Placed(states, fixture_poses, theirs, scene if theirs and task.world != LIBERO else None)
-
-
-def _check_world(task: Task) -> None:
-    """Raise where scenes of this package are to be LIBERO's."""
-    if task.world == LIBERO:
-        raise Unusable("its scenes are of world=memobench, not of LIBERO's assets; convert it without --world libero")
+    return demo.model_file
 
 
 def is_ours(demo: PublishedDemo) -> bool:
@@ -129,14 +104,14 @@ def is_ours(demo: PublishedDemo) -> bool:
     return "success" in demo.extras
 
 
-def other_scene(demo: PublishedDemo) -> str | None:
-    """Return how a demonstration's scene is not of this package, None where it is."""
-    if is_ours(demo) or not demo.model_file.strip() or ModelFile(demo.model_file).name == OURS:
-        return None
-    return (
-        "its scenes are LIBERO's: pictures and actions are as they were, states are put into this package's scenes; "
-        "--world libero keeps them"
-    )
+def world_of(demo: PublishedDemo) -> World:
+    """Return the world of a demonstration's scenes: this package's own where it wrote them, else LIBERO's.
+
+    Raises:
+        Unusable: its model file is missing, or no XML.
+    """
+    ours = is_ours(demo) or parse(_model_text(demo)).get("model") == OURS
+    return MEMOBENCH if ours else LIBERO
 
 
 def _known_or_read_off(frames: list[int], satisfied: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -199,27 +174,31 @@ class ReadOff:
 
 
 def _read_off(
-    sim: Simulation, task: Task, demo: PublishedDemo, placed: Placed, exec_start: int, *, asked: bool
+    sim: Simulation,
+    task: Task,
+    states: States,
+    fixture_poses: dict[str, Pose],
+    exec_start: int,
+    *,
+    ours: bool,
+    asked: bool,
 ) -> ReadOff:
     """Show the states to the simulator one after the other; evaluate goals and checkpoints where they are ``asked``."""
-    hold_steps = libero_rules.HOLD_STEPS if placed.theirs else HOLD_STEPS
+    hold_steps = HOLD_STEPS // UPSTREAM_EVALUATIONS if task.world == LIBERO else HOLD_STEPS
     evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)], hold_steps)
-    holds = sim.holds if placed.scene is None else LiberoRules(task, placed.scene, sim.holds).holds
     look = ObjectSlots(sim)
     proprio, objects = [], []
-    satisfied = np.zeros((len(placed.states), len(task.checkpoints)), dtype=np.bool_)
+    satisfied = np.zeros((len(states), len(task.checkpoints)), dtype=np.bool_)
     success = False
-    for frame, state in enumerate(placed.states):
-        sim.set_state(state, placed.fixture_poses)
+    for frame, state in enumerate(states):
+        sim.set_state(state, fixture_poses)
         proprio.append(sim.proprio())
-        sim.highlights = highlights_at(task, sim, frame) if is_ours(demo) and frame < exec_start else ()
+        sim.highlights = highlights_at(task, sim, frame) if ours and frame < exec_start else ()
         objects.append(look.observe())
         if frame == exec_start:
             sim.begin_execution()
         if asked and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
-            if placed.scene is not None:
-                placed.scene.show(demo.states[frame])
-            goal, *satisfied[frame] = evaluator.step(holds)
+            goal, *satisfied[frame] = evaluator.step(sim.holds)
             success = success or goal
     return ReadOff(np.array(proprio, dtype=np.float32), np.array(objects), satisfied, success)
 
@@ -257,7 +236,7 @@ def _simulation(task: Task) -> Simulation:
 
 
 def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
-    """Return the task that a demonstration shows, from the file's own BDDL and metadata.
+    """Return the task that a demonstration shows, in its world, from the file's own BDDL and metadata.
 
     Raises:
         Unusable: they do not make a task, or its name or memory type names no folder.
@@ -278,6 +257,7 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
             task = replace(task, family=known.family)
         if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
             task = known
+    task = task.in_world(world_of(demo))
     return task.variant(int(demo.extras.get("variant", 0))) if ours is not None else task
 
 

@@ -57,7 +57,7 @@ class Articulation:
     Drawers and doors are open when q < ``open_below`` and closed when q > ``closed_above``; knobs are on when
     q >= ``on_at_least`` and off when q < ``off_below``; the others' limits are nan. ``closed_q`` and ``open_q`` are
     good targets for q (off and on for a knob). ``handle_site``: full name of the site at the handle's middle, which
-    moves along.
+    moves along. ``shares_origin``: the moving body has the fixture's origin, so only the handle shows which part it is.
     """
 
     joint: str
@@ -70,6 +70,7 @@ class Articulation:
     closed_above: float = nan
     on_at_least: float = nan
     off_below: float = nan
+    shares_origin: bool = False
 
 
 @dataclass(frozen=True)

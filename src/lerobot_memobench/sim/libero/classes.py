@@ -29,7 +29,7 @@ class Part:
         clearance: free space behind the handle, m.
         closed_q, open_q: good targets for the joint (off and on for a knob), m or rad.
         ranges: `init` predicate -> between which positions LIBERO draws the joint.
-        open_below, closed_above, on_at_least, off_below: as of `Articulation`.
+        open_below, closed_above, on_at_least, off_below, shares_origin: as of `Articulation`.
     """
 
     kind: Literal["drawer", "door", "knob"]
@@ -46,6 +46,7 @@ class Part:
     closed_above: float = nan
     on_at_least: float = nan
     off_below: float = nan
+    shares_origin: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,7 @@ def _drawer(level: str, height: float) -> Part:
         ranges={"open": (-0.16, -0.14), "close": (0.0, 0.005)},
         open_below=-0.14,
         closed_above=0.0,
+        shares_origin=True,
     )
 
 
@@ -136,6 +138,7 @@ _KNOB = Part(
     ranges={"turnon": (0.5, 2.1), "turnoff": (-0.005, 0.0)},
     on_at_least=0.5,
     off_below=0.0,
+    shares_origin=True,
 )
 
 CLASSES: dict[str, LiberoClass] = {

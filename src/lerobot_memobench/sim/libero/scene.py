@@ -297,6 +297,7 @@ def _articulation(name: str, part: Part) -> Articulation:
         closed_above=part.closed_above,
         on_at_least=part.on_at_least,
         off_below=part.off_below,
+        shares_origin=part.shares_origin,
     )
 
 

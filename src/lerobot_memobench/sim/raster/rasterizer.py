@@ -188,11 +188,6 @@ class Rasterizer:
                 )
         return view
 
-    def free(self) -> None:
-        """Forget the pictures of still rows; the next frame draws them again."""
-        self._still.clear()
-        self._shown = None
-
     def _clear(self) -> None:
         self._target.depth[:] = 0.0
         self._target.triangle[:] = -1

@@ -1,1 +1,0 @@
-"""How does a scene become a picture? One list of triangles, drawn with OpenGL."""
