@@ -104,7 +104,6 @@ class ModelFile:
     """The bodies and joints that a model file describes.
 
     Attributes:
-        name: of the model.
         joints: by name, in the order of the state.
         state_dim: length of a state: 1 + nq + nv.
         model: the scene compiled; inertias are invented.
@@ -115,7 +114,6 @@ class ModelFile:
 
     def __init__(self, text: str) -> None:
         root = parse(text)
-        self.name = root.get("model", "")
         world = root.find("worldbody")
         if root.tag != "mujoco" or world is None:
             raise Unusable("model_file is no MJCF: it has no <mujoco> with a <worldbody>")
