@@ -98,7 +98,7 @@ def load_actor(plan: EvaluationPlan) -> Actor:
     policy, environment = copy(plan.policy), plan.environment
     policy.pretrained_path = None if plan.policy_path is None else Path(plan.policy_path)
     renamed = read_rename_map(plan.arguments.get("rename_map"))
-    with quiet() if plan.policy_path is None else nullcontext():  # it has no weights: a warning says so
+    with quiet() if plan.policy_path is None else nullcontext():  # LeRobot warns that it has no weights
         loaded = make_policy(cfg=policy, env_cfg=environment, rename_map=renamed).eval()
     before, after = make_pre_post_processors(
         policy_cfg=policy,

@@ -112,7 +112,7 @@ class Inputs:
         self._phase: NDArray[np.float32] | None = None
 
     def announce(self) -> None:
-        """Tell the environment, before its step, whether the policy needs the observation after it."""
+        """Announce to the environment, before its step, whether the policy needs the observation after it."""
         needed, self._planned = self._needed(), self._ready()
         if needed != self._drawn:
             self._env.call("need_observation", needed)
@@ -177,7 +177,7 @@ KNOWN: dict[tuple[str, str], ChunkPolicy] = {
 
 
 def needs_observation(policy: Any) -> Callable[[], bool]:
-    """Return a function that says, after an action, whether a policy reads the next pictures or objects.
+    """Return the check, made after an action, whether a policy reads the next pictures or objects.
 
     A policy defines it as a method of that name. Of LeRobot's policies, those whose source is known need an
     observation when no action is planned; any other policy needs every observation.
@@ -190,7 +190,7 @@ def needs_observation(policy: Any) -> Callable[[], bool]:
 
 
 def has_planned_action(policy: Any) -> Callable[[], bool]:
-    """Return a function that says, after an action, whether a policy has planned the next one.
+    """Return the check, made after an action, whether a policy has planned the next one.
 
     Its ``select_action`` then reads ``observation.phase`` and ``observation.step`` and nothing else. A policy defines
     it as a method of that name. LeRobot's are known by the source of ``select_action``, since a subclass may act
