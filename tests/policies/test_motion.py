@@ -254,11 +254,9 @@ def test_actions_begin_without_hindsight_and_learn_with_it(trained: tuple[Any, d
 
 def test_queries_stand_before_the_actions(trained: tuple[Any, dict[str, Any]]) -> None:
     model, chunk = trained[0].model, trained[0].config.chunk_size
-    tokens, real, blocks, _ = model.embed_suffix(torch.zeros(4, chunk, 32), torch.ones(4))
-    assert tokens.shape[:2] == real.shape == blocks.shape == (4, FORESIGHT + chunk)
-    assert real.all()
-    assert blocks[:, 0].all()
-    assert not blocks[:, 1:].any()
+    actions = torch.randn(4, chunk, 128)
+    tokens = model.fusion.actions(actions)
+    assert torch.equal(tokens[:, FORESIGHT:], actions)
     assert torch.equal(tokens[1, :FORESIGHT], model.foresight.queries)
 
 
