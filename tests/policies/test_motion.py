@@ -254,7 +254,7 @@ def test_actions_begin_without_hindsight_and_learn_with_it(trained: tuple[Any, d
 
 def test_queries_stand_before_the_actions(trained: tuple[Any, dict[str, Any]]) -> None:
     model, chunk = trained[0].model, trained[0].config.chunk_size
-    actions = torch.randn(4, chunk, 128)
+    actions = torch.randn(4, chunk, model.foresight.queries.shape[1])
     tokens = model.fusion.actions(actions)
     assert torch.equal(tokens[:, FORESIGHT:], actions)
     assert torch.equal(tokens[1, :FORESIGHT], model.foresight.queries)

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
 from einops import rearrange
@@ -20,9 +20,6 @@ from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.layers import attend, hidden, rms_norm, rotary, rotate
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
-
-if TYPE_CHECKING:
-    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 
 class Prefix(NamedTuple):
@@ -249,7 +246,7 @@ class Modulation(MemoryFusion):
 
     tells_reads = True
 
-    def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         self.model, self.shared = model, SharedMemory()
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
         for layer in model.paligemma_with_expert.gemma_expert.model.layers:
@@ -306,7 +303,7 @@ class Context(MemoryFusion):
 
     tells_reads = True
 
-    def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         self.model, self.memory = model, cast("MemoryTokens | None", None)
 
     def hand_over(self, memory: MemoryTokens) -> None:

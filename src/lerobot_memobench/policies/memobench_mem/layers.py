@@ -17,7 +17,7 @@ from lerobot_memobench.policies.memobench_mem.products import exact_gradients, e
 
 EPS = 1e-6
 FEW_KEYS = 64
-"""Up to here scores that are kept are quicker on a CPU than torch's kernel, which keeps none."""
+"""Up to here a CPU learns quicker by scores that are kept than by torch's kernel, which keeps none."""
 
 
 class _Normed(torch.autograd.Function):
@@ -92,7 +92,8 @@ def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, found: list[
     bias = bias.to(query.dtype)
     if bias.shape[1] > 1:
         bias = bias.repeat_interleave(heads, dim=1)
-    if found is None and (query.is_cuda or key.shape[1] > FEW_KEYS):
+    many = torch.is_grad_enabled() and key.shape[1] > FEW_KEYS
+    if found is None and (query.is_cuda or many):
         exact = contextlib.nullcontext() if torch.compiler.is_compiling() else exact_products()
         mask = bias.expand(-1, count * heads, -1)[:, None]
         with exact:
