@@ -36,7 +36,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_names
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import CHOICES, MemoryMechanism, Query
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, attend_fused
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep, gathering
 from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory
@@ -141,8 +141,6 @@ def updater(settings: MemobenchMemConfig, steps: int) -> Callable[[], None]:
     looked_up = GatherMemoryProcessorStep(cache=cache, **gathering(settings)).gather(cache, moments.flatten().tolist())
     actions = {ACTION: torch.rand(rows, settings.chunk_size, 7)}
     policy = MemobenchMemPolicy(settings)
-    if policy.attends_fused:
-        attend_fused(policy.model)  # as training does
     return updates(policy, observed(settings, rows) | actions | looked_up)
 
 

@@ -1,70 +1,103 @@
-"""An update of the small policy that sees objects, with products in bfloat16 as it is made, beside one in float32.
+"""Updates and plans of small policies that see objects, by this source and by another one, in turns in one run.
 
-    python benchmarks/object_update.py [--moments 6] [--episodes 12] [--repeats 15]
+    python benchmarks/object_update.py FOLDER [--rounds 9] [--memory frames bank …] [--words 16]
 
-An update is forward, backward, clipping, AdamW and the weight average, on one thread, with a memory and without;
-seconds are of the CPU. Prints one JSON line: ratio (float32 / as it is made) and seconds. A CPU that is not quicker
-in bfloat16 has a ratio of 1.
+FOLDER holds the other state's `lerobot_memobench` (`git worktree add /tmp/before COMMIT`, then `/tmp/before/src`). An
+update is forward, backward, clipping, the policy's own AdamW and the weight average, of 12 episodes x 6 samples. A plan
+is one of the shipped `memobench_small`, whose memory is full. Each side is a process of its own on one thread, which
+waits until it is asked. Prints a Markdown table: medians of CPU milliseconds, and the median ratio before / after.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
+import statistics
+import subprocess
+import sys
+import time
 from collections.abc import Callable
-from contextlib import nullcontext
-from unittest import mock
+from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.utils.constants import OBS_ENV_STATE
-from policies import config, histories, remembered, training_batch, updates
-from turns import medians
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK
+from policies import config, histories, observation, remembered, training_batch, updates
 
-from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory
+from lerobot_memobench.protocol import OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 
-REMEMBERED, THINGS = 50, 10
+HERE = Path(__file__).parents[1] / "src"
+EPISODES, MOMENTS = 12, 6
+REMEMBERED, THINGS = 50, 8
 """Frames that are remembered of an episode of 400 steps, and things in each."""
+MEMORIES = ("frames", "none", "bank", "fast_weights", "recurrent")
+PLAN, MANY = "plan", 20
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--moments", type=int, default=6)
-    parser.add_argument("--episodes", type=int, default=12)
-    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("before", type=Path)
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--memory", nargs="+", default=list(MEMORIES))
+    parser.add_argument("--words", type=int, default=16)
     asked = parser.parse_args()
+    print("| | before, ms | after, ms | ratio |\n| --- | ---: | ---: | ---: |")
+    for name in (*asked.memory, PLAN):
+        sides = [Side(source, name, asked.words) for source in (asked.before, HERE)]
+        for side in sides:
+            side.milliseconds()
+        taken = [[side.milliseconds() for side in sides] for _ in range(asked.rounds)]
+        before, after = (statistics.median(side) for side in zip(*taken, strict=True))
+        ratio = statistics.median(other / ours for other, ours in taken)
+        print(f"| {name} | {before:.1f} | {after:.1f} | {ratio:.2f} |", flush=True)
+        for side in sides:
+            side.process.communicate()
+
+
+class Side:
+    """A process that serves."""
+
+    def __init__(self, source: Path, name: str, words: int) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-W", "ignore", __file__, "--serve", name, str(words)],
+            env={**os.environ, "PYTHONPATH": f"{source}{os.pathsep}{source.parent}"},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    def milliseconds(self) -> float:
+        """Let it do its work once."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        print("go", file=self.process.stdin, flush=True)
+        return float(self.process.stdout.readline())
+
+
+def serve(name: str, words: int) -> None:
+    """Answer each line with the CPU milliseconds of an update, or of a plan."""
     torch.set_num_threads(1)
-    keep_freed_memory()  # as training does, on both sides
-    result: dict[str, object] = {"benchmark": "object_update", "samples": asked.moments * asked.episodes}
-    for name, memory_fusion in {"memory": "modulation", "no_memory": "none"}.items():
-        settings = config("small", device="cpu", memory_fusion=memory_fusion, perception="objects")
-        settings.input_features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (SIZE,))
-        batch = object_batch(settings, asked.episodes, asked.moments)
-        made, plain = updater(settings, batch), updater(settings, batch)
-        sides = {"made": made, "plain": lambda plain=plain: in_float32(plain)}
-        seconds = medians(sides, asked.repeats, warm_up=3)
-        result[name] = {"ratio": round(seconds["plain"] / seconds["made"], 3)} | {
-            f"{side}_s": round(value, 4) for side, value in seconds.items()
-        }
-    print(json.dumps(result))
+    keep_freed_memory()  # as training does
+    torch.manual_seed(0)
+    times, work = (MANY, planner(words)) if name == PLAN else (1, updater(settings_of(name), words))
+    for _ in sys.stdin:
+        started = time.process_time()
+        for _ in range(times):
+            work()
+        print(1e3 * (time.process_time() - started) / times, flush=True)
 
 
-def in_float32(update: Callable[[], None]) -> None:
-    """Make an update without products in bfloat16."""
-    with (
-        mock.patch.object(modeling_memobench_mem, "quick_products", nullcontext),
-        mock.patch.object(modeling_memobench_mem, "quick_gradients"),
-    ):
-        update()
+def settings_of(memory: str) -> MemobenchMemConfig:
+    """Return the configuration of a small policy of objects."""
+    settings = config("small", device="cpu", perception="objects", memory=memory)
+    settings.input_features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (SIZE,))
+    return settings
 
 
 def scene(count: int) -> torch.Tensor:
@@ -76,29 +109,49 @@ def scene(count: int) -> torch.Tensor:
     return slots.flatten(1)
 
 
-def object_batch(settings: MemobenchMemConfig, episodes: int, moments: int) -> dict[str, torch.Tensor]:
-    """Return a preprocessed training batch of some moments of each of some episodes."""
-    torch.manual_seed(0)
-    rows, frames = episodes * moments, settings.memory_frames
-    numbers = remembered(rows, moments, frames, REMEMBERED)
-    count = episodes * REMEMBERED
+def spoken(settings: MemobenchMemConfig, rows: int, words: int) -> dict[str, torch.Tensor]:
+    """Return the mask of instructions of so many words."""
+    return {OBS_LANGUAGE_ATTENTION_MASK: torch.arange(settings.tokenizer_max_length or 0).expand(rows, -1) < words}
+
+
+def updater(settings: MemobenchMemConfig, words: int) -> Callable[[], None]:
+    """Return a function that makes one update on some moments of each of some episodes."""
+    rows, count = EPISODES * MOMENTS, EPISODES * REMEMBERED
+    if settings.memory == "frames":
+        numbers = remembered(rows, MOMENTS, settings.memory_frames, REMEMBERED)
+    else:  # all frames up to a moment
+        lengths = torch.randint(REMEMBERED // 3, REMEMBERED, (rows, 1))
+        all_of = torch.arange(REMEMBERED) + torch.arange(rows)[:, None] // MOMENTS * REMEMBERED
+        numbers = torch.where(torch.arange(REMEMBERED) < lengths, all_of, -1)
     stored = frame_row(scene(count), torch.randn(count, 8), torch.ones(count))
     batch = {key: value for key, value in training_batch(settings, rows).items() if "images" not in key}
-    return (
-        batch
-        | {
-            OBS_ENV_STATE: scene(rows),
-            OBS_RAW_STATE: torch.randn(rows, 8),
-        }
-        | histories(numbers, stored, REMEMBERED, settings.memory_stride)
+    batch |= {OBS_ENV_STATE: scene(rows), OBS_RAW_STATE: torch.randn(rows, 8)} | spoken(settings, rows, words)
+    return updates(
+        MemobenchMemPolicy(settings), batch | histories(numbers, stored, REMEMBERED, settings.memory_stride or 1)
     )
 
 
-def updater(settings: MemobenchMemConfig, batch: dict[str, torch.Tensor]) -> Callable[[], None]:
-    """Return a function that makes one update."""
-    torch.manual_seed(0)
-    return updates(MemobenchMemPolicy(settings), batch)
+def planner(words: int) -> Callable[[], None]:
+    """Return a function that makes one plan of the shipped policy, 300 steps into an episode."""
+    import lerobot_memobench
+
+    shipped = Path(lerobot_memobench.__file__).parent / "policies/shipped/memobench_small"
+    policy = MemobenchMemPolicy.from_pretrained(shipped)
+    seen = observation(policy.config, 1) | {OBS_ENV_STATE: scene(1), OBS_RAW_STATE: torch.randn(1, 8)}
+    seen |= {OBS_PHASE: torch.ones(1, 1)} | spoken(policy.config, 1, words)
+    for step in range(300):
+        policy.observe(seen | {OBS_STEP: torch.full((1, 1), float(step))})
+    noise = torch.zeros(1, policy.config.chunk_size, policy.config.max_action_dim)
+
+    def plan() -> None:
+        with torch.no_grad():
+            policy.plan(seen, [0], noise)
+
+    return plan
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1] == "--serve":
+        serve(sys.argv[2], int(sys.argv[3]))
+    else:
+        main()

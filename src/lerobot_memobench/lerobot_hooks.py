@@ -116,16 +116,6 @@ READ_SAMPLE = Hook(
     "LeRobot decodes the videos of every sample, wanted or not",
     caller="lerobot.datasets.lerobot_dataset",
 )
-ATTEND = Hook(
-    "transformers.models.gemma.modeling_gemma",
-    "eager_attention_forward",
-    ("module", "query", "key", "value", "attention_mask", "scaling"),
-    "compute attention in one kernel where a policy with a long prefix learns",
-    "LeRobot's pi0.5 calls this function by its name, whatever `attn_implementation` says",
-    caller="lerobot.policies.pi05.modeling_pi05",
-    package="transformers",
-    read=("5.5.4", "5.22.2"),
-)
 PREPARE = Hook(
     "accelerate.accelerator",
     "Accelerator.prepare",
@@ -144,10 +134,7 @@ GATHER_SHARDS = Hook(
     ends="0.6.2",
     read=(LEROBOT,),
 )
-HOOKS = (
-    *(OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, ATTEND),
-    *(PREPARE, GATHER_SHARDS),
-)
+HOOKS = (OPEN_DATASETS, MAKE_PROCESSORS, DRAW_FRAMES, READ_SAMPLE, PREPARE, GATHER_SHARDS)
 
 
 class _Standing:

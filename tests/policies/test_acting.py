@@ -13,6 +13,7 @@ from lerobot.rollout.inference.rtc import supports_rtc_inference
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.rollout import Row
+from lerobot_memobench.protocol import CONTROL_HZ
 from tests.support.memory import remembered, trained_on
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training
@@ -131,7 +132,7 @@ def chunking(policy: Any) -> Any:
 
 @pytest.mark.parametrize(
     ("objective", "memory_fusion", "supported"),
-    [("regression", "none", False), ("flow_matching", "modulation", False), ("flow_matching", "none", True)],
+    [("regression", "none", False), ("flow_matching", "modulation", True), ("flow_matching", "none", True)],
 )
 def test_what_is_supported_is_said(root: Path, objective: str, memory_fusion: str, supported: bool) -> None:
     policy = made_for_training(root, **OBJECTS, objective=objective, memory_fusion=memory_fusion)[0]
@@ -151,6 +152,34 @@ def test_a_guided_plan_continues_the_last_one(root: Path) -> None:
     apart = [float((plan[0, :3] - left_over[:3]).abs().mean()) for plan in (free, guided)]
     assert apart[0] == pytest.approx(0.5)
     assert apart[1] < 0.1
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_a_guided_plan_reads_its_memory(root: Path, clock: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One observation per plan is what it remembers, at the step or time at which it was seen."""
+    fields = OBJECTS | {"objective": "flow_matching", "num_inference_steps": 10, "open_gate": True}
+    policy, before, _, dataset = made_for_training(root, **fields)
+    chunking(policy)
+    noise = torch.randn(1, policy.config.chunk_size, 32, generator=torch.Generator().manual_seed(0))
+
+    def planned(first: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """The free and the guided plan at step 7, after a plan at step 0 that saw another frame."""
+        found = []
+        for left_over in (None, torch.full((3, 7), 0.5)):
+            policy.reset()
+            for step, seen in ((0, first), (7, 7)):
+                monkeypatch.setattr("time.monotonic", lambda step=step: 100.0 + step / CONTROL_HZ)
+                batch = before(observation(dataset, seen, **({"step": float(step)} if clock else {})))
+                guidance = {} if step == 0 else {"inference_delay": 3, "prev_chunk_left_over": left_over}
+                plan = policy.predict_action_chunk(batch, noise=noise, **guidance)
+            found.append(plan)
+        return found[0], found[1]
+
+    free, guided = planned(0)
+    assert [step for _, steps in remembered(policy, [0]) for step in steps] == [0, 7]
+    apart = [float((plan[0, :3] - 0.5).abs().mean()) for plan in (free, guided)]
+    assert apart[1] < 0.1 < apart[0]
+    assert not torch.equal(guided, planned(20)[1]), "the guided plan depends on what was seen before"
 
 
 def test_regression_refuses_to_be_guided(root: Path) -> None:

@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem import network
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryModulator
+from lerobot_memobench.policies.memobench_mem.layers import attend, rms_norm
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
@@ -54,15 +56,15 @@ def test_a_modulator_tells_what_it_looks_at() -> None:
     torch.manual_seed(0)
     modulator, length = MemoryModulator(32, heads=4), 6
     memory = MemoryTokens(torch.randn(3, length, 32), torch.arange(length) < torch.tensor([[6], [2], [0]]))
-    actions, (key, _) = torch.randn(3, 5, 32), modulator.keys(memory)
-    units = torch.eye(length, modulator.head_dim).expand(3, 1, -1, -1)
+    actions, (key, _) = rms_norm(torch.randn(3, 5, 32)), modulator.keys(memory)
+    units = torch.eye(length, modulator.head_dim).expand(3, -1, -1)
     read: list[torch.Tensor] = []
     modulator.out.register_forward_hook(lambda _, inputs, __: read.append(inputs[0]))
-    modulator(actions, memory, (key, units))
+    found: list[torch.Tensor] = []
+    modulator.read(actions, memory, (key, units), found)
     of_heads = read[0].unflatten(-1, (4, modulator.head_dim))[..., :length]
-    found = modulator.weights(actions, memory, (key, units))
-    torch.testing.assert_close(found, of_heads.mean(dim=(1, 2)))
-    torch.testing.assert_close(found.sum(dim=1), torch.tensor([1.0, 1.0, 0.0]))
+    torch.testing.assert_close(found[0], of_heads.mean(dim=(1, 2)))
+    torch.testing.assert_close(found[0].sum(dim=1), torch.tensor([1.0, 1.0, 0.0]))
 
 
 @pytest.mark.parametrize("fusion", ["modulation", "context"])
@@ -87,13 +89,20 @@ def test_reads_are_of_the_sampled_frames_and_change_no_action(root: Path, fusion
     assert policy.memory_reads() == [[], []]
 
 
-def test_what_actions_attend_to_in_context_is_what_was_summed(root: Path) -> None:
-    """The one layer, pass and row that is left gives its own weights, memory's columns of them."""
+def test_what_actions_attend_to_in_context_is_what_was_summed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The weights that the expert's layers multiply values by, memory's columns of them."""
     policy, batches = acting(root, memory_fusion="context", num_inference_steps=1)
-    (layer, *others) = policy.model.paligemma_with_expert.gemma_expert.model.layers
     weights: list[torch.Tensor] = []
-    for each in (layer, *others):
-        each.self_attn.register_forward_hook(lambda _, __, outputs: weights.append(outputs[1][0]))
+
+    def noting(*given: Any) -> torch.Tensor:
+        read = attend(*given)
+        if given[0].shape[1] == policy.config.chunk_size:
+            query, key, scale = given[0][0], given[1][0], given[0].shape[-1] ** -0.5
+            scores = torch.einsum("nhd,md->hnm", query, key) * scale + given[3][0]
+            weights.append(scores.softmax(dim=-1))
+        return read
+
+    monkeypatch.setattr(network, "attend", noting)
     policy.watch_memory()
     rolled(policy, batches[:9])
     (read,), _ = policy.memory_reads()

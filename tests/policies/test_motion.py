@@ -12,7 +12,14 @@ import torch
 from torch import Tensor
 
 from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL, thumbnails
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import AHEAD, PLACES, Histories, MemorySpec, NoSettings
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
+    AHEAD,
+    PLACES,
+    Histories,
+    MemorySpec,
+    MemoryTokens,
+    NoSettings,
+)
 from lerobot_memobench.policies.memobench_mem.memory.motion import FORESIGHT, FORESIGHT_WEIGHT, HINDSIGHT, Motion
 from lerobot_memobench.policies.memobench_mem.motion_fields import (
     BLOCK,
@@ -254,11 +261,11 @@ def test_actions_begin_without_hindsight_and_learn_with_it(trained: tuple[Any, d
 
 def test_queries_stand_before_the_actions(trained: tuple[Any, dict[str, Any]]) -> None:
     model, chunk = trained[0].model, trained[0].config.chunk_size
-    tokens, real, blocks, _ = model.embed_suffix(torch.zeros(4, chunk, 32), torch.ones(4))
-    assert tokens.shape[:2] == real.shape == blocks.shape == (4, FORESIGHT + chunk)
-    assert real.all()
-    assert blocks[:, 0].all()
-    assert not blocks[:, 1:].any()
+    actions = torch.randn(4, chunk, model.foresight.queries.shape[1])
+    real = torch.ones(4, 1, dtype=torch.bool)
+    model.set_memory(MemoryTokens(torch.randn(4, 1, model.memory.out.out_features), real))
+    tokens = model.fusion.actions(actions)
+    assert torch.equal(tokens[:, FORESIGHT:], actions)
     assert torch.equal(tokens[1, :FORESIGHT], model.foresight.queries)
 
 

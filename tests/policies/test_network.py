@@ -6,7 +6,9 @@ import pytest
 import torch
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.modeling_pi05 import PaliGemmaWithExpertModel, PI05Pytorch
+from torch._dynamo.utils import counters
 
+from lerobot_memobench.policies.memobench_mem import layers, network
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import pool_tokens
 from lerobot_memobench.policies.memobench_mem.fusion import (
@@ -17,7 +19,8 @@ from lerobot_memobench.policies.memobench_mem.fusion import (
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
-from lerobot_memobench.sim.object_layout import SIZE, SLOTS
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
+from tests.support.lerobots_passes import lerobots_passes
 from tests.support.memory import histories
 from tests.support.small_policy import small_config
 
@@ -99,12 +102,58 @@ def _pair(memory_fusion: str = "modulation") -> tuple[MemoryPI05, MemoryPI05]:
 
 def test_without_modulation_the_policy_is_pi05_output_for_output() -> None:
     plain, ours = _pair()
-    assert type(plain).forward is PI05Pytorch.forward
-    assert type(ours).sample_actions is PI05Pytorch.sample_actions
     inputs = _inputs(ours.config)
     _hand_over(ours, *_memory(ours.config))
     assert torch.equal(_losses(plain, inputs), _losses(ours, inputs))
     assert torch.equal(_actions(plain, inputs), _actions(ours, inputs))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"memory_fusion": "none"},
+        {"memory_fusion": "modulation"},
+        {"memory_fusion": "context"},
+        {"memory": "motion", "perception": "objects", "size": "small", "objective": "flow_matching"},
+        {"memory_fusion": "none", "size": "small", "perception": "objects", "objective": "flow_matching"},
+    ],
+)
+def test_passes_are_lerobots_to_rounding(fields: dict[str, object]) -> None:
+    """Losses, gradients and actions of LeRobot's own passes over the same weights."""
+    torch.manual_seed(0)
+    ours = MemoryPI05(small_config(**fields)).train()
+    with torch.no_grad():
+        for name, parameter in ours.named_parameters():
+            if "vision_tower" not in name:
+                parameter.add_(0.05 * torch.randn_like(parameter))  # some start at zero and hide errors
+    inputs = _inputs(ours.config)
+    if ours.state_token is not None:
+        shown = torch.arange(SLOTS) < torch.tensor([[5], [3]])
+        slots = torch.randn(BATCH, SLOTS, WIDTH)
+        slots[..., :2] = torch.stack([shown, torch.arange(SLOTS).expand(BATCH, -1)], dim=-1)
+        seen = torch.cat([slots.flatten(1), torch.randn(BATCH, HAND_DIM)], dim=1)
+        inputs["images"] = [seen, torch.randn(BATCH, ours.config.max_state_dim)]
+        inputs["img_masks"] = [shown, torch.ones(BATCH, dtype=torch.bool)]
+    each, mask = torch.randn(BATCH, 2, ours.config.dimensions.vlm.width), torch.arange(2) < torch.tensor([[2], [1]])
+    memory = MemoryTokens(each[:, :1], mask[:, :1]) if ours.config.memory == "motion" else MemoryTokens(each, mask)
+
+    def passed(model: PI05Pytorch) -> list[torch.Tensor | None]:
+        ours.zero_grad()
+        if ours.memory is not None:
+            ours.set_memory(memory)
+        losses = _losses(model, inputs)
+        losses.mean().backward()
+        return [losses, _actions(model, inputs), *(parameter.grad for parameter in ours.parameters())]
+
+    found = passed(ours)
+    with lerobots_passes(ours) as theirs:
+        expected = passed(theirs)
+    assert sum(one is not None for one in found) > 20
+    for one, other in zip(found, expected, strict=True):
+        if one is None:  # last states of the prefix, which none reads
+            assert other is None or not other.any()
+        else:
+            torch.testing.assert_close(one, other, rtol=1e-3, atol=2e-6)
 
 
 def test_modulation_reaches_both_paths() -> None:
@@ -153,10 +202,53 @@ def test_context_memory_joins_the_prefix_and_padding_says_nothing() -> None:
     assert not torch.allclose(_actions(ours, inputs), actions)
 
 
+@pytest.mark.parametrize("few", [0, 99])
+def test_heads_share_keys(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores that are kept, and torch's kernel: what is read, and every gradient, is that of each head by itself."""
+    monkeypatch.setattr(layers, "FEW_KEYS", few)
+    torch.manual_seed(0)
+    parts = [torch.randn(shape, requires_grad=True) for shape in ((2, 5, 8, 4), (2, 7, 4), (2, 7, 4))]
+    for seen in (torch.arange(7) < torch.tensor([[[7]], [[2]]]), torch.rand(2, 5, 7) < 0.6):
+        bias = layers.hidden(seen)
+        query, key, value = parts
+        scores = torch.einsum("bnhd,bmd->bhnm", query, key) / 2 + bias.unsqueeze(1)
+        alone = torch.einsum("bhnm,bmd->bnhd", scores.softmax(dim=-1), value).flatten(2)
+        found = layers.attend(query, key, value, bias)
+        torch.testing.assert_close(found, alone)
+        along = torch.randn_like(found)
+        expected = torch.autograd.grad(alone, parts, along)
+        for ours, of_each in zip(torch.autograd.grad(found, parts, along), expected, strict=True):
+            torch.testing.assert_close(ours, of_each)
+
+
+@pytest.mark.slow
+def test_passes_are_captured_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a break, by a backend that needs no compiler: actions and gradients are the same."""
+    original = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda part, mode, **how: original(part, backend="aot_eager", **how))
+    network.compiled.cache_clear()
+    found = []
+    for compiles in (False, True):
+        torch.manual_seed(0)
+        ours = MemoryPI05(_config(compile_model=compiles, open_gate=True))
+        inputs = _inputs(ours.config)
+        with torch.no_grad():
+            _hand_over(ours, *_memory(ours.config))
+            actions = [_actions(ours, inputs) for _ in range(2)]
+        _hand_over(ours, *_memory(ours.config))
+        _losses(ours, inputs).mean().backward()
+        found.append([*actions, *(one.grad for one in ours.parameters() if one.grad is not None)])
+    network.compiled.cache_clear()
+    assert counters["stats"]["unique_graphs"] > 0
+    for plain, captured in zip(*found, strict=True):
+        torch.testing.assert_close(plain, captured, rtol=1e-4, atol=1e-6)
+
+
 def test_the_instruction_conditions_the_experts_norms_and_its_padding_does_not() -> None:
     config = _config(size="small", perception="objects")
     torch.manual_seed(0)
     model = MemoryPI05(config)
+    torch.nn.init.normal_(next(model.paligemma_with_expert.adaptive_norms()).dense.weight)  # zero at first
     tokens = torch.randint(0, 200, (2, 12))
     short = torch.arange(12) < torch.tensor([[12], [7]])
     seen = [torch.zeros(2, SIZE + HAND_DIM), torch.zeros(2, config.max_state_dim)]
@@ -164,7 +256,8 @@ def test_the_instruction_conditions_the_experts_norms_and_its_padding_does_not()
 
     def condition(words: torch.Tensor) -> torch.Tensor:
         model.embed_prefix(seen, shown, words, short)
-        return model.embed_suffix(torch.zeros(2, CHUNK, 32), torch.ones(2))[3]
+        (modulation, *_) = model.modulations(torch.ones(2))
+        return modulation.flatten(1)
 
     told = condition(tokens)
     assert torch.equal(told, condition(torch.where(short, tokens, 3)))
@@ -315,28 +408,24 @@ def test_positions_matter_to_the_modulator() -> None:
 
 
 def test_keys_are_computed_once_per_memory_and_only_without_gradients() -> None:
-    class Plain(torch.nn.Module):
-        def forward(self, x: torch.Tensor, cond: torch.Tensor | None = None) -> tuple[torch.Tensor, None]:
-            return x, None
-
     modulator, state = _modulator(), SharedMemory()
-    norm = ModulatedNorm(Plain(), modulator, state)
+    norm = ModulatedNorm(torch.nn.Identity(), modulator, state)
     calls: list[int] = []
     keys = modulator.keys
     modulator.keys = lambda memory: calls.append(1) or keys(memory)  # type: ignore[method-assign]
-    actions, mask = torch.randn(2, 5, 32), torch.ones(2, 9, dtype=torch.bool)
+    actions, mask, zero = torch.randn(2, 5, 32), torch.ones(2, 9, dtype=torch.bool), torch.zeros(2, 1, 96)
     memories = torch.randn(3, 2, 9, 32)
     fresh = []
     for memory in memories:
-        state.set(MemoryTokens(memory, mask))
-        fresh.append(norm(actions)[0].detach())
-        norm(actions)
+        state.set(MemoryTokens(memory, mask), [modulator])
+        fresh.append(norm(actions, zero)[0].detach())
+        norm(actions, zero)
     assert len(calls) == 6  # with gradients: every time, as checkpointing runs layers again
     with torch.no_grad():
         for memory, expected in zip(memories, fresh, strict=True):
-            state.set(MemoryTokens(memory, mask))
+            state.set(MemoryTokens(memory, mask), [modulator])
             for _ in range(3):
-                torch.testing.assert_close(norm(actions)[0], expected)
+                torch.testing.assert_close(norm(actions, zero)[0], expected)
     assert len(calls) == 9
 
 

@@ -389,11 +389,11 @@ def test_the_present_is_the_same_in_training_and_in_a_rollout(root: Path) -> Non
         policy.train(learning).model.embed_prefix(*policy._preprocess_images(batch), *(batch[key] for key in words))
         for batch, learning in ((trained, True), (acted, False))
     ]
-    seen = [embeddings[real] for embeddings, real, _ in prefixes]
+    seen = [prefix.tokens[prefix.real] for prefix in prefixes]
     assert torch.equal(*seen)
     count = trained[words[1]].sum()
     assert len(seen[0]) == 3 + 1 + count, "three things, the state and the words"
-    assert [embeddings.shape[1] for embeddings, *_ in prefixes] == [3 + 1 + count, 16 + 1 + count]
+    assert [prefix.tokens.shape[1] for prefix in prefixes] == [3 + 1 + count, 16 + 1 + count]
 
 
 def test_a_batch_to_learn_from_has_the_slots_of_its_fullest_sample(root: Path) -> None:

@@ -83,6 +83,7 @@ LEROBOTS = {
     "use_amp": "eval_main",
     "rtc_config": "rollout/inference/rtc.py",
     "relative_exclude_joints": "RelativeActionsProcessorStep, of datasets that name their actions",
+    **dict.fromkeys(("compile_model", "compile_mode"), "torch.compile, by which results are equal to rounding"),
 }
 """Fields that LeRobot reads or writes itself -> where."""
 

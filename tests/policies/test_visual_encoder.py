@@ -12,8 +12,6 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_policy, make_pre_post_processors
-from torch.nn.functional import scaled_dot_product_attention
-from transformers.models.gemma import modeling_gemma
 
 from lerobot_memobench.datasets.feature_cache import building
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
@@ -21,7 +19,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
-from lerobot_memobench.policies.memobench_mem import network
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
@@ -29,7 +26,6 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PL
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from tests.support.picture_rollouts import (
     CAMERAS,
-    observed,
 )
 from tests.support.small_policy import batch_of, made_for_training, small_config
 from tests.support.synthetic_dataset import LENGTHS
@@ -294,39 +290,6 @@ def test_every_kind_trains_and_the_tower_does_not(
     assert all(parameter.grad is not None for parameter in policy.model.memory_parameters().values())
     assert policy.perception.project.weight.grad.any()
     assert not policy.perception.tower.training
-
-
-def test_attention_in_one_kernel_learns_the_same_and_acts_by_lerobots(
-    root: Path, encoder_fields: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fused: list[bool] = []
-
-    def counting(*tensors: torch.Tensor, **named: Any) -> torch.Tensor:
-        fused.append(torch.is_grad_enabled())
-        return scaled_dot_product_attention(*tensors, **named)
-
-    monkeypatch.setattr(network, "scaled_dot_product_attention", counting)
-    policy, before, _, dataset = made_for_training(root, **encoder_fields)
-    batch = before(batch_of(dataset, [10, 30, 50]))
-    layers = [module for module in policy.modules() if isinstance(module, modeling_gemma.GemmaAttention)]
-    found = []
-    for count in (policy.config.dimensions.vlm.depth, 0):
-        fused.clear()
-        policy.zero_grad()
-        loss, _ = policy.train().forward(batch)
-        loss.backward()
-        assert len(fused) == count
-        assert torch.backends.cuda.flash_sdp_enabled(), "not left out for quick products"
-        found.append([loss, *(weight.grad for weight in policy.get_optim_params())])
-        for layer in layers:
-            vars(layer).pop(network.MARK, None)
-    for ours, lerobots in zip(*found, strict=True):
-        torch.testing.assert_close(ours, lerobots, rtol=1e-3, atol=1e-5)
-    network.attend_fused(policy)
-    policy.eval().select_action(before(observed(root, dataset, 0)))
-    with torch.no_grad():
-        policy.forward(batch)
-    assert not fused
 
 
 # -- checkpoints ---------------------------------------------------------------------------------------------------

@@ -20,7 +20,6 @@ from lerobot_memobench.cli.conformance import conformance
 from lerobot_memobench.cli.console import run_app
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.demo import demo, doctor
-from lerobot_memobench.cli.fit import fit
 from lerobot_memobench.cli.report import compare, controls, html, merge, report, rerun
 from lerobot_memobench.cli.sealed import test_sealed
 from lerobot_memobench.cli.tasks import gallery, objects, recipe, tasks
@@ -59,7 +58,7 @@ app = typer.Typer(
 COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], ...]] = {
     "Look around": (tasks, objects, gallery, doctor, demo),
     "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
-    "Train": (recipe, fit, conformance),
+    "Train": (recipe, conformance),
     "Results": (test_sealed, report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls)),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""

@@ -71,7 +71,6 @@ from lerobot_memobench.run.arguments import (
     resolve_recipe,
     whole_number,
 )
-from lerobot_memobench.run.gpu_memory import refuse_too_large
 from lerobot_memobench.run.lerobot_commands import call_lerobot, without_configuration
 from lerobot_memobench.run.plan import check_observations, env_config, policy_config
 
@@ -109,7 +108,6 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
     if given.wants_help:
         return call_lerobot("train", arguments.for_parser)
     arguments = complete_training(arguments)
-    refuse_too_large(arguments)
     note, left = note_on_resume(arguments)
     for noted in (note, note_on_start(arguments)):
         if noted is not None:

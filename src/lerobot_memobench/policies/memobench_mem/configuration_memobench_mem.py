@@ -238,9 +238,10 @@ READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
         "time_sampling_offset",
     ),
     "use_relative_actions=true": (lambda it: it.use_relative_actions, "relative_exclude_joints"),
+    "compile_model=true": (lambda it: it.compile_model, "compile_mode"),
     "policy=pi05": (
         lambda _: False,
-        "paligemma_variant action_expert_variant n_obs_steps compile_model compile_mode freeze_vision_encoder "
+        "paligemma_variant action_expert_variant n_obs_steps freeze_vision_encoder "
         "scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr " + " ".join(PI05_ALONE),
     ),
 }
@@ -769,7 +770,8 @@ class MemobenchMemConfig(PI05Config):
 @OptimizerConfig.register_subclass("memobench_adamw")
 @dataclass
 class FusedAdamWConfig(AdamWConfig):
-    """AdamW that needs no room beside its state on a GPU, where torch's default makes a copy of all that learns.
+    """AdamW in one kernel: torch's default makes a copy of all that learns on a GPU, and takes three times as long on a
+    CPU.
 
     At full size that copy is 10.5 GiB, and is what made four cards of 80 GB too small for `config=train_paper`.
     """
@@ -777,7 +779,7 @@ class FusedAdamWConfig(AdamWConfig):
     def build(self, params: Iterable[nn.Parameter]) -> Optimizer:
         """Return the optimizer of some parameters."""
         learning = list(params)
-        fused = all(parameter.is_cuda for parameter in learning) or None  # elsewhere torch's own choice
+        fused = all(parameter.device.type in ("cpu", "cuda") for parameter in learning) or None  # None: torch's choice
         return AdamW(learning, self.lr, self.betas, self.eps, self.weight_decay, fused=fused)
 
 

@@ -6,42 +6,51 @@ memory into the prefix. Shapes: B rows, L memory tokens, W width of the action e
 
 from __future__ import annotations
 
+import functools
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
-import torch.nn.functional as F
-from einops import rearrange, repeat
+from einops import rearrange
 from torch import Tensor, nn
 
+from lerobot_memobench.policies.memobench_mem.layers import attend, hidden, rms_norm, rotary, rotate
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 
-if TYPE_CHECKING:
-    from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 
-Prefix = tuple[Tensor, Tensor, Tensor]
-"""LeRobot's prefix: embeddings (B, N, D), which of them are real (B, N), and where attention blocks begin (B, N)."""
-Suffix = tuple[Tensor, Tensor, Tensor, Tensor]
-"""The same of the action expert's tokens (B, T, W), and the condition (B, W) of its norms."""
+class Prefix(NamedTuple):
+    """What actions are planned from.
 
+    Attributes:
+        tokens: (B, N, D). real: (B, N), which of them are no padding.
+        attends: (B, N, N) bool, which (last) of them each (first) attends to; None: all to all that are real.
+        unread: how many of the first ones actions do not attend to.
+        asked: the tokens whose last states are asked for by `MemoryFusion.read_out`; None: of none.
+    """
 
-UNREAD = "unread"
-"""Attribute of attention modules that learn in one kernel: of how many of the first tokens nobody reads the result."""
+    tokens: Tensor
+    real: Tensor
+    attends: Tensor | None = None
+    unread: int = 0
+    asked: slice | None = None
+
+    def joined(self, tokens: Tensor, real: Tensor) -> Prefix:
+        """Return it with more tokens behind, as all attend to."""
+        more = tokens.to(self.tokens.dtype)
+        return Prefix(torch.cat([self.tokens, more], dim=1), torch.cat([self.real, real], dim=1))
 
 
 class MemoryFusion(ABC):
     """A way by which actions read memory tokens; made once for a model, to which it may add parameters.
 
     Attributes:
-        attends_fused: whether training attends in one kernel (`network.attend_fused`), as a long prefix is quicker.
         tells_reads: whether `watched` can say how much each token was read.
     """
 
-    attends_fused: ClassVar[bool] = False
     tells_reads: ClassVar[bool] = False
 
     @abstractmethod
@@ -53,26 +62,26 @@ class MemoryFusion(ABC):
         """Take the memory, of width d_m, that the next passes read."""
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Return the model's prefix, given LeRobot's.
+        """Return the model's prefix, given pi0.5's.
 
         Args:
             state: place of the token of the robot's state; None: there is none.
         """
         return prefix
 
-    def suffix(self, suffix: Suffix) -> Suffix:
-        """Return the model's suffix, given LeRobot's; the actions stay its last tokens."""
-        return suffix
+    def actions(self, tokens: Tensor) -> Tensor:
+        """Return the action expert's tokens (B, T, W), given pi0.5's; the actions stay the last ones."""
+        return tokens
 
-    def attention(self, mask: Tensor) -> Tensor:
-        """Return what is added to attention (B, 1, queries, keys), given LeRobot's: 0, or very low where none is paid.
-
-        Queries are the last of the keys: of the prefix, of prefix and actions, or of actions alone.
-        """
-        return mask
+    def condition(self, condition: Tensor) -> Tensor:
+        """Return the condition (..., B, W) of the expert's norms, given pi0.5's."""
+        return condition
 
     def read_out(self, states: Tensor) -> None:  # noqa: B027 (most need nothing of it)
-        """Take the last states of a prefix (B, N, D)."""
+        """Take the last states (B, n, D) of the prefix's tokens that it asked for."""
+
+    def made(self, states: Tensor) -> None:  # noqa: B027
+        """Take the expert's last states (B, T, W)."""
 
     def outputs(self) -> dict[str, Tensor]:
         """Return what the last pass made beside actions, for `MemoryMechanism.losses`."""
@@ -92,15 +101,6 @@ class MemoryFusion(ABC):
         return name
 
 
-@contextmanager
-def hooked(modules: Iterable[nn.Module], note: Callable[[Any, Any, Any], None]) -> Iterator[None]:
-    """Call ``note(module, inputs, outputs)`` after each pass of some modules, while this lasts."""
-    with ExitStack() as hooks:
-        for module in modules:
-            hooks.callback(module.register_forward_hook(note).remove)
-        yield
-
-
 # -- modulation -------------------------------------------------------------------------------------------------------
 
 
@@ -110,25 +110,26 @@ _ROPE_BASE = 10_000.0
 class RMSNorm(nn.Module):
     """Root-mean-square norm with a learned scale that starts at one (Gemma's form)."""
 
-    def __init__(self, width: int, eps: float = 1e-6) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(width))
-        self.eps = eps
 
     def forward(self, x: Tensor) -> Tensor:
         """Norm of x (..., W), in float32."""
-        x = x.to(torch.float32)
-        return x * torch.rsqrt(x.square().mean(dim=-1, keepdim=True) + self.eps) * (1.0 + self.weight)
+        return rms_norm(x) * (1.0 + self.weight)
 
 
-def rotate(x: Tensor, positions: Tensor) -> Tensor:
-    """Rotary position embedding of x (B, heads, N, d) at positions (N,), halves paired as in Gemma."""
-    half = x.shape[-1] // 2
-    frequencies = _ROPE_BASE ** -(torch.arange(half, dtype=torch.float32, device=x.device) / half)
-    angles = torch.outer(positions.to(torch.float32), frequencies)
-    cos, sin = angles.cos().to(x.dtype), angles.sin().to(x.dtype)
-    first, second = x.chunk(2, dim=-1)
-    return torch.cat([first * cos - second * sin, second * cos + first * sin], dim=-1)
+@functools.lru_cache(maxsize=64)
+def _places(begin: int, count: int, width: int, device: torch.device) -> Tensor:
+    """Return the rotations of ``count`` positions from ``begin`` on, for vectors of this width."""
+    frequencies = _ROPE_BASE ** -(torch.arange(width // 2, dtype=torch.float32, device=device) / (width // 2))
+    return rotary(torch.arange(begin, begin + count, device=device), frequencies)
+
+
+def rotate_from(x: Tensor, begin: int) -> Tensor:
+    """Rotary position embedding of x (..., N, d), whose positions are ``begin``, ``begin`` + 1, ..."""
+    places = _places.__wrapped__ if torch.compiler.is_compiling() else _places  # else torch warns of the cache
+    return rotate(x, places(begin, x.shape[-2], x.shape[-1], x.device))
 
 
 class MemoryModulator(nn.Module):
@@ -152,10 +153,10 @@ class MemoryModulator(nn.Module):
         nn.init.zeros_(self.modulation.bias)
 
     def keys(self, memory: MemoryTokens) -> tuple[Tensor, Tensor]:
-        """Rotated keys and values, both (B, 1, L, head_dim), of memory of width W."""
+        """Rotated keys and values, both (B, L, head_dim), of memory of width W."""
         normed = memory.through(self.memory_norm)
-        key, value = (rearrange(normed.through(linear).rows(), "b l d -> b 1 l d") for linear in (self.key, self.value))
-        return rotate(key, torch.arange(key.shape[2], device=key.device)), value
+        key, value = (normed.through(linear).rows() for linear in (self.key, self.value))
+        return rotate_from(key, 0), value
 
     def forward(
         self, actions: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor] | None = None
@@ -165,34 +166,22 @@ class MemoryModulator(nn.Module):
         ``keys`` are those of the same memory, if they have been computed before. A row whose memory is all masked
         reads zeros.
         """
-        mask, count = memory.mask, actions.shape[1]
-        key, value = self.keys(memory) if keys is None else keys
-        query, bias = self._queries(actions, mask)
-        read = F.scaled_dot_product_attention(
-            query,
-            repeat(key, "b 1 l d -> b h l d", h=self.heads),
-            repeat(value, "b 1 l d -> b h l d", h=self.heads).to(query.dtype),
-            attn_mask=repeat(bias, "b l -> b h t l", h=self.heads, t=count),
-        )
-        read = read * rearrange(mask.any(dim=1).to(read.dtype), "b -> b 1 1 1")
-        read = self.out(rearrange(read, "b h t d -> b t (h d)"))
-        scale, shift = self.modulation(read).chunk(2, dim=-1)
-        return scale, shift
+        return self.read(rms_norm(actions), memory, self.keys(memory) if keys is None else keys)
 
-    def _queries(self, actions: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rotated queries of actions (B, heads, T, head_dim), and what is added to their scores (B, L)."""
-        count, length = actions.shape[1], mask.shape[1]
-        query = rearrange(self.query(self.action_norm(actions)), "b t (h d) -> b h t d", h=self.heads)
-        query = rotate(query, torch.arange(length, length + count, device=actions.device))
+    def read(
+        self, normed: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor], found: list[Tensor] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Do as `forward`, of actions whose mean square is one; add to ``found`` how much is read, (B, L)."""
+        weights: list[Tensor] | None = None if found is None else []
+        query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
+        query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
         # A finite bias keeps the softmax of an all-masked row finite; its result is then set to zero.
-        bias = torch.zeros_like(mask, dtype=query.dtype).masked_fill(~mask, torch.finfo(query.dtype).min / 2)
-        return query, bias
-
-    def weights(self, actions: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor]) -> Tensor:
-        """Return how much `forward` reads of each memory token (B, L): the mean over heads and actions."""
-        query, bias = self._queries(actions, memory.mask)
-        scores = query @ keys[0].transpose(-1, -2) * self.head_dim**-0.5 + rearrange(bias, "b l -> b 1 1 l")
-        return scores.softmax(dim=-1).mean(dim=(1, 2)) * memory.mask
+        read = attend(query, keys[0], keys[1].to(query.dtype), hidden(memory.mask)[:, None], weights)
+        if found is not None and weights is not None:
+            found.append(weights[0].mean(dim=(1, 2)) * memory.mask)
+        read = read * memory.mask.any(dim=1)[:, None, None]
+        scale, shift = self.modulation(self.out(read)).chunk(2, dim=-1)
+        return scale, shift
 
 
 @dataclass
@@ -201,31 +190,30 @@ class SharedMemory:
 
     It is kept until the next pass replaces it, because gradient checkpointing runs layers again in ``backward``. In a
     rollout the layers' keys of this memory are kept as well: all denoising steps of a plan read the same memory.
+
+    Attributes:
+        found: takes how much of each token each layer reads, where somebody looks.
     """
 
     memory: MemoryTokens | None = None
     keys: dict[nn.Module, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    found: list[Tensor] | None = None
 
-    def set(self, memory: MemoryTokens) -> None:
-        """Begin a pass over another memory."""
+    def set(self, memory: MemoryTokens, modulators: Iterable[MemoryModulator] = ()) -> None:
+        """Begin a pass over another memory; the keys of these are made once where no gradients are wanted."""
         self.memory = memory
-        self.keys.clear()
+        self.keys = {} if torch.is_grad_enabled() else {one: one.keys(memory) for one in modulators}
 
     def keys_of(self, modulator: MemoryModulator) -> tuple[Tensor, Tensor]:
-        """Keys and values of a layer; computed once per memory where no gradients are wanted."""
+        """Keys and values of a layer."""
         assert self.memory is not None
-        if torch.is_grad_enabled():
-            return modulator.keys(self.memory)
-        if modulator not in self.keys:
-            self.keys[modulator] = modulator.keys(self.memory)
-        return self.keys[modulator]
+        return self.keys[modulator] if modulator in self.keys else modulator.keys(self.memory)
 
 
 class ModulatedNorm(nn.Module):
     """LeRobot's norm before an expert layer's feed-forward, followed by the memory's modulation.
 
-    Both of pi0.5's paths (joint training and denoising over cached keys) call ``norm(x, cond=...)`` right before the
-    feed-forward and keep the residual outside, so x <- norm(x) * (1 + scale) + shift here touches nothing else.
+    The residual stays outside, so x <- norm(x) * (1 + scale) + shift here touches nothing else.
     """
 
     def __init__(self, norm: nn.Module, modulator: MemoryModulator, state: SharedMemory) -> None:
@@ -234,14 +222,20 @@ class ModulatedNorm(nn.Module):
         self.modulator = modulator
         self.state = state
 
-    def forward(self, x: Tensor, cond: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-        """Normalised and modulated x (B, T, W), and LeRobot's gate."""
-        normed, gate = self.norm(x, cond=cond)
-        if self.state.memory is None:
-            return normed, gate
-        keys = self.state.keys_of(self.modulator)
-        scale, shift = self.modulator(x, self.state.memory, keys)
-        return (normed * (1.0 + scale) + shift).to(normed.dtype), gate
+    def forward(self, x: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised and modulated x (B, T, W), and the norm's gate (B, 1, W).
+
+        Args:
+            modulation: (B, 1, 3 W), scale, shift and gate of the norm itself.
+        """
+        scale, shift, gate = modulation.float().chunk(3, dim=-1)
+        normed = rms_norm(x)
+        made = torch.addcmul(shift, normed, 1 + scale)
+        if self.state.memory is not None:
+            keys = self.state.keys_of(self.modulator)
+            scale, shift = self.modulator.read(normed, self.state.memory, keys, self.state.found)
+            made = torch.addcmul(shift, made, 1 + scale)
+        return made.to(x.dtype), gate.to(x.dtype)
 
 
 class Modulation(MemoryFusion):
@@ -252,7 +246,7 @@ class Modulation(MemoryFusion):
 
     tells_reads = True
 
-    def __init__(self, model: PI05Pytorch, memory_dim: int, expert_dim: int) -> None:
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         self.model, self.shared = model, SharedMemory()
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
         for layer in model.paligemma_with_expert.gemma_expert.model.layers:
@@ -262,7 +256,7 @@ class Modulation(MemoryFusion):
 
     def hand_over(self, memory: MemoryTokens) -> None:
         """Begin a pass over this memory in every layer."""
-        self.shared.set(memory.through(cast(nn.Linear, self.model.memory_to_expert)))
+        self.shared.set(memory.through(cast(nn.Linear, self.model.memory_to_expert)), self.modulators)
 
     @property
     def modulators(self) -> list[MemoryModulator]:
@@ -279,8 +273,11 @@ class Modulation(MemoryFusion):
     def watched(self) -> Iterator[list[Tensor]]:
         """Yield how much the modulators look at each token."""
         found: list[Tensor] = []
-        with hooked(self.modulators, lambda modulator, inputs, _: found.append(modulator.weights(*inputs))):
+        self.shared.found = found
+        try:
             yield found
+        finally:
+            self.shared.found = None
 
     def owns(self, name: str) -> bool:
         """Say whether a parameter is the projection's or a modulator's."""
@@ -306,7 +303,7 @@ class Context(MemoryFusion):
 
     tells_reads = True
 
-    def __init__(self, model: PI05Pytorch, memory_dim: int, expert_dim: int) -> None:
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         self.model, self.memory = model, cast("MemoryTokens | None", None)
 
     def hand_over(self, memory: MemoryTokens) -> None:
@@ -317,24 +314,16 @@ class Context(MemoryFusion):
         """Append the memory, which attends and is attended like images and language."""
         if self.memory is None:
             return prefix
-        embeddings, real, blocks = prefix
-        mask = self.memory.mask
-        return (
-            torch.cat([embeddings, self.memory.rows().to(embeddings.dtype)], dim=1),
-            torch.cat([real, mask], dim=1),
-            torch.cat([blocks, torch.zeros_like(mask)], dim=1),
-        )
+        return prefix.joined(self.memory.rows(), self.memory.mask)
 
     @contextmanager
     def watched(self) -> Iterator[list[Tensor]]:
         """Yield how much actions attend to each token: a share of all that they attend to."""
+        assert self.memory is not None
+        length = self.memory.mask.shape[1]
         found: list[Tensor] = []
-
-        def note(attention: Any, inputs: Any, outputs: tuple[Tensor, Tensor]) -> None:
-            assert self.memory is not None
-            weights, length = outputs[1], self.memory.mask.shape[1]  # (B, heads, T, prefix and T), memory at its end
+        with self.model.paligemma_with_expert.watched() as (_, of_actions):
+            yield found
+        for weights in of_actions:  # (B, heads, T, prefix and T), memory at the prefix's end
             actions = weights.shape[2]
             found.append(weights[..., -actions - length : -actions].mean(dim=(1, 2)))
-
-        with hooked([layer.self_attn for layer in self.model.paligemma_with_expert.gemma_expert.model.layers], note):
-            yield found

@@ -10,6 +10,7 @@ import contextlib
 import copy
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision, attend_fused
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory, quick_gradients, quick_products
 from lerobot_memobench.policies.memobench_mem.reads import ChunkReads, chunk_reads
@@ -82,7 +83,7 @@ from lerobot_memobench.policies.memobench_mem.training import (
     means_over_ranks,
     noise_and_time,
 )
-from lerobot_memobench.protocol import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
+from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
 # A saved pipeline is built right after its policy, by the names under which its steps register when imported.
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
@@ -214,17 +215,9 @@ class MemobenchMemPolicy(PI05Policy):
         cache = open_frames(Path(meta.root), self.config, self.perception)
         self.run = TrainingRun(self.config, cache, meta)
         begin_training(self.run)
-        if self.attends_fused:
-            attend_fused(self.model)
         if self._device.type == "cpu":
             keep_freed_memory()
         prepare_shards(self)
-
-    @property
-    def attends_fused(self) -> bool:
-        """Whether it learns with attention in one kernel."""
-        fusion = self.model.fusion
-        return self.config.uses_visual_encoder or (fusion is not None and fusion.attends_fused)
 
     @property
     def averages(self) -> bool:
@@ -364,7 +357,9 @@ class MemobenchMemPolicy(PI05Policy):
         """Forget histories and planned actions. LeRobot calls it once per batch of episodes."""
         super().reset()
         self.rollout.reset()
+        self.rollout.late = self._rtc_enabled()
         self._calls = self._planned = 0
+        self._began: float | None = None
         self._thread = threading.get_ident()
         self._acting_rows: list[int] = []
 
@@ -427,7 +422,7 @@ class MemobenchMemPolicy(PI05Policy):
             what = f"'{name}'" if name else "picture"
             raise MemobenchError(f"The observation has no {what}, which this policy remembers; {cure(name, batch)}")
         count = len(batch[name])
-        steps = _column(batch, OBS_STEP) or [self._calls] * count  # without a clock one call is one step
+        steps = _column(batch, OBS_STEP) or [self._step()] * count
         phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
         clocks = list(zip(phases or [EXECUTION] * count, steps, strict=True))
         self._calls += 1
@@ -437,6 +432,14 @@ class MemobenchMemPolicy(PI05Policy):
             if started[row]:
                 self.rollout.rows[row].draw_seed(batch[key][row] for key in observed)
         return steps, started, frozen
+
+    def _step(self) -> int:
+        """Return the control step since `reset` where observations show none: one for each call, or by real time."""
+        if not self._rtc_enabled():
+            return self._calls
+        now = time.monotonic()
+        self._began = now if self._began is None else self._began
+        return round((now - self._began) * CONTROL_HZ)
 
     @torch.no_grad()
     def _write(self, batch: dict[str, Tensor], rows: list[int]) -> None:
@@ -549,11 +552,9 @@ class MemobenchMemPolicy(PI05Policy):
     def supports_rtc(self) -> bool:
         """Return whether LeRobot's real-time chunking may ask this policy for its chunks.
 
-        It guides the denoising of a chunk, which regression lacks, and offers one observation per chunk, of which no
-        history can be made.
+        It guides the denoising of a chunk, which regression lacks.
         """
-        denoises = self.config.objective != REGRESSION
-        return bool(super().supports_rtc()) and denoises and not self._remembers
+        return bool(super().supports_rtc()) and self.config.objective != REGRESSION
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -562,7 +563,8 @@ class MemobenchMemPolicy(PI05Policy):
         A policy that remembers must be offered the observation of every control step by `observe`, this one included,
         unless it holds its step (``observation.step``); or let `select_action` do so. A training batch is answered
         with the histories that it brings. ``noise`` (B, chunk, max_action_dim) replaces the episodes' own; other
-        keywords are LeRobot's real-time chunking ones.
+        keywords are LeRobot's real-time chunking ones, which offers one observation per chunk: it is remembered at the
+        step at which it is seen, for the frames that were due since the last one.
 
         Raises:
             MemobenchError: observations were left out between two chunks; or real-time chunking, by regression.
@@ -580,7 +582,7 @@ class MemobenchMemPolicy(PI05Policy):
             if noise is None:
                 noise = self._stacked(lambda _, shape: torch.randn(shape), samples)
             return self.plan(batch, [*samples], noise, training=True, **kwargs)
-        if OBS_STEP in batch or not self._remembers or not self._calls:
+        if OBS_STEP in batch or not self._remembers or not self._calls or self._rtc_enabled():
             self.observe(batch)
         elif self._calls == self._planned:
             raise MemobenchError(
@@ -670,8 +672,6 @@ class MemobenchMemPolicy(PI05Policy):
         memo[id(self)] = made
         with _WithoutGraph():
             made.__dict__.update(copy.deepcopy(self.__dict__, memo))
-        if made.run is not None and made.attends_fused:
-            attend_fused(made.model)
         return made
 
     # -- adapters --------------------------------------------------------------------------------------------------

@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from einops import rearrange, repeat
+from lerobot.policies.common.flow_matching import euler_integrate
+from lerobot.policies.common.vla_utils import create_sinusoidal_pos_embedding
 from lerobot.policies.pi05.modeling_pi05 import GemmaConfig, PaliGemmaWithExpertModel, PI05Pytorch
 from lerobot.policies.pi_gemma import PaliGemmaForConditionalGenerationWithPiGemma, PiGemmaForCausalLM
 from torch import Tensor, nn
-from torch.nn.functional import scaled_dot_product_attention
 from transformers.initialization import no_init_weights
-from transformers.models.gemma import modeling_gemma
 
-from lerobot_memobench.lerobot_hooks import ATTEND, hooked_for
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
 from lerobot_memobench.perception.weights import load_detector
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import Dimensions, MemobenchMemConfig
@@ -35,12 +34,12 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     VisualTokenEncoder,
     seed_parameters,
 )
-from lerobot_memobench.policies.memobench_mem.fusion import UNREAD, Context, MemoryFusion, Modulation, Prefix, Suffix
+from lerobot_memobench.policies.memobench_mem.fusion import Context, MemoryFusion, ModulatedNorm, Modulation, Prefix
+from lerobot_memobench.policies.memobench_mem.layers import attend, hidden, modulated, rms_norm, rotary, rotate
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
 from lerobot_memobench.policies.memobench_mem.motion_fields import motion_field
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
-from lerobot_memobench.policies.memobench_mem.products import exact_gradients, exact_products
 from lerobot_memobench.sim.object_slots import classes
 
 FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
@@ -48,8 +47,17 @@ OWN = ("state_token.", "instruction.", "paligemma_with_expert.perception.")
 """First parts of the names of parameters that plain pi0.5 does not have, beside the memory's."""
 
 
+@functools.cache
+def compiled(part: Callable[..., Any], mode: str) -> Callable[..., Any]:
+    """Return a part of a pass as torch compiles it: whole, for every model that asks for it."""
+    return torch.compile(part, mode=mode, fullgraph=True)
+
+
 class MemoryPI05(PI05Pytorch):
     """LeRobot's pi0.5 at a policy's dimensions, with a memory, whose tokens the fusion is handed before a pass.
+
+    No token of the prefix attends to an action, so every pass is two: one over the prefix, whose keys and values are
+    kept, and one over the actions for each step of denoising.
 
     Attributes:
         memory: the memory mechanism. fusion: how actions read its tokens. None: plain pi0.5.
@@ -58,8 +66,8 @@ class MemoryPI05(PI05Pytorch):
     """
 
     def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
-        with torch.device("meta"), no_init_weights():
-            super().__init__(config, rtc_processor=rtc_processor)
+        nn.Module.__init__(self)  # LeRobot's own would build the model at its one size
+        self.config, self.rtc_processor, self.gradient_checkpointing_enabled = config, rtc_processor, False
         dims = config.dimensions
         width, vlm_width = dims.expert.width, dims.vlm.width
         self.paligemma_with_expert = SizedPaliGemmaWithExpert(config)
@@ -69,6 +77,10 @@ class MemoryPI05(PI05Pytorch):
         self.time_mlp_out = nn.Linear(width, width)
         self.state_token = StateToken(config.max_state_dim, vlm_width) if config.state_token else None
         self.instruction = InstructionCondition(vlm_width, width) if config.state_token else None
+        if config.compile_model:
+            torch.set_float32_matmul_precision("high")  # as LeRobot does
+            tower = self.paligemma_with_expert.paligemma.model.vision_tower
+            tower.compile(mode=config.compile_mode, fullgraph=True)
         self.memory: MemoryMechanism | None = None
         self.fusion: MemoryFusion | None = None
         if config.memory == NONE:
@@ -77,47 +89,130 @@ class MemoryPI05(PI05Pytorch):
         self.fusion = (self.memory.fusion or FUSIONS[config.memory_fusion])(self, vlm_width, width)
         if config.open_gate and isinstance(self.fusion, Modulation):
             self.fusion.open_gate()
-        self.paligemma_with_expert.fusion = self.fusion
 
     def set_memory(self, memory: MemoryTokens) -> None:
         """Let the next passes read these tokens."""
         assert self.fusion is not None  # of plain pi0.5 nobody asks it
         self.fusion.hand_over(memory)
 
-    def embed_prefix(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor, *histories: Any) -> Prefix:
-        """Return LeRobot's prefix (observation, then words), as the fusion changes it.
+    # -- passes ------------------------------------------------------------------------------------------------------
+
+    def embed_prefix(self, images: list[Tensor], img_masks: list[Tensor], tokens: Tensor, masks: Tensor) -> Prefix:
+        """Return the prefix (observation, then words), as the fusion changes it.
 
         With a token of the state, the last of the ``images`` is the state (B, dim), and the masks of the others may be
-        of their tokens (B, n), which LeRobot's are not. Later versions hand over states too (``histories``): none here,
-        where the configuration refuses pi0.5's own memory.
+        of their tokens (B, n).
         """
-        place = None
+        if (self.state_token is not None or self.training) and not masks.is_meta:  # padding is most of a short prefix
+            longest = int(masks.sum(dim=1).max())
+            tokens, masks = tokens[:, :longest], masks[:, :longest]
+        words, state = self.paligemma_with_expert.embed_language_tokens(tokens), None
         if self.state_token is None or self.instruction is None:
-            prefix: Prefix = super().embed_prefix(images, img_masks, tokens, masks, *histories)
+            parts = self.paligemma_with_expert.embed_images(images)
         else:
-            longest = int(masks.sum(dim=1).max())  # padding would be most of so short a prefix
-            words, real, _ = super().embed_prefix([], [], tokens[:, :longest], masks[:, :longest])
-            self.instruction.read(words, real)
-            *parts, state = images
-            embedded = [*(self.paligemma_with_expert.embed_image(part) for part in parts), self.state_token(state)]
-            of_tokens = [
-                repeat(mask, "b -> b n", n=part.shape[1]) if mask.ndim == 1 else mask
-                for mask, part in zip(img_masks, embedded, strict=True)
-            ]
-            place = sum(part.shape[1] for part in embedded) - 1
-            real = torch.cat([*of_tokens, real], dim=1)
-            prefix = (
-                torch.cat([*(part.to(words.dtype) for part in embedded), words], dim=1),
-                real,
-                torch.zeros_like(real),
-            )
-        return prefix if self.fusion is None else self.fusion.prefix(prefix, place)
+            self.instruction.read(words, masks)
+            *observed, numbers = images
+            parts = [*self.paligemma_with_expert.embed_images(observed), self.state_token(numbers)]
+            state = sum(part.shape[1] for part in parts) - 1
+        of_tokens = [
+            repeat(mask, "b -> b n", n=part.shape[1]) if mask.ndim == 1 else mask
+            for mask, part in zip(img_masks, parts, strict=True)
+        ]
+        embedded = torch.cat([*(part.to(words.dtype) for part in parts), words], dim=1)
+        prefix = Prefix(embedded, torch.cat([*of_tokens, masks], dim=1))
+        return prefix if self.fusion is None else self.fusion.prefix(prefix, state)
 
-    def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> Suffix:
-        """Return LeRobot's action tokens, their masks, and the condition of the norms, as the fusion changes them."""
-        *tokens, condition = super().embed_suffix(noisy_actions, timestep)
-        suffix: Suffix = *tokens, condition if self.instruction is None else condition + self.instruction()
-        return suffix if self.fusion is None else self.fusion.suffix(suffix)
+    def read_prefix(self, prefix: Prefix) -> Past:
+        """Return what actions attend to of a prefix; the fusion is shown the last states that it asks for."""
+        past, states = self._run(
+            SizedPaliGemmaWithExpert.read_prefix, self.paligemma_with_expert, prefix, self._apply_checkpoint
+        )
+        if self.fusion is not None and states is not None:
+            self.fusion.read_out(states)
+        return past
+
+    def modulations(self, time: Tensor) -> list[Tensor]:
+        """Return scale, shift and gate of each norm of the expert (..., B, 1, 3 W) at times (..., B) of denoising."""
+        waves = create_sinusoidal_pos_embedding(
+            time.flatten(),
+            self.action_in_proj.out_features,
+            self.config.min_period,
+            self.config.max_period,
+            device=time.device,
+        )
+        condition = F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(waves.to(time.dtype))))).unflatten(0, time.shape)
+        if self.instruction is not None:
+            condition = condition + self.instruction()
+        if self.fusion is not None:
+            condition = self.fusion.condition(condition)
+        return [norm.dense(condition).unsqueeze(-2) for norm in self.paligemma_with_expert.adaptive_norms()]
+
+    def velocity(self, x: Tensor, modulations: list[Tensor], past: Past) -> Tensor:
+        """Return the velocity (B, T, A) of noisy actions (B, T, A), float32."""
+        tokens = self.action_in_proj(x)
+        if self.fusion is not None:
+            tokens = self.fusion.actions(tokens)
+        states = self.paligemma_with_expert.read_actions(tokens, modulations, past, self._apply_checkpoint)
+        if self.fusion is not None:
+            self.fusion.made(states)
+        velocity: Tensor = self.action_out_proj(states[:, -self.config.chunk_size :].to(torch.float32))
+        return velocity
+
+    def _run(self, part: Callable[..., Any], *given: Any) -> Any:
+        """Run a part of a pass, compiled where it is asked for."""
+        run = compiled(part, self.config.compile_mode) if self.config.compile_model else part
+        return run(*given)
+
+    def forward(
+        self,
+        images: list[Tensor],
+        img_masks: list[Tensor],
+        tokens: Tensor,
+        masks: Tensor,
+        actions: Tensor,
+        noise: Tensor,
+        time: Tensor,
+    ) -> Tensor:
+        """Return the squared errors (B, T, A) of the velocity at times (B,) between noise and actions."""
+        at = rearrange(time, "b -> b 1 1")
+        past = self.read_prefix(self.embed_prefix(images, img_masks, tokens, masks))
+        modulations = self._run(MemoryPI05.modulations, self, time)
+        found = self._run(MemoryPI05.velocity, self, at * noise + (1 - at) * actions, modulations, past)
+        return F.mse_loss(noise - actions, found, reduction="none")
+
+    @torch.no_grad()
+    def sample_actions(
+        self,
+        images: list[Tensor],
+        img_masks: list[Tensor],
+        tokens: Tensor,
+        masks: Tensor,
+        noise: Tensor,
+        num_steps: int | None = None,
+        **guidance: Any,
+    ) -> Tensor:
+        """Return actions (B, T, A), denoised from noise (B, T, A).
+
+        Args:
+            guidance: of LeRobot's real-time chunking.
+        """
+        steps = num_steps or self.config.num_inference_steps
+        if self.config.compile_model:
+            torch.compiler.cudagraph_mark_step_begin()  # what the last plan left may be written over
+        past = self.read_prefix(self.embed_prefix(images, img_masks, tokens, masks))
+        times = 1.0 - torch.arange(steps, dtype=torch.float32, device=noise.device) / steps
+        each = zip(*self._run(MemoryPI05.modulations, self, times[:, None].expand(-1, len(noise))), strict=True)
+
+        @torch.no_grad()  # guidance asks for the gradient of its own error alone
+        def denoise(x: Tensor, time: Tensor) -> Tensor:
+            velocity: Tensor = self._run(MemoryPI05.velocity, self, x, next(each), past)
+            return velocity
+
+        return euler_integrate(
+            denoise, noise, steps, rtc_processor=self.rtc_processor, rtc_enabled=self._rtc_enabled(), **guidance
+        )
+
+    # -- parameters --------------------------------------------------------------------------------------------------
 
     def memory_parameters(self) -> dict[str, nn.Parameter]:
         """Return every parameter that plain pi0.5 does not have, by name."""
@@ -158,12 +253,12 @@ def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) ->
 class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
     """LeRobot's pair of transformers at this policy's dimensions, image tower and unused heads frozen.
 
-    Attributes:
-        fusion: says which tokens attend to which, and is shown the prefix's last states; None: as in LeRobot's.
+    Its passes equal LeRobot's to rounding. They leave out what is read by none: actions among the keys of the prefix,
+    and last states of the prefix.
     """
 
     perception: ObservationEncoder
-    fusion: MemoryFusion | None = None
+    _found: tuple[list[Tensor], list[Tensor]] | None = None
 
     def __init__(self, config: MemobenchMemConfig) -> None:
         dims, image_size = config.dimensions, config.image_size[0]
@@ -232,18 +327,130 @@ class SizedPaliGemmaWithExpert(PaliGemmaWithExpertModel):
         self.paligemma.lm_head.requires_grad_(False)
         self.gemma_expert.lm_head.requires_grad_(False)
 
-    def forward(self, attention_mask: Tensor | None = None, *args: Any, **kwargs: Any) -> Any:
-        """Return what LeRobot's does: the last states of prefix and actions, None where there is none; and a cache."""
-        if self.fusion is not None and attention_mask is not None:
-            attention_mask = self.fusion.attention(attention_mask)
-        (prefix, actions), cache = super().forward(attention_mask, *args, **kwargs)
-        if self.fusion is not None and prefix is not None:
-            self.fusion.read_out(prefix)
-        return [prefix, actions], cache
-
     def embed_image(self, image: Tensor) -> Tensor:
         """Return prefix tokens (B, n, D) of what LeRobot calls an image: one part of the observation."""
         return self.perception.prefix(image)
+
+    def embed_images(self, images: list[Tensor]) -> list[Tensor]:
+        """Return prefix tokens (B, n, D) of each part of the observation; parts of equal shape go through at once."""
+        if len({image.shape for image in images}) > 1:
+            return [self.embed_image(image) for image in images]
+        return [*self.embed_image(torch.cat(images)).chunk(len(images))]
+
+    def adaptive_norms(self) -> Iterator[Any]:
+        """Yield the expert's norms in the order of a pass."""
+        expert: Any = self.gemma_expert.model
+        for layer in expert.layers:
+            after = layer.post_attention_layernorm
+            yield from (layer.input_layernorm, after.norm if isinstance(after, ModulatedNorm) else after)
+        yield expert.norm
+
+    @contextlib.contextmanager
+    def watched(self) -> Iterator[tuple[list[Tensor], list[Tensor]]]:
+        """Yield two lists, to which layers add meanwhile how much prefix and actions attend to what, (B, H, N, M)."""
+        self._found = [], []
+        try:
+            yield self._found
+        finally:
+            self._found = None
+
+    def read_prefix(self, prefix: Prefix, call: Callable[..., Any]) -> tuple[Past, Tensor | None]:
+        """Return each layer's keys and values of a prefix, and the last states that it asks for.
+
+        Args:
+            call: runs a layer; with gradient checkpointing twice.
+        """
+        model: Any = self.paligemma.model.language_model
+        real = prefix.real
+        turned = rotary(torch.cumsum(real, dim=1) - 1, model.rotary_emb.inv_freq)
+        seen = real[:, None] if prefix.attends is None else prefix.attends & real[:, None]
+        found, kept = self._found[0] if self._found else None, []
+        x, last = _narrowed(prefix.tokens, model), len(model.layers) - 1
+        for number, layer in enumerate(model.layers):
+            asked = slice(None) if number < last or found is not None else prefix.asked
+            x, *keys = call(_prefix_layer, layer, x, turned, hidden(seen), asked, found)
+            kept.append((keys[0][:, prefix.unread :], keys[1][:, prefix.unread :]))
+        if prefix.asked is None:
+            states = None
+        else:
+            states = rms_norm(x[:, prefix.asked] if found is not None else x) * (1.0 + model.norm.weight.float())
+        return Past(kept, hidden(real[:, None, prefix.unread :]), real.sum(dim=1, keepdim=True)), states
+
+    def read_actions(self, x: Tensor, modulations: list[Tensor], past: Past, call: Callable[..., Any]) -> Tensor:
+        """Return the expert's last states (B, T, W) of its tokens (B, T, W), which attend to the past and each other.
+
+        Args:
+            modulations: scale, shift and gate of each norm (B, 1, 3 W). call: as of `read_prefix`.
+        """
+        model: Any = self.gemma_expert.model
+        places = past.length + torch.arange(x.shape[1], device=x.device)
+        turned = rotary(places, self.paligemma.model.language_model.rotary_emb.inv_freq)
+        bias, found = F.pad(past.bias, (0, x.shape[1])), self._found[1] if self._found else None
+        x, norms = _narrowed(x, model), iter(modulations)
+        for layer, keys in zip(model.layers, past.keys, strict=True):
+            x = call(_action_layer, layer, x, next(norms), next(norms), turned, keys, bias, found)
+        return modulated(x, next(norms))[0]
+
+
+class Past(NamedTuple):
+    """What actions attend to of a prefix.
+
+    Attributes:
+        keys: of each layer, keys and values (B, M, d). bias: (B, 1, M), added to scores.
+        length: (B, 1), how many tokens of the prefix are real: the position of the first action.
+    """
+
+    keys: list[tuple[Tensor, Tensor]]
+    bias: Tensor
+    length: Tensor
+
+
+def _narrowed(x: Tensor, model: Any) -> Tensor:
+    """Return tokens in bfloat16 where the layers of a transformer are."""
+    return x.to(torch.bfloat16) if model.layers[0].self_attn.q_proj.weight.dtype == torch.bfloat16 else x
+
+
+def _projected(attention: Any, x: Tensor, turned: Tensor) -> Tensor:
+    """Return rotated queries (B, N, H, d)."""
+    query: Tensor = attention.q_proj(x).unflatten(-1, (-1, attention.head_dim))
+    return rotate(query, turned.unsqueeze(-3))
+
+
+def _prefix_layer(
+    layer: Any, x: Tensor, turned: Tensor, bias: Tensor, asked: slice | None, found: list[Tensor] | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the next states of the tokens that are asked for, and keys and values of all."""
+    attention = layer.self_attn
+    normed = (rms_norm(x) * (1.0 + layer.input_layernorm.weight.float())).to(x.dtype)
+    key, value = rotate(attention.k_proj(normed), turned), attention.v_proj(normed)
+    if asked is None:
+        return x, key, value
+    query = _projected(attention, normed[:, asked], turned[:, asked])
+    read = attend(query, key, value, bias if bias.shape[1] == 1 else bias[:, asked], found)
+    x = x[:, asked] + attention.o_proj(read)
+    normed = (rms_norm(x) * (1.0 + layer.post_attention_layernorm.weight.float())).to(x.dtype)
+    return x + layer.mlp(normed), key, value
+
+
+def _action_layer(
+    layer: Any,
+    x: Tensor,
+    before: Tensor,
+    after: Tensor,
+    turned: Tensor,
+    past: tuple[Tensor, Tensor],
+    bias: Tensor,
+    found: list[Tensor] | None,
+) -> Tensor:
+    """Return the next states (B, T, W) of the expert's tokens, given the modulations of both norms."""
+    attention, norm = layer.self_attn, layer.post_attention_layernorm
+    normed, gate = modulated(x, before)
+    own = rotate(attention.k_proj(normed), turned), attention.v_proj(normed)
+    key, value = (torch.cat([of_past, here], dim=1) for of_past, here in zip(past, own, strict=True))
+    read = attention.o_proj(attend(_projected(attention, normed, turned), key, value, bias, found))
+    x = torch.addcmul(x, read, gate)
+    normed, gate = norm(x, after) if isinstance(norm, ModulatedNorm) else modulated(x, after)
+    return torch.addcmul(x, layer.mlp(normed), gate)
 
 
 class StateToken(nn.Module):
@@ -297,7 +504,7 @@ def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:
     return config
 
 
-# -- precision and attention -----------------------------------------------------------------------------------------
+# -- precision -------------------------------------------------------------------------------------------------------
 
 
 class Precision:
@@ -328,44 +535,3 @@ class Precision:
         if any(parameter.dtype == torch.float32 for parameter in self._narrow):
             return torch.autocast(device.type, dtype=torch.bfloat16)
         return contextlib.nullcontext()
-
-
-MARK = "learns_fused"
-"""Attribute of attention modules that compute in one kernel where gradients are wanted."""
-
-
-def attend_fused(model: nn.Module) -> None:
-    """Compute the attention of a model's layers in one kernel wherever gradients are wanted, while it lives.
-
-    LeRobot's pi0.5 attends by Hugging Face's ``eager_attention_forward``, called by its name, whatever
-    ``attn_implementation`` says. It keeps a weight for each pair of tokens: of 72 samples with two pictures 56 MB in a
-    layer, which come from the system page by page. torch's kernel keeps none, and an update of such a policy takes 1.1
-    instead of 2.0 s on one core. It rounds otherwise, so rollouts go on with LeRobot's. Its products are exact:
-    rounding to bfloat16, which makes large ones quicker, makes its many small ones several times slower.
-    """
-    for module in model.modules():
-        if isinstance(module, modeling_gemma.GemmaAttention):
-            setattr(module, MARK, True)
-    hooked_for(model, ATTEND, _fused)
-
-
-def _fused(attend: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap transformers' attention for the modules that are marked."""
-
-    @functools.wraps(attend)
-    def attention(
-        module: nn.Module, query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None, scaling: float, **more: Any
-    ) -> tuple[Tensor, Tensor | None]:
-        if not (hasattr(module, MARK) and torch.is_grad_enabled()):
-            weighed: tuple[Tensor, Tensor] = attend(module, query, key, value, mask, scaling, **more)
-            return weighed
-        key, value = (modeling_gemma.repeat_kv(kept, module.num_key_value_groups) for kept in (key, value))
-        unread = getattr(module, UNREAD, 0)
-        query, mask = query[:, :, unread:], None if mask is None else mask[:, :, unread:]
-        with exact_products():
-            read = scaled_dot_product_attention(query, key, value, attn_mask=mask, scale=scaling)
-        exact_gradients(read)
-        read = read.transpose(1, 2)
-        return F.pad(read, (0, 0, 0, 0, unread, 0)) if unread else read.contiguous(), None
-
-    return attention

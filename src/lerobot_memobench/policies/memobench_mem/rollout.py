@@ -88,10 +88,13 @@ class Rollout:
     Args:
         remembers: whether frames are written at all.
         stride: every how many control steps one is; an episode's first one always is.
+
+    Attributes:
+        late: whether the next frame stands for one that was to be written and was not offered.
     """
 
     def __init__(self, remembers: bool, stride: int) -> None:
-        self.remembers, self.stride = remembers, stride
+        self.remembers, self.stride, self.late = remembers, stride, False
         self.reset()
 
     def reset(self) -> None:
@@ -117,12 +120,14 @@ class Rollout:
         started = [self._tick(row, clock) for row, clock in enumerate(clocks)]
         for held, begins, last in zip(self.rows, started, before, strict=True):
             due = (last // self.stride + 1) * self.stride  # the next one that is written
-            if not begins and due < held.position and held.missed is None:
+            if not begins and due < held.position and held.missed is None and not self.late:
                 held.missed = due
         steps, frozen = [row.position for row in self.rows], [row.frozen for row in self.rows]
-        wanted = [
-            row for row, step in enumerate(steps) if not frozen[row] and (started[row] or step % self.stride == 0)
+        written = [
+            begins or step % self.stride == 0 or (self.late and step // self.stride > last // self.stride)
+            for begins, step, last in zip(started, steps, before, strict=True)
         ]
+        wanted = [row for row, writes in enumerate(written) if writes and not frozen[row]]
         if wanted and self.remembers:
             write(wanted)
         return steps, started, frozen

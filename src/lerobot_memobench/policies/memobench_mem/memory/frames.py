@@ -39,12 +39,17 @@ def sample_frames(step: int, max_frames: int) -> list[int]:
     return [i * step // (max_frames - 1) for i in range(max_frames)]
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Frame:
-    """A frame: its control step since the episode began, and what is stored of it (P', D') on the CPU."""
+    """A frame: its control step since the episode began, and what is stored of it (P', D') on the CPU.
+
+    Attributes:
+        tokens: its memory tokens (P, d_m), once it has been read; of objects alone, where they are small.
+    """
 
     step: int
     stored: Tensor
+    tokens: Tensor | None = None
 
 
 @dataclass
@@ -108,22 +113,29 @@ class Frames(MemoryMechanism):
         return [[*row[1 - self.capacity :], frame] for row, frame in zip(state, new, strict=True)]
 
     def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
-        """Encode the sampled frames of each row; rows with fewer than F are padded."""
-        count, like = self.spec.frames, state[0][0].stored
-        frames = torch.zeros(len(state), count, *like.shape, dtype=like.dtype)
-        steps, real = (
-            torch.zeros(len(state), count, dtype=torch.int64),
-            torch.zeros(len(state), count, dtype=torch.bool),
-        )
-        for number, kept in enumerate(state):
-            row = [kept[slot] for slot in sample_frames(len(kept) - 1, count)]
-            frames[number, : len(row)] = torch.stack([frame.stored for frame in row])
-            steps[number, : len(row)] = torch.tensor([frame.step for frame in row])
-            real[number, : len(row)] = True
-        device = self.encoder.project.weight.device
-        frames, steps, real = frames.to(device), steps.to(device), real.to(device)
-        each = self._encoded(self._pooled(frames.flatten(0, 1)).unflatten(0, real.shape), steps)
-        return self._tokens(each.flatten(1, 2), real, steps)
+        """Return the sampled frames of each row, encoded; rows with fewer than F are padded."""
+        count, device = self.spec.frames, self.encoder.project.weight.device
+        rows = [[kept[slot] for slot in sample_frames(len(kept) - 1, count)] for kept in state]
+        read = [frame for row in rows for frame in row]
+        places, steps = torch.zeros(len(rows), count, dtype=torch.int64), torch.zeros(len(read), dtype=torch.int64)
+        real = torch.arange(count) < torch.tensor([[len(row)] for row in rows])
+        places[real], steps[:] = torch.arange(len(read)), torch.tensor([frame.step for frame in read])
+        places, steps, real = places.to(device), steps.to(device), real.to(device)
+        each = self._each(read, steps)
+        return self._tokens(each[places].flatten(1, 2), real, steps[places])
+
+    def _each(self, read: list[Frame], steps: Tensor) -> Tensor:
+        """Return the memory tokens (N, P, d_m) of frames, each of objects made once."""
+        new = [number for number, frame in enumerate(read) if frame.tokens is None]
+        made = [frame.tokens for frame in read]
+        if new:
+            stored = torch.stack([read[number].stored for number in new]).to(steps.device)
+            tokens = self._encoded(self._pooled(stored).unsqueeze(1), steps[new, None]).squeeze(1)
+            if not isinstance(self.pool, ObjectPool):
+                return tokens
+            for number, made[number] in zip(new, tokens, strict=True):
+                read[number].tokens = made[number]
+        return torch.stack(made)  # type: ignore[arg-type]  # all are made now
 
     def join(self, states: Sequence[Any]) -> list[list[Frame]]:
         """Return the rows of several states."""

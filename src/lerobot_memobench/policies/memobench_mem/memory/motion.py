@@ -16,7 +16,7 @@ import torch
 from einops import rearrange, reduce, repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Suffix
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     Histories,
     MemoryMechanism,
@@ -65,34 +65,30 @@ class Foresight(MemoryFusion):
         self.model = cast(Any, model)
         pool = self.model.memory.pool
         self.model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
-        self.condition: Tensor | None = None
-        self.made: Tensor | None = None
-        self.model.paligemma_with_expert.gemma_expert.model.norm.register_forward_hook(self._keep)
+        self.hindsight: Tensor | None = None
+        self.foreseen: Tensor | None = None
 
     def hand_over(self, memory: MemoryTokens) -> None:
         """Make the condition of the next passes."""
-        self.condition = self.model.foresight.condition(memory.rows().squeeze(1))
+        self.hindsight = self.model.foresight.condition(memory.rows().squeeze(1))
 
-    def suffix(self, suffix: Suffix) -> Suffix:
-        """Put the queries before the actions, into their block of attention."""
-        if self.condition is None:
-            return suffix
-        tokens, real, blocks, condition = suffix
+    def actions(self, tokens: Tensor) -> Tensor:
+        """Put the queries before the actions, to which they attend as actions do."""
         queries = repeat(self.model.foresight.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
-        return (
-            torch.cat([queries, tokens], dim=1),
-            torch.cat([real.new_ones(queries.shape[:2]), real], dim=1),
-            torch.cat([blocks, blocks.new_zeros(queries.shape[:2])], dim=1),  # the first of all begins the block
-            condition + self.condition,
-        )
+        return tokens if self.hindsight is None else torch.cat([queries, tokens], dim=1)
 
-    def _keep(self, norm: nn.Module, given: Any, made: tuple[Tensor, Tensor | None]) -> None:
-        self.made = made[0][:, :FORESIGHT]
+    def condition(self, condition: Tensor) -> Tensor:
+        """Add what hindsight says."""
+        return condition if self.hindsight is None else condition + self.hindsight
+
+    def made(self, states: Tensor) -> None:
+        """Keep the queries' states."""
+        self.foreseen = states[:, :FORESIGHT]
 
     def outputs(self) -> dict[str, Tensor]:
         """Return the motion (B, n, C k) that the last pass foresaw."""
-        made, self.made = self.made, None
-        return {} if made is None else {FORESEEN: self.model.foresight.decode(made.to(torch.float32))}
+        foreseen, self.foreseen = self.foreseen, None
+        return {} if foreseen is None else {FORESEEN: self.model.foresight.decode(foreseen.to(torch.float32))}
 
     def owns(self, name: str) -> bool:
         """Say whether a parameter is the queries', the condition's or the decoder's."""

@@ -8,7 +8,7 @@ import torch
 from einops import rearrange, repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import rotate
+from lerobot_memobench.policies.memobench_mem.fusion import rotate_from
 from lerobot_memobench.policies.memobench_mem.memory.frames import MemoryEncoder
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryMechanism,
@@ -95,12 +95,11 @@ class Recurrent(MemoryMechanism):
         frame = encoded(self.encoder, tokens, step, self.settings.time_codes)
         count, length = slots.shape[1], frame.shape[1] + slots.shape[1]
         both = self.pre_norm(torch.cat([frame, slots], dim=1))
-        place = torch.arange(length, device=both.device)
         key, value = self.key_value(both).chunk(2, dim=-1)
         asked = rearrange(self.query(both[:, -count:]), "r s (h d) -> r h s d", h=HEADS)
         # All heads share the keys, so they are one head with more rows. Without a mask this is quicker than torch's.
-        asked = rotate(asked, place[-count:]).flatten(1, 2) * key.shape[-1] ** -0.5
-        weights = (asked @ rotate(key, place).mT).softmax(dim=-1)
+        asked = rotate_from(asked, length - count).flatten(1, 2) * key.shape[-1] ** -0.5
+        weights = (asked @ rotate_from(key, 0).mT).softmax(dim=-1)
         read = rearrange(weights @ value, "r (h s) d -> r s (h d)", h=HEADS)
         return {"slots": self.post_norm(self.attended(read) + slots)}
 

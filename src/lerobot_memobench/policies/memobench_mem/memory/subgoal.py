@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 import torch.nn.functional as F
 from einops import repeat
-from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
-from lerobot.utils.constants import OPENPI_ATTENTION_MASK_VALUE
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import UNREAD, MemoryFusion, Prefix, hooked
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
@@ -64,7 +62,6 @@ class NarrowChannel(MemoryFusion):
         said: (B,) number of the text of the last prefix; S: none.
     """
 
-    attends_fused = True
     tells_reads = True
 
     def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
@@ -75,29 +72,10 @@ class NarrowChannel(MemoryFusion):
         self.memory: MemoryTokens | None = None
         self.said: Tensor | None = None
         self._scores: Tensor | None = None
-        self._unread = self._length = 0  # of the prefix: what actions do not read, and all of it; 0: it is not made yet
-        self._copies_state = False
-        language: Any = model.paligemma_with_expert.paligemma.model.language_model
-        last = language.layers[-1]
-        self._attention = last.self_attn
-        for part in (last.self_attn.q_proj, last.self_attn.o_proj, last.post_attention_layernorm, language.norm):
-            part.register_forward_pre_hook(self._those_read)
-        for part in (last.self_attn.q_proj, last.self_attn.o_proj, last.mlp):
-            part.register_forward_hook(self._padded)
-
-    def _skipped(self) -> int:
-        """Return of how many of the prefix's first tokens a training's pass makes no last state: none reads them."""
-        return self._unread - 1 if self._length and torch.is_grad_enabled() else 0
-
-    def _those_read(self, part: nn.Module, inputs: tuple[Tensor]) -> Tensor:
-        return inputs[0][:, self._skipped() :]
-
-    def _padded(self, part: nn.Module, inputs: Any, outputs: Tensor) -> Tensor:
-        return F.pad(outputs, (0, 0, self._skipped(), 0))
 
     def hand_over(self, memory: MemoryTokens) -> None:
         """Keep this memory, and what may be said, for the next prefix."""
-        self.memory, self._scores, self._length = memory, None, 0
+        self.memory, self._scores = memory, None
 
     def owns(self, name: str) -> bool:
         """Say whether a parameter is of the choice."""
@@ -108,53 +86,36 @@ class NarrowChannel(MemoryFusion):
         memory, added = self.memory, cast(SubgoalChoice, self.model.subgoal)
         assert memory is not None
         assert memory.query is not None
-        self._length = 0
-        embeddings, real, blocks = prefix
-        dtype, own = embeddings.dtype, embeddings[:, : 0 if state is None else state + 1][:, -1:]
-        ask = repeat(added.ask, "1 1 d -> b 1 d", b=len(embeddings))
-        embeddings = torch.cat([embeddings, memory.rows().to(dtype), ask.to(dtype)], dim=1)
-        real = torch.cat([real, memory.mask, torch.ones_like(real[:, :1])], dim=1)
-        blocks = torch.zeros_like(real)
-        true = memory.query.subgoal
-        said = self._chosen((embeddings, real, blocks)) if true is None else torch.where(true < 0, self.count, true)
-        self.said = said
+        own = prefix.tokens[:, : 0 if state is None else state + 1][:, -1:]
+        ask = repeat(added.ask, "1 1 d -> b 1 d", b=len(own))
+        prefix = prefix.joined(memory.rows(), memory.mask).joined(ask, memory.mask.new_ones(len(own), 1))
+        unread, true = prefix.tokens.shape[1], memory.query.subgoal
+        prefix = prefix._replace(asked=slice(unread - 1, unread))
+        said = self.said = self._chosen(prefix) if true is None else torch.where(true < 0, self.count, true)
         text, of_text = added.texts(said)
         if self.model.instruction is not None:
             self.model.instruction.read(text, of_text)
-        begins = torch.zeros_like(of_text)
-        begins[:, 0] = True
-        self._unread, self._copies_state = embeddings.shape[1], state is not None
-        behind = torch.ones(own.shape[:2], dtype=torch.bool, device=real.device)
-        embeddings = torch.cat([embeddings, text.to(dtype), own], dim=1)
-        self._length = embeddings.shape[1]
-        setattr(self._attention, UNREAD, self._unread - 1)
-        return embeddings, torch.cat([real, of_text, behind], dim=1), torch.cat([blocks, begins, behind], dim=1)
+        whole = prefix.joined(text, of_text).joined(own, of_text.new_ones(own.shape[:2]))
+        return whole._replace(attends=self.attention(whole, unread, own.shape[1]), unread=unread, asked=prefix.asked)
+
+    def attention(self, prefix: Prefix, unread: int, copies: int) -> Tensor:
+        """Return which tokens attend to which, (B, N, N) bool: see the table.
+
+        Args:
+            unread: how many of the first ones actions do not read. copies: 1 where the last is the state's copy.
+        """
+        places = torch.arange(prefix.tokens.shape[1], device=prefix.tokens.device)
+        part = (places >= unread).int() + (places >= len(places) - copies).int()  # 0: what is before, 1: text, 2: copy
+        of_query, of_key = part[:, None], part
+        seen = torch.where(of_query == 2, of_key == 2, of_key <= of_query)
+        return seen.expand(len(prefix.tokens), -1, -1)
 
     @torch.no_grad()
     def _chosen(self, prefix: Prefix) -> Tensor:
-        """Return the texts (B,) that a pass over this prefix chooses; in eager attention, as LeRobot's own pass."""
-        embeddings, real, blocks = prefix
-        both = self.model.paligemma_with_expert
-        both.paligemma.model.language_model.config._attn_implementation = "eager"
-        both.forward(
-            attention_mask=prepare_attention_masks_4d(make_att_2d_masks(real, blocks)),
-            position_ids=torch.cumsum(real, dim=1) - 1,
-            inputs_embeds=[embeddings, None],
-            use_cache=False,
-        )
+        """Return the texts (B,) that a pass over this prefix chooses."""
+        self.model.read_prefix(prefix)
         assert self._scores is not None
         return self._scores.argmax(dim=1)
-
-    def attention(self, mask: Tensor) -> Tensor:
-        """Hide from actions what they do not read, and from the state's copy all but itself."""
-        if not self._length:
-            return mask
-        queries, keys = (torch.arange(count, device=mask.device) for count in mask.shape[-2:])
-        queries = (queries + len(keys) - len(queries)).unsqueeze(1)  # actions alone come over cached keys
-        hidden = (queries >= self._length) & (keys < self._unread)
-        if self._copies_state:
-            hidden |= (queries == self._length - 1) & (keys != self._length - 1)
-        return mask.masked_fill(hidden, OPENPI_ATTENTION_MASK_VALUE)
 
     def read_out(self, states: Tensor) -> None:
         """Score the texts by the last state of ``ask``."""
@@ -162,27 +123,22 @@ class NarrowChannel(MemoryFusion):
         assert memory is not None
         assert memory.query is not None
         assert memory.query.choices is not None
-        asked = states[:, self._unread - self._length - 1 if self._length else -1]
-        self._scores = scored(added.score(asked.to(added.score.weight.dtype)), memory.query.choices)
+        self._scores = scored(added.score(states[:, 0].to(added.score.weight.dtype)), memory.query.choices)
 
     @contextmanager
     def watched(self) -> Iterator[list[Tensor]]:
         """Yield how much the text said attends to each of the memory's tokens: a share of all that it attends to."""
         found: list[Tensor] = []
-
-        def note(attention: Any, inputs: Any, outputs: tuple[Tensor, Tensor]) -> None:
-            assert self.memory is not None
-            weights, length = outputs[1], self.memory.mask.shape[1]  # (B, heads, N, N)
-            if weights.shape[2] == self._length:  # and not the pass that chooses
-                assert self.said is not None
-                _, real = cast(SubgoalChoice, self.model.subgoal).texts(self.said)
-                read = weights[:, :, self._unread :, self._unread - 1 - length : self._unread - 1].mean(dim=1)
-                words = read[:, : real.shape[1]] * real.unsqueeze(-1)
-                found.append(words.sum(dim=1) / real.sum(dim=1, keepdim=True))
-
-        layers = self.model.paligemma_with_expert.paligemma.model.language_model.layers
-        with hooked([layer.self_attn for layer in layers], note):
+        with self.model.paligemma_with_expert.watched() as (of_prefix, _):
             yield found
+        assert self.memory is not None
+        assert self.said is not None
+        _, real = cast(SubgoalChoice, self.model.subgoal).texts(self.said)
+        words, length = real.shape[1], self.memory.mask.shape[1]
+        for weights in of_prefix[len(of_prefix) // 2 :]:  # (B, heads, N, N), after the pass that chooses
+            unread = weights.shape[2] - words - (self.model.state_token is not None)
+            read = weights[:, :, unread : unread + words, unread - 1 - length : unread - 1].mean(dim=1)
+            found.append((read * real.unsqueeze(-1)).sum(dim=1) / real.sum(dim=1, keepdim=True))
 
     def outputs(self) -> dict[str, Tensor]:
         """Return the scores (B, S + 1) of the texts."""

@@ -1,0 +1,220 @@
+"""What the policy at full size takes of a GPU, part by part; run it first where one is lent.
+
+    python benchmarks/gpu.py --out outputs/gpu.jsonl            # one 80 GB card, under eight minutes
+    python benchmarks/gpu.py --size tiny --device cpu --out …   # the same parts, to try the script
+
+Needs no weights, dataset or network: pi0.5 with its memory has random weights, and batches are random, of the shapes
+that the preprocessor makes: two cameras, 32 remembered frames, prompts of 200 tokens, chunks of 50 actions. Each part
+adds a JSON line to ``--out``; parts that are there already are left out, so the script goes on where it ended. A part
+that fails says why, and the next one begins. Prints a table of all lines at the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from policies import config, observation, training_batch
+from random_weights import random_policy
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+
+WARM_UP, BATCH = 3, 16
+Part = Callable[[str, str, int], dict[str, Any]]
+
+
+def main() -> None:
+    """Measure what is not measured yet, and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", default="pi05")
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--out", type=Path, default=Path("outputs/gpu.jsonl"))
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
+    parser.add_argument("--steps", type=int, default=10, help="timed plans, or updates, of each part")
+    parser.add_argument("--minutes", type=float, default=8.0, help="no part begins later")
+    asked = parser.parse_args()
+    torch.backends.cuda.matmul.allow_tf32 = True  # as LeRobot trains and evaluates
+    asked.out.parent.mkdir(parents=True, exist_ok=True)
+    where = {"size": asked.size, "device": asked.device, "torch": torch.__version__}
+    where["card"] = torch.cuda.get_device_name() if asked.device == "cuda" else "CPU"
+    began = time.monotonic()
+    for part in asked.parts:
+        done = [line["part"] for line in lines(asked.out) if line["size"] == asked.size and "error" not in line]
+        if part in done or time.monotonic() - began > 60 * asked.minutes:
+            continue
+        started = time.monotonic()
+        try:
+            found = PARTS[part](asked.size, asked.device, asked.steps)
+        except Exception as error:  # the next part may work
+            found = {"error": f"{type(error).__name__}: {str(error)[:300]}"}
+        line = {"part": part, **where, **found, "took_s": round(time.monotonic() - started, 1)}
+        with asked.out.open("a", encoding="utf-8") as file:
+            print(json.dumps(line), file=file)
+        print(json.dumps(line), flush=True)
+        gc.collect()
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
+    table([line for line in lines(asked.out) if line["size"] == asked.size])
+
+
+def lines(file: Path) -> list[dict[str, Any]]:
+    """Return what was measured before; a line that was cut off is measured again."""
+    found = []
+    for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else []:
+        try:
+            found.append(json.loads(line))
+        except ValueError:
+            continue
+    return found
+
+
+# -- parts ------------------------------------------------------------------------------------------------------------
+
+
+def equal(size: str, device: str, steps: int) -> dict[str, Any]:
+    """Return how far loss and actions of a tiny policy on the device are from those on the CPU, in float32."""
+    found = []
+    for place in ("cpu", device):
+        torch.manual_seed(0)
+        policy = random_policy(config("tiny", device="cpu", open_gate=True))
+        policy.config.device = place
+        policy = policy.to(place).eval()
+        batch = {key: value.to(place) for key, value in training_batch(policy.config, 2).items()}
+        noise = torch.randn(2, policy.config.chunk_size, 32, generator=torch.Generator().manual_seed(1))
+        actions = policy.predict_action_chunk(batch, noise=noise).float().cpu()
+        torch.manual_seed(2)
+        policy.model.sample_noise = on_the_cpu  # a GPU draws other numbers
+        loss, _ = policy.forward(batch)
+        found.append((actions, loss.item()))
+    (ours, loss), (other, loss_there) = found
+    return {
+        "largest_difference": float((ours - other).abs().max()),
+        "largest_action": float(ours.abs().max()),
+        "loss_difference": abs(loss - loss_there),
+    }
+
+
+def on_the_cpu(shape: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return noise that does not depend on the device."""
+    return torch.randn(shape).to(device)
+
+
+def planning(rows: int, **fields: Any) -> Part:
+    """Return the part that fills the memories of so many environments, takes in frames, and plans."""
+
+    def part(size: str, device: str, steps: int) -> dict[str, Any]:
+        policy = random_policy(config(size, device=device, dtype="bfloat16", **fields)).eval()
+        seen = {key: value.to(device) for key, value in observation(policy.config, rows).items()}
+        policy.reset()
+        started = time.perf_counter()
+        for _ in range(policy.config.memory_frames):
+            policy.observe(seen)
+        policy.predict_action_chunk(seen)
+        first, _ = time.perf_counter() - started, peak()
+        frames, plans = [], []
+        for turn in range(steps + WARM_UP):
+            taken = timed(policy.observe, seen), timed(policy.predict_action_chunk, seen)
+            if turn >= WARM_UP:
+                frames.append(taken[0])
+                plans.append(taken[1])
+        return {
+            "plan_ms": round(1e3 * statistics.median(plans), 1),
+            "frame_ms": round(1e3 * statistics.median(frames), 2),
+            "first_s": round(first, 1),
+            "peak_gib": peak(),
+        }
+
+    return part
+
+
+def updating(ddp: bool, **fields: Any) -> Part:
+    """Return the part that updates a policy on batches of 16, as `config=train_paper` does."""
+
+    def part(size: str, device: str, steps: int) -> dict[str, Any]:
+        settings = config(size, device=device, dtype="bfloat16", gradient_checkpointing=True, **fields)
+        policy = random_policy(settings).train()
+        optimizer = settings.get_optimizer_preset().build(policy.get_optim_params())
+        learner: Any = policy
+        if ddp:
+            backend = "nccl" if device == "cuda" else "gloo"
+            place = "tcp://127.0.0.1:29511"
+            torch.distributed.init_process_group(backend, init_method=place, rank=0, world_size=1)
+            learner = DistributedDataParallel(policy, find_unused_parameters=True)
+        batch = {key: value.to(device) for key, value in training_batch(settings, BATCH).items()}
+        try:
+            taken = [timed(update, learner, policy, optimizer, batch) for _ in range(steps + WARM_UP)]
+        finally:
+            if ddp:
+                torch.distributed.destroy_process_group()
+        return {"update_s": round(statistics.median(taken[WARM_UP:]), 3), "peak_gib": peak()}
+
+    return part
+
+
+def update(learner: Any, policy: MemobenchMemPolicy, optimizer: Any, batch: Mapping[str, Tensor]) -> None:
+    """Update once, as training does."""
+    loss, _ = learner(batch)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(policy.parameters(), policy.config.optimizer_grad_clip_norm)
+    optimizer.step()
+    optimizer.zero_grad()
+    policy.update()
+
+
+COMPILED = {"compile_model": True, "compile_mode": "reduce-overhead"}
+PARTS: dict[str, Part] = {
+    "equal": equal,
+    "plan": planning(1),
+    "plan, 8 environments": planning(8),
+    "plan, no memory": planning(1, memory="none"),
+    "update": updating(ddp=False),
+    "update, DDP of one": updating(ddp=True),
+    "plan, compiled": planning(1, **COMPILED),
+}
+
+
+# -- measuring --------------------------------------------------------------------------------------------------------
+
+
+def timed(work: Callable[..., Any], *given: Any) -> float:
+    """Return the seconds that work takes, on the GPU too."""
+    synchronise()
+    started = time.perf_counter()
+    work(*given)
+    synchronise()
+    return time.perf_counter() - started
+
+
+def synchronise() -> None:
+    """Wait for the GPU."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def peak() -> float:
+    """Return the GiB that were allocated at most since the last call."""
+    synchronise()
+    found = torch.cuda.max_memory_allocated() / 2**30
+    if torch.cuda.is_available():
+        torch.cuda.reset_peak_memory_stats()
+    return round(found, 2)
+
+
+def table(measured: list[dict[str, Any]]) -> None:
+    """Print all parts as a Markdown table."""
+    names = list(dict.fromkeys(name for line in measured for name in line if name not in ("size", "device", "torch")))
+    for cells in (names, ["---"] * len(names), *([str(line.get(name, "")) for name in names] for line in measured)):
+        print(f"| {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
