@@ -127,15 +127,16 @@ def _line(name: str, seed: int | str, row: list[float]) -> str:
 
 
 def worlds(path: Path) -> None:
-    """Draw scenes of both worlds, agentview over wrist, as a picture of at most 150 kB."""
-    columns = []
-    for name in WORLDS_TASKS:
-        for task in (get_task(name), get_task(name).in_world("libero")):
-            sim = Simulation(task)
+    """Draw scenes of both worlds, a row for each, agentview beside wrist, as a picture of at most 150 kB."""
+    rows = []
+    for world in ("memobench", "libero"):
+        pictures = []
+        for name in WORLDS_TASKS:
+            sim = Simulation(get_task(name).in_world(world))
             sim.reset(8)
-            columns.append(np.vstack([sim.render(camera) for camera in MJCF_CAMERAS]))
-    gap = np.full((columns[0].shape[0], 4, 3), 255, np.uint8)
-    picture = Image.fromarray(np.hstack([part for column in columns for part in (column, gap)][:-1]))
+            pictures += [sim.render(camera) for camera in MJCF_CAMERAS]
+        rows.append(np.hstack([np.pad(one, ((0, 4), (0, 4), (0, 0)), constant_values=255) for one in pictures]))
+    picture = Image.fromarray(np.vstack(rows))
     small = picture.resize((picture.width * 5 // 8, picture.height * 5 // 8), Image.Resampling.LANCZOS)
     small.quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
 
