@@ -2,7 +2,6 @@
 
     python scripts/libero_looks.py errors [--sheet FILE]     # one scene of each task without scans
     python scripts/libero_looks.py worlds FILE               # both worlds, side by side
-    python scripts/libero_looks.py speed
 
 All want ``PYTHONPATH=src:.`` and the extra [libero]; `errors` wants MuJoCo's renderer (``MUJOCO_GL=egl``).
 """
@@ -10,8 +9,6 @@ All want ``PYTHONPATH=src:.`` and the extra [libero]; `errors` wants MuJoCo's re
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -141,51 +138,17 @@ def worlds(path: Path) -> None:
     small.quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def speed() -> None:
-    """Print the CPU time of construction, first pictures, resets and steps with two pictures."""
-    print("task | construct and two pictures | reset | reset, two pictures | step | step, two pictures")
-    for task in tasks()[::7]:
-        print(task.name, *(f"{1e3 * value:.1f} ms" for value in _times(task)), sep=" | ", flush=True)
-
-
-def _times(task: Task) -> Iterator[float]:
-    start = time.process_time()
-    sim = Simulation(task)
-    sim.reset(7)
-    _look(sim)
-    yield time.process_time() - start
-    for steps, looks in ((False, False), (False, True), (True, False), (True, True)):
-        count = 40 if steps else 10
-        start = time.process_time()
-        for seed in range(count):
-            if steps:
-                sim.step(np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0]))
-            else:
-                sim.reset(7 + seed)
-            if looks:
-                _look(sim)
-        yield (time.process_time() - start) / count
-
-
-def _look(sim: Simulation) -> None:
-    for camera in MJCF_CAMERAS:
-        sim.render(camera)
-
-
 def main() -> None:
     """Run the command that was asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("errors").add_argument("--sheet", type=Path)
     commands.add_parser("worlds").add_argument("path", type=Path)
-    commands.add_parser("speed")
     args = parser.parse_args()
     if args.command == "errors":
         errors(args.sheet)
-    elif args.command == "worlds":
-        worlds(args.path)
     else:
-        speed()
+        worlds(args.path)
 
 
 if __name__ == "__main__":
