@@ -2,7 +2,6 @@
 
     python scripts/libero_looks.py errors [--sheet FILE]     # one scene of each task without scans
     python scripts/libero_looks.py worlds FILE               # both worlds, side by side
-    python scripts/libero_looks.py speed
 
 All want ``PYTHONPATH=src:.`` and the extra [libero]; `errors` wants MuJoCo's renderer (``MUJOCO_GL=egl``).
 """
@@ -10,8 +9,6 @@ All want ``PYTHONPATH=src:.`` and the extra [libero]; `errors` wants MuJoCo's re
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -127,48 +124,18 @@ def _line(name: str, seed: int | str, row: list[float]) -> str:
 
 
 def worlds(path: Path) -> None:
-    """Draw scenes of both worlds, agentview over wrist, as a picture of at most 150 kB."""
-    columns = []
-    for name in WORLDS_TASKS:
-        for task in (get_task(name), get_task(name).in_world("libero")):
-            sim = Simulation(task)
+    """Draw scenes of both worlds, a row for each, agentview beside wrist, as a picture of at most 150 kB."""
+    rows = []
+    for world in ("memobench", "libero"):
+        pictures = []
+        for name in WORLDS_TASKS:
+            sim = Simulation(get_task(name).in_world(world))
             sim.reset(8)
-            columns.append(np.vstack([sim.render(camera) for camera in MJCF_CAMERAS]))
-    gap = np.full((columns[0].shape[0], 4, 3), 255, np.uint8)
-    picture = Image.fromarray(np.hstack([part for column in columns for part in (column, gap)][:-1]))
+            pictures += [sim.render(camera) for camera in MJCF_CAMERAS]
+        rows.append(np.hstack([np.pad(one, ((0, 4), (0, 4), (0, 0)), constant_values=255) for one in pictures]))
+    picture = Image.fromarray(np.vstack(rows))
     small = picture.resize((picture.width * 5 // 8, picture.height * 5 // 8), Image.Resampling.LANCZOS)
     small.quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
-
-
-def speed() -> None:
-    """Print the CPU time of construction, first pictures, resets and steps with two pictures."""
-    print("task | construct and two pictures | reset | reset, two pictures | step | step, two pictures")
-    for task in tasks()[::7]:
-        print(task.name, *(f"{1e3 * value:.1f} ms" for value in _times(task)), sep=" | ", flush=True)
-
-
-def _times(task: Task) -> Iterator[float]:
-    start = time.process_time()
-    sim = Simulation(task)
-    sim.reset(7)
-    _look(sim)
-    yield time.process_time() - start
-    for steps, looks in ((False, False), (False, True), (True, False), (True, True)):
-        count = 40 if steps else 10
-        start = time.process_time()
-        for seed in range(count):
-            if steps:
-                sim.step(np.array([0.1, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0]))
-            else:
-                sim.reset(7 + seed)
-            if looks:
-                _look(sim)
-        yield (time.process_time() - start) / count
-
-
-def _look(sim: Simulation) -> None:
-    for camera in MJCF_CAMERAS:
-        sim.render(camera)
 
 
 def main() -> None:
@@ -177,14 +144,11 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("errors").add_argument("--sheet", type=Path)
     commands.add_parser("worlds").add_argument("path", type=Path)
-    commands.add_parser("speed")
     args = parser.parse_args()
     if args.command == "errors":
         errors(args.sheet)
-    elif args.command == "worlds":
-        worlds(args.path)
     else:
-        speed()
+        worlds(args.path)
 
 
 if __name__ == "__main__":

@@ -140,8 +140,8 @@ def box_class(name: str, half: tuple[float, float, float]) -> type:
     return Box
 
 
-def make(name: str) -> Any:
-    """Return LIBERO's environment of a task, without pictures."""
+def make(name: str, pictures: bool = False) -> Any:
+    """Return LIBERO's environment of a task; with pictures, each step draws those of the two cameras."""
     import libero.libero.envs.bddl_utils as bddl
     import robosuite
     from libero.libero.envs import TASK_MAPPING
@@ -155,9 +155,10 @@ def make(name: str) -> Any:
         robots=["Panda"],
         controller_configs=robosuite.load_controller_config(default_controller="OSC_POSE"),
         initialization_noise=None,
-        use_camera_obs=False,
+        use_camera_obs=pictures,
         has_renderer=False,
-        has_offscreen_renderer=False,
+        has_offscreen_renderer=pictures,
+        camera_names=["agentview", "robot0_eye_in_hand"],
         control_freq=20,
         ignore_done=True,
     )

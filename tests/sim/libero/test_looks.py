@@ -49,7 +49,7 @@ def test_what_is_kept_draws_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyP
         mujoco.mj_forward(model, data)
         renderer = Rasterizer(model, draw_list, 128, 128, 0)
         pictures.append(np.stack([renderer.draw(model, data, camera) for camera in MJCF_CAMERAS.values()]))
-    assert list(tmp_path.glob("lerobot_memobench/libero/*.npz"))
+    assert list(tmp_path.glob("lerobot_memobench/libero/*.npy"))
     np.testing.assert_array_equal(pictures[0], pictures[1])
     np.testing.assert_array_equal(pictures[1], pictures[2])
 

@@ -546,7 +546,7 @@ class MemobenchMemPolicy(PI05Policy):
         return self.rollout.writes_next() or any(not self.rollout.rows[row].queue for row in self._acting_rows)
 
     def has_planned_action(self) -> bool:
-        """Return whether the next action is planned and no frame is due to be remembered: only the clock is read then."""
+        """Return whether the next action is planned and no frame will be remembered: then only the clock is read."""
         return not self.needs_observation()
 
     def supports_rtc(self) -> bool:

@@ -42,15 +42,21 @@ def assets_folder() -> Path:
         if not folder.is_dir():
             raise MemobenchError(f"{ASSETS_VARIABLE} is {named!r}, which is no folder; name LIBERO's folder of assets")
         return folder
-    found = importlib.util.find_spec(PACKAGE)  # finds a namespace package without running anything of it
-    places = list(found.submodule_search_locations or ()) if found else []
-    for place in places:
-        if (Path(place) / "assets").is_dir():
-            return Path(place) / "assets"
+    installed = _installed(PACKAGE)
+    if installed is not None:
+        return installed
     raise MemobenchError(
         f"the world 'libero' needs LIBERO's assets, which are not installed; run: {INSTALL} "
         f"(or set {ASSETS_VARIABLE} to the folder of assets of a LIBERO checkout)"
     )
+
+
+@cache
+def _installed(package: str) -> Path | None:
+    """Return the folder of assets in a namespace package, of which nothing is run."""
+    found = importlib.util.find_spec(package)
+    places = [Path(place) / "assets" for place in found.submodule_search_locations or ()] if found else []
+    return next((place for place in places if place.is_dir()), None)
 
 
 def asset(name: str) -> Path:

@@ -94,21 +94,19 @@ def build_draw_list(
     visual = np.flatnonzero(model.geom_group == VISUAL_GROUP)
     moves = model.body_weldid[model.geom_bodyid[visual]] != 0
     layers, layer_of = layers_of(model)
-    geoms: list[int] = []
-    materials, parts, indices, start = [], [], [], 0
-    for geom in [*visual[~moves].tolist(), *visual[moves].tolist()]:
-        for layer, (positions, normals, uv, triangles) in _textured(model, geom, meshes, as_mujoco, layer_of):
-            part = np.zeros(len(positions), dtype=VERTEX)
-            part["position"], part["normal"], part["uv"], part["row"] = positions, normals, uv, len(geoms)
-            parts.append(part)
-            indices.append(triangles + start)
-            start += len(part)
-            geoms.append(geom)
-            materials.append((*_material(model, geom), layer))
-    rows = np.array(geoms, dtype=np.int64)
+    ids = [*visual[~moves].tolist(), *visual[moves].tolist()]
+    parts = [(geom, *part) for geom in ids for part in _textured(model, geom, meshes, as_mujoco, layer_of)]
+    ends = np.cumsum([0, *(len(shape[0]) for _, _, shape in parts)]).tolist()
+    vertices = np.empty(ends[-1], dtype=VERTEX)
+    for row, (_, _, (positions, normals, uv, _)) in enumerate(parts):
+        part = vertices[ends[row] : ends[row + 1]]
+        part["position"], part["normal"], part["uv"], part["row"] = positions, normals, uv, row
+    indices = [shape[3] + start for (_, _, shape), start in zip(parts, ends, strict=False)]
+    materials = [(*_material(model, geom), layer) for geom, layer, _ in parts]
+    rows = np.array([geom for geom, _, _ in parts], dtype=np.int64)
     bodies = model.geom_bodyid[rows]
     return DrawList(
-        np.concatenate(parts) if parts else np.zeros(0, VERTEX),
+        vertices,
         np.concatenate([np.zeros((0, 3), np.int32), *indices]).astype(np.int32),
         rows,
         int((model.body_weldid[bodies] == 0).sum()),

@@ -346,9 +346,9 @@ def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
     """Return which triangles are the upper side of the mirror."""
     upper, mirror = np.zeros(triangles, np.bool_), draw_list.mirror
     if mirror is not None:
-        corners = draw_list.vertices[draw_list.triangles]
-        mine = np.isin(corners["row"][:, 0], mirror.rows)
-        upper[: len(mine)] = mine & (corners["normal"][:, :, 2] > 0.99).all(axis=1)
+        mine = np.flatnonzero(np.isin(draw_list.vertices["row"][draw_list.triangles[:, 0]], mirror.rows))
+        normals = draw_list.vertices["normal"][draw_list.triangles[mine]]
+        upper[mine] = (normals[:, :, 2] > 0.99).all(axis=1)
     return upper
 
 

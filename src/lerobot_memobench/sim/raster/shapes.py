@@ -69,6 +69,8 @@ def _named_mesh(model: mujoco.MjModel, mesh: int, meshes: Mapping[str, Triangles
     if name not in meshes:
         return _mesh(model, mesh, LEAST_AGREEMENT if sharp else -np.inf)
     here = _mesh_axes(model, mesh)
+    if not model.mesh_pos[mesh].any() and (here == np.eye(3)).all():
+        return meshes[name]
     points, normals, uv, triangles = meshes[name]
     return (points - model.mesh_pos[mesh]) @ here, normals @ here, uv, triangles
 
