@@ -121,6 +121,7 @@ def make_server(policy: ServedPolicy, host: str, port: int) -> Server:
             connection.send(pack(policy.metadata))
             for frame in connection:
                 try:
+                    assert isinstance(frame, bytes), "openpi's questions are binary frames"
                     answer = pack(policy.answer(unpack(frame)))
                 except Exception:
                     connection.send(traceback.format_exc())

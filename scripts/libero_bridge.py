@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.envs.episode_log import MERGED_FILE, has_log, read_log
 from lerobot_memobench.evaluation.statistics import mcnemar
 from lerobot_memobench.policies.remote.transports import Websocket
 from lerobot_memobench.protocol import EVALUATION_SEED, UPSTREAM, UPSTREAM_EVALUATIONS, UPSTREAM_HORIZON
@@ -36,7 +37,6 @@ from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task
 from scripts.libero_records import NO_OP, STABILISATION_STEPS, holds, make, prepare, task_files
 
-LOG = "episodes.jsonl"
 PATIENCE = 60.0
 """How long the server is waited for, and each of its answers, s."""
 
@@ -62,7 +62,7 @@ def stock(folder: Path, tasks: list[str], episodes: int, server: Websocket, repl
             if (name, episode) in done:
                 continue
             record = play(get_task(name), episode, server, replan)
-            with (folder / LOG).open("a") as log:
+            with (folder / MERGED_FILE).open("a") as log:
                 log.write(json.dumps(record) + "\n")
             print(name, record["seed"], "success" if record["success"] else "-", record["steps"], flush=True)
 
@@ -134,8 +134,7 @@ def question(env: Any, task: Task, observed: dict[str, NDArray[np.float64]], ste
 
 def read(folder: Path) -> list[Record]:
     """Return the episodes of a folder's log, none where there is none."""
-    log = folder / LOG
-    return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    return read_log(folder, []) if has_log(folder) else []
 
 
 def pairs_of(here: Path, there: Path) -> list[Pair]:
