@@ -7,14 +7,24 @@ import re
 import runpy
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
+from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
+from lerobot_memobench.policies.remote.transports import pack, unpack
 from lerobot_memobench.run.arguments import read_arguments, split_arguments
 from lerobot_memobench.run.plan import take_run_options
+from lerobot_memobench.sim.object_layout import STARTS, WIDTH
+from lerobot_memobench.sim.object_slots import ObjectSlots, in_slots
+from tests.support.libero import needs_assets, simulate
+from tests.support.remote_case import batch
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -104,3 +114,53 @@ def test_recurrent_ppo_learns_and_goes_on(tmp_path: Path) -> None:
     assert len(rewards) == 4
     assert max(rewards[2:]) > rewards[0] + 0.3
     assert ["before training" in text for text in printed] == [True, False], "the second goes on from the first"
+
+
+# --- openpi_server.py ---
+
+
+def test_a_policy_acts_through_openpis_protocol_as_by_itself() -> None:
+    """A policy with a memory, asked over the wire at every eighth step; a failure comes back as its last line."""
+    example = runpy.run_path(str(EXAMPLES / "openpi_server.py"))
+    served = example["ServedPolicy"]("memobench_small")
+    server = example["make_server"](served, "127.0.0.1", 0)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    port = int(server.socket.getsockname()[1])
+    with pytest.raises(MemobenchError, match=r"has no 'observation\.environment_state'"):
+        RemotePolicy(RemoteConfig(port=port, keys="observation/state=state,prompt=task")).select_action(batch(0))
+    keys = ",".join(f"observation/{name}={name}" for name in ("environment_state", "state", "step"))
+    remote = RemotePolicy(RemoteConfig(port=port, n_action_steps=8, keys=f"{keys},prompt=task"))
+    rng = np.random.default_rng(5)
+    episodes = [[seen_at(step, rng) for step in range(steps)] for steps in (26, 9)]
+    answered = [[remote.select_action(seen) for seen in episode] for episode in episodes]
+    server.shutdown()
+    served.policy.config.n_action_steps, served.policy.config.full_chunk_when_stalled = 8, False
+    for episode, actions in zip(episodes, answered, strict=True):
+        served.begin()
+        alone = [served.after(served.policy.select_action(served.before(dict(seen)))) for seen in episode]
+        assert torch.equal(torch.cat(alone), torch.cat(actions))
+        assert len({tuple(action.ravel().tolist()) for action in alone}) == len(episode)
+
+
+@needs_assets
+def test_a_simulator_state_of_libero_is_answered_as_object_state() -> None:
+    """What comes over the wire is seen as the scene that it was read from, whose fixtures stand elsewhere."""
+    example = runpy.run_path(str(EXAMPLES / "openpi_server.py"))
+    sim = simulate("turn_on_the_stove_and_turn_it_off_near_the_shelf")
+    for seed in (20_000, 20_001):
+        sim.reset(seed)
+        sent = unpack(pack({"state": sim.state(), "fixtures": sim.fixture_poses()}))
+        seen = example["objects"](sim.task.name, sent["state"], sent["fixtures"])
+        assert np.array_equal(seen, ObjectSlots(sim).observe())
+
+
+def seen_at(step: int, rng: np.random.Generator) -> dict[str, Any]:
+    """Return what a policy of object state observes at a step: five things somewhere."""
+    things = rng.uniform(-0.5, 0.5, (5, WIDTH))
+    things[:, STARTS["present"]], things[:, STARTS["class"]] = 1, rng.integers(0, 30, 5)
+    return {
+        "observation.environment_state": torch.from_numpy(in_slots(things))[None],
+        "observation.state": torch.from_numpy(rng.uniform(-0.5, 0.5, (1, 8)).astype(np.float32)),
+        "observation.step": torch.tensor([float(step)]),
+        "task": ["open the drawer"],
+    }
