@@ -182,7 +182,7 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     if options.split is not None:
         check_choice("split", options.split, EVALUATED)
         arguments = arguments.default("seed", SPLITS[options.split].start)
-    policy = policy_config(arguments)
+    policy = evaluated_policy(arguments)
     output = _output(arguments, options)
     log = Path(arguments.get(LOG) or output)
     arguments = arguments.changed(OUTPUT, output).changed(LOG, log)
@@ -364,19 +364,34 @@ def earlier_batch_size(log: Path) -> int | None:
 # --- the configurations of the policy and the environment, as LeRobot will build them ---
 
 
-def policy_config(arguments: LerobotArguments) -> PreTrainedConfig:
-    """Return the policy's configuration; that of a repository is downloaded.
+def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
+    """Return the policy's configuration; None where none is chosen, or a configuration file has a say.
 
     Raises:
-        MemobenchError: the checkpoint is not whole, or the type is not known. Others come from the configuration.
+        MemobenchError: the checkpoint is not whole. Others come from the configuration's own checks.
     """
     path = arguments.get("policy.path")
     if path is None:
-        parsed = _parsed(arguments, "policy")
-        if parsed is None:
-            raise MemobenchError(f"policy.type={arguments.get('policy.type')} is not known; import what registers it")
-        return cast("PreTrainedConfig", parsed)
+        return cast("PreTrainedConfig | None", _parsed(arguments, "policy"))
     check_checkpoint(path)
+    return _loaded(path, arguments) if _is_known(arguments, "policy") else None
+
+
+def evaluated_policy(arguments: LerobotArguments) -> PreTrainedConfig:
+    """Return the configuration of the policy that is evaluated; that of a repository is downloaded.
+
+    Raises:
+        MemobenchError: the type is not known. Others as of `policy_config`.
+    """
+    config, path = policy_config(arguments), arguments.get("policy.path")
+    if config is None and path is not None:
+        config = _loaded(path, arguments)
+    if config is None:
+        raise MemobenchError(f"policy.type={arguments.get('policy.type')} is not known; import what registers it")
+    return config
+
+
+def _loaded(path: str, arguments: LerobotArguments) -> PreTrainedConfig:
     from lerobot.configs.policies import PreTrainedConfig
 
     with quiet():
