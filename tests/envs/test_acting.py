@@ -18,7 +18,7 @@ from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.acting import acting
-from lerobot_memobench.envs.command_line import policy_being_run
+from lerobot_memobench.envs.command_line import asked_seeds, policy_being_run
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file, write_episodes
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, policy_inputs
@@ -212,7 +212,7 @@ def test_evaluations_within_a_training_are_kept_apart(tmp_path: Path, monkeypatc
 
 def test_nobody_is_told_outside_of_lerobots_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["notebook"])
-    found = acting(policy_being_run(), PIXELS, False)
+    found = acting(policy_being_run(), None, asked_seeds(), PIXELS, False)
     assert (found.protocol, found.line, found.counts(3)) == ({}, {}, True)
 
 
@@ -220,7 +220,7 @@ def test_a_file_of_settings_tells_who_acts(tmp_path: Path, monkeypatch: pytest.M
     told = {"policy": {"type": "memobench_random", "seed": 3}, "seed": 7, "eval": {"n_episodes": 2}}
     (tmp_path / "eval.json").write_text(json.dumps(told))
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--config_path={tmp_path / 'eval.json'}"])
-    found = acting(policy_being_run(), PIXELS, False)
+    found = acting(policy_being_run(), None, asked_seeds(), PIXELS, False)
     assert (found.policy["type"], found.inputs, found.seeds) == ("memobench_random", "nothing", range(7, 9))
     (tmp_path / "eval.json").write_text(json.dumps({**told, "policy": {"type": "memobench_random", "seed": 4}}))
-    assert acting(policy_being_run(), PIXELS, False).policy["identity"] != found.policy["identity"]
+    assert acting(policy_being_run(), None, asked_seeds(), PIXELS, False).policy["identity"] != found.policy["identity"]
