@@ -17,11 +17,13 @@ from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 
 
-@pytest.mark.parametrize(("gpu", "fused"), [(True, True), (False, None)])
-def test_the_optimizer_makes_no_copy_on_a_gpu(gpu: bool, fused: bool | None, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("kind", "fused"), [("cuda", True), ("cpu", True), ("mps", None)])
+def test_the_optimizer_is_one_kernel(kind: str, fused: bool | None, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[dict[str, Any]] = []
     monkeypatch.setattr(configuration_memobench_mem, "AdamW", lambda *_, **options: made.append(options))
-    MemobenchMemConfig(device="cpu").get_optimizer_preset().build([SimpleNamespace(is_cuda=gpu)] * 2)  # type: ignore
+    MemobenchMemConfig(device="cpu").get_optimizer_preset().build(
+        [SimpleNamespace(device=SimpleNamespace(type=kind))] * 2
+    )  # type: ignore
     assert made == [{"fused": fused}]
 
 
