@@ -31,12 +31,11 @@ def write_video(path: Path, frames: int = 12) -> None:
         container.mux(stream.encode())
 
 
-def fake_evaluation(output: Path) -> int:
+def fake_evaluation(output: Path) -> None:
     for name in demo.TASKS:
         write_video(output / "videos" / f"{name}.0.mp4")
     for name in ("episodes.jsonl", "report.json", "report.md", "protocol.json", "card.json", "card.md"):
         (output / name).write_text(name)
-    return 0
 
 
 def fake_comparison(work: Path, made: Path) -> None:
@@ -58,7 +57,7 @@ def test_the_demo_folder(tmp_path: Path) -> None:
         demo.make_demo(out, fake_evaluation, fake_comparison)
     assert (out / "videos" / "old.mp4").exists()
     (out / demo.CONTACT_SHEET).touch()
-    assert demo.make_demo(out, fake_evaluation, fake_comparison) == 0
+    demo.make_demo(out, fake_evaluation, fake_comparison)
     assert {path.name for path in out.iterdir()} == {*demo.PRODUCTS, "notes.txt"}
     assert {path.name for path in (out / "videos").iterdir()} == {f"{name}.0.mp4" for name in demo.TASKS}
     with Image.open(out / "contact_sheet.png") as sheet:
@@ -70,11 +69,10 @@ def test_the_demo_folder(tmp_path: Path) -> None:
 
 
 def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
-    def evaluate(output: Path) -> int:
+    def evaluate(output: Path) -> None:
         fake_evaluation(output)
         (output / "episodes.jsonl").unlink()
         write_episodes(output, [rollout(name, "temporal", "", [], True, 0) for name in demo.TASKS])
-        return 0
 
     demo.make_demo(tmp_path / "demo", evaluate, fake_comparison)
     for name in ("card.json", "protocol.json"):  # of a fake evaluation: none
@@ -84,16 +82,21 @@ def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
     assert not written.notes
 
 
+def fail(*where: object) -> None:
+    raise MemobenchError("the weights cannot be loaded")
+
+
 def test_a_failed_evaluation_leaves_the_earlier_demo(tmp_path: Path) -> None:
     (tmp_path / demo.CONTACT_SHEET).write_text("earlier")
-    assert demo.make_demo(tmp_path, lambda output: 3, fake_comparison) == 3
+    with pytest.raises(MemobenchError, match="the weights cannot be loaded"):
+        demo.make_demo(tmp_path, fail, fake_comparison)
     assert [path.name for path in tmp_path.iterdir()] == [demo.CONTACT_SHEET]
 
 
 def test_a_failed_comparison_leaves_the_earlier_demo(tmp_path: Path) -> None:
     (tmp_path / demo.CONTACT_SHEET).write_text("earlier")
-    with pytest.raises(MemobenchError, match="the evaluation expert has failed"):
-        demo.make_demo(tmp_path, fake_evaluation, lambda *where: demo.compare_memories(*where, lambda *_: 2))
+    with pytest.raises(MemobenchError, match="the weights cannot be loaded"):
+        demo.make_demo(tmp_path, fake_evaluation, lambda *where: demo.compare_memories(*where, fail))
     assert [path.name for path in tmp_path.iterdir()] == [demo.CONTACT_SHEET]
 
 
@@ -101,13 +104,12 @@ def test_the_memories_are_compared_on_the_same_episodes(tmp_path: Path) -> None:
     wrong, other = "reference_drift", "storage_failure"
     failed = {"expert": {}, "with memory": {3: wrong}, "without memory": {1: wrong, 2: wrong, 3: other}}
 
-    def evaluate(name: str, folder: Path) -> int:
+    def evaluate(name: str, folder: Path) -> None:
         ends = [failed[name].get(k) for k in range(5)]
         write_episodes(
             folder, [rollout(BOWL, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)]
         )
         write_video(folder / "videos" / f"{BOWL}.1.mp4")  # the first on which they differ
-        return 0
 
     told = demo.compare_memories(tmp_path / "work", tmp_path / "made", evaluate)
     assert [one.solved for one in told.values()] == [
@@ -131,7 +133,7 @@ def test_what_is_compared_differs_in_the_policy_alone(tmp_path: Path, monkeypatc
 def test_without_trained_policies_the_demo_is_the_experts(tmp_path: Path) -> None:
     for name in (demo.MEMORY_TABLE, demo.CONTACT_SHEET):
         (tmp_path / name).write_text("of an earlier demo")
-    assert demo.make_demo(tmp_path, fake_evaluation, None) == 0
+    demo.make_demo(tmp_path, fake_evaluation, None)
     assert not {path.name for path in tmp_path.iterdir()} & {demo.MEMORY_VIDEO, demo.MEMORY_TABLE}
 
 
