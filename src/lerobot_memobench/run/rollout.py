@@ -127,10 +127,11 @@ class Inputs:
         begins = self._phase is None or bool((observation[PHASE] != self._phase).any())
         self._phase = np.array(observation[PHASE])
         if self._planned and not begins:
-            clock = {
-                key: observation[name] for key, name in zip(CLOCK, (PHASE, STEP), strict=True) if key in self._last
+            now = {
+                key: torch.as_tensor(observation[name]).reshape(-1).to(self._last[key])
+                for key, name in zip(CLOCK, (PHASE, STEP), strict=True)
+                if key in self._last  # a processor may drop it
             }
-            now = {key: torch.as_tensor(value).reshape(-1).to(self._last[key]) for key, value in clock.items()}
             return {**self._last, **now}
         if begins or self._drawn:  # the first frame of an execution is always drawn: a policy cannot foresee it
             converted = preprocess_observation(observation)
