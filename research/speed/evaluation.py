@@ -33,6 +33,7 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchRandomPolicy
 from lerobot_memobench.protocol import EVALUATION_EPISODES, EVALUATION_SEED, HORIZON
+from lerobot_memobench.run import run
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.run import run_evaluation
 from lerobot_memobench.tasks.catalogue import task_names
@@ -72,23 +73,27 @@ class Stopwatch:
 
 @contextmanager
 def stopwatch() -> Iterator[Stopwatch]:
-    """Yield a watch that notes the steps of vector environments in this process and the end of LeRobot's evaluation."""
+    """Yield a watch that notes the steps of vector environments in this process and the end of an evaluation."""
     from lerobot.scripts import lerobot_eval
 
-    watch, step, evaluate = Stopwatch(), gym.vector.SyncVectorEnv.step, lerobot_eval.eval_policy
+    watch, step = Stopwatch(), gym.vector.SyncVectorEnv.step
 
     def noted_step(self: gym.vector.SyncVectorEnv, actions: Any) -> Any:
         watch.step()
         return step(self, actions)
 
-    def noted_evaluation(*args: Any, **settings: Any) -> Any:
-        found = evaluate(*args, **settings)
-        watch.end()
-        return found
+    def noted(evaluation: Any) -> Any:
+        def evaluate(*args: Any, **settings: Any) -> Any:
+            found = evaluation(*args, **settings)
+            watch.end()
+            return found
+
+        return evaluate
 
     with (
         patch.object(gym.vector.SyncVectorEnv, "step", noted_step),
-        patch.object(lerobot_eval, "eval_policy", noted_evaluation),
+        patch.object(lerobot_eval, "eval_policy", noted(lerobot_eval.eval_policy)),
+        patch.object(run, "evaluate", noted(run.evaluate)),
     ):
         yield watch
 

@@ -15,6 +15,7 @@ from lerobot_memobench.policies.memobench_mem.fusion import (
     MemoryModulator,
     ModulatedNorm,
     SharedMemory,
+    rotate_from,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, SizedPaliGemmaWithExpert
@@ -471,3 +472,13 @@ def test_the_prefix_is_lerobots(dtype: torch.dtype) -> None:
     pictures = (torch.rand(2, 3, 96, 96, generator=torch.Generator().manual_seed(0)) * 2 - 1).to(dtype)
     with torch.no_grad():
         assert torch.equal(pair.embed_image(pictures), PaliGemmaWithExpertModel.embed_image(pair, pictures))
+
+
+def test_positions_of_a_rollout_serve_a_training() -> None:
+    """They are kept, and a rollout makes them in inference mode."""
+    with torch.inference_mode():
+        rotate_from(torch.ones(1, 3, 8), 1234)
+    keys = torch.ones(1, 3, 8, requires_grad=True)
+    rotate_from(keys, 1234).square().sum().backward()
+    assert keys.grad is not None
+    assert keys.grad.isfinite().all()

@@ -123,10 +123,8 @@ def test_a_rollout_perceives_and_remembers_what_training_reads(case: Case) -> No
     assert apart(frames[0], frames[7]) > 4 * case.of.rounding, "moments differ"
     prefixes = []
     for batch in (trained, acted):
-        embeddings, real, _ = policy.model.embed_prefix(
-            *policy._preprocess_images(batch), *(trained[key] for key in WORDS)
-        )
-        prefixes.append(embeddings[real])
+        prefix = policy.model.embed_prefix(*policy._preprocess_images(batch), *(trained[key] for key in WORDS))
+        prefixes.append(prefix.tokens[prefix.real])
     assert apart(*prefixes) <= 2 * case.of.rounding
 
 

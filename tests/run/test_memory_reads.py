@@ -24,6 +24,7 @@ from lerobot_memobench.run.shards import plan_shards
 from tests.support.logs import record
 
 TASK = "turn_on_the_stove_and_turn_it_off"
+MILK = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 LINE = ["env=memobench", f"tasks={TASK}", "episodes=2", "batch_size=1", "memory_reads=true", "policy=memobench_small"]
 
 
@@ -44,12 +45,6 @@ class Policy:
         return self.rows
 
 
-class Environment:
-    def call(self, name: str) -> tuple[str]:
-        assert name == "task"
-        return ("a_task",)
-
-
 def steps_of(folder: Path, episode: int) -> list[int] | None:
     found, notes = find_reads(folder, [record(episode=episode, seed=20 + episode)], {})
     assert not notes
@@ -60,7 +55,7 @@ def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
     chunks = [ChunkReads(step, (0,), (1.0,)) for step in range(3)]
     policy: Any = Policy(chunks[:2], [], chunks[:1])
     log = ReadLog(tmp_path, 20, "fixed")
-    with log.noting(Environment(), policy, [20, 21, 22]) as ended:
+    with log.noting("a_task", policy, [20, 21, 22]) as ended:
         ended(np.array([False, False, False]))
         assert not (tmp_path / "memory_reads").exists()
         ended(np.array([True, True, False]))
@@ -75,7 +70,7 @@ def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
 
 def test_a_rollout_that_breaks_off_leaves_only_whole_episodes(tmp_path: Path) -> None:
     policy: Any = Policy([ChunkReads(0, (0,), (1.0,))])
-    with pytest.raises(ZeroDivisionError), ReadLog(tmp_path, 7, "fixed").noting(Environment(), policy, [7]):
+    with pytest.raises(ZeroDivisionError), ReadLog(tmp_path, 7, "fixed").noting("a_task", policy, [7]):
         raise ZeroDivisionError
     assert not policy.watched
     assert not reads_file(tmp_path, "a_task", 0).exists()
@@ -86,7 +81,7 @@ def test_reads_of_evidence_stand_at_their_own_episode(tmp_path: Path) -> None:
     for part, number in (("a", 0), ("a", 1), ("b", 2), ("b", 3)):
         env = gym.vector.SyncVectorEnv([partial(evidence, tmp_path / part)])
         policy: Any = Policy([ChunkReads(0, (0,), (number / 10,))])
-        with ReadLog(tmp_path / part, 20_000, "drawn").noting(env, policy, [20_000 + number]) as ended:
+        with ReadLog(tmp_path / part, 20_000, "drawn").noting(MILK, policy, [20_000 + number]) as ended:
             env.reset(seed=[20_000 + number])
             ended(env.step(np.zeros((1, 7), np.float32))[3])
         env.close()
@@ -106,7 +101,7 @@ def test_reads_of_evidence_stand_at_their_own_episode(tmp_path: Path) -> None:
 
 def evidence(folder: Path) -> MemobenchEnv:
     return MemobenchEnv(
-        "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate",
+        MILK,
         obs_type=OBJECTS,
         prompt_in=RESET,
         horizon=1,

@@ -267,7 +267,6 @@ OF_THE_RUN = {
     "pause_steps": COUNT,
     "speed": st.sampled_from(["1", "0.5", "0.33"]),
     "evidence": st.just("false"),
-    "env.max_parallel_tasks": COUNT,
     "eval.use_async_envs": BOOLEAN,
     "job_name": st.sampled_from(["mine", "run 7"]),
     "rename_map": st.just('{"observation.images.image": "observation.images.top"}'),

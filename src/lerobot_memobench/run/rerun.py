@@ -68,7 +68,7 @@ SERVERS = ("policy.host", "policy.servers")
 RECORDING = "eval.recording"
 """Writes a dataset of the rollouts: no outcome depends on it, and a repetition leaves it out."""
 MOST = {"env.horizon": 10 * HORIZON, "eval.n_episodes": MOST_EPISODES, "env.videos": MOST_EPISODES}
-MOST |= {"eval.batch_size": 512, "env.max_parallel_tasks": 512}
+MOST |= {"eval.batch_size": 512}
 MOST_STEPS = 100 * HORIZON
 """What a card may ask for: setting -> its largest number, and control steps of an episode with its pauses."""
 NAMED = {"success", "steps", "checkpoints"}

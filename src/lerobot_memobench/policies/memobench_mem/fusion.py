@@ -122,8 +122,9 @@ class RMSNorm(nn.Module):
 @functools.lru_cache(maxsize=64)
 def _places(begin: int, count: int, width: int, device: torch.device) -> Tensor:
     """Return the rotations of ``count`` positions from ``begin`` on, for vectors of this width."""
-    frequencies = _ROPE_BASE ** -(torch.arange(width // 2, dtype=torch.float32, device=device) / (width // 2))
-    return rotary(torch.arange(begin, begin + count, device=device), frequencies)
+    with torch.inference_mode(False):  # a training may use them after a rollout
+        frequencies = _ROPE_BASE ** -(torch.arange(width // 2, dtype=torch.float32, device=device) / (width // 2))
+        return rotary(torch.arange(begin, begin + count, device=device), frequencies)
 
 
 def rotate_from(x: Tensor, begin: int) -> Tensor:
