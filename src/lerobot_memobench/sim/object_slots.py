@@ -53,6 +53,10 @@ def layout() -> dict[str, Any]:
     return {"slots": SLOTS, "fields": fields, "classes": list(classes())}
 
 
+NORMALS = (None,) if "normal:" in str(mujoco.mj_multiRay.__doc__) else ()
+"""Where MuJoCo's rays write the normals of what they hit; versions until 3.4 have no such argument."""
+
+
 @dataclass(frozen=True)
 class Thing:
     """What one slot may show.
@@ -157,7 +161,7 @@ class ObjectSlots:
                 continue
             geoms, distances = np.full(count, -1, np.int32), np.zeros(count)
             mujoco.mj_multiRay(
-                model, data, origin, rays[inside].ravel(), self._group, True, -1, geoms, distances, None, count,
+                model, data, origin, rays[inside].ravel(), self._group, True, -1, geoms, distances, *NORMALS, count,
                 mujoco.mjMAXVAL,
             )  # fmt: skip
             owners, mine = self.owners(geoms), tried[inside] // POINTS
