@@ -50,27 +50,36 @@ class Handle:
     clearance: float
 
 
-@dataclass(frozen=True)
-class Articulation:
-    """A joint that predicates read and experts move.
+@dataclass(frozen=True, kw_only=True)
+class JointRule:
+    """Where a joint counts as open or closed, on or off, and how a moving part is found.
 
     Drawers and doors are open when q < ``open_below`` and closed when q > ``closed_above``; knobs are on when
     q >= ``on_at_least`` and off when q < ``off_below``; the others' limits are nan. ``closed_q`` and ``open_q`` are
-    good targets for q (off and on for a knob). ``handle_site``: full name of the site at the handle's middle, which
-    moves along. ``shares_origin``: the moving body has the fixture's origin, so only the handle shows which part it is.
+    good targets for q (off and on for a knob), m or rad. ``shares_origin``: the moving body has the fixture's origin,
+    so only the handle shows which part it is.
     """
 
-    joint: str
     kind: Literal["drawer", "door", "knob"]
     closed_q: float
     open_q: float
-    handle_site: str
-    handle: Handle
     open_below: float = nan
     closed_above: float = nan
     on_at_least: float = nan
     off_below: float = nan
     shares_origin: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Articulation(JointRule):
+    """A joint that predicates read and experts move.
+
+    ``handle_site``: full name of the site at the handle's middle, which moves along.
+    """
+
+    joint: str
+    handle_site: str
+    handle: Handle
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import nan, pi
-from typing import Literal
 
-from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Grasp
+from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Grasp, JointRule
 
 Turn = tuple[str, float]
 """Axis (x, y or z) and angle, rad."""
 
 
-@dataclass(frozen=True)
-class Part:
+@dataclass(frozen=True, kw_only=True)
+class Part(JointRule):
     """A drawer, door or knob of a fixture.
 
     Attributes:
@@ -27,26 +26,16 @@ class Part:
         handle_quaternion: from the handle's frame (x along it, y into the fixture) to the body's, wxyz.
         handle_size: length of the handle, and its thickness along y and z, m.
         clearance: free space behind the handle, m.
-        closed_q, open_q: good targets for the joint (off and on for a knob), m or rad.
         ranges: `init` predicate -> between which positions LIBERO draws the joint.
-        open_below, closed_above, on_at_least, off_below, shares_origin: as of `Articulation`.
     """
 
-    kind: Literal["drawer", "door", "knob"]
     joint: str
     body: str
     handle: tuple[float, float, float]
     handle_size: tuple[float, float, float]
     clearance: float
-    closed_q: float
-    open_q: float
     ranges: dict[str, tuple[float, float]]
     handle_quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    open_below: float = nan
-    closed_above: float = nan
-    on_at_least: float = nan
-    off_below: float = nan
-    shares_origin: bool = False
 
 
 @dataclass(frozen=True)

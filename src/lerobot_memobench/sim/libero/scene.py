@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from functools import cache
 from types import MappingProxyType
 
@@ -19,7 +20,16 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Articulation, Asset, Grasp, Handle, Quaternion
+from lerobot_memobench.sim.assets.asset import (
+    ALONG_X,
+    ALONG_Y,
+    Articulation,
+    Asset,
+    Grasp,
+    Handle,
+    JointRule,
+    Quaternion,
+)
 from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.libero import mjcf
@@ -287,17 +297,10 @@ def _by_the_sides(low: Triple, high: Triple) -> tuple[Grasp, ...]:
 def _articulation(name: str, part: Part) -> Articulation:
     length, *thickness = part.handle_size
     return Articulation(
+        **{rule.name: getattr(part, rule.name) for rule in fields(JointRule)},
         joint=f"{name}_{part.joint}",
-        kind=part.kind,
-        closed_q=part.closed_q,
-        open_q=part.open_q,
         handle_site=f"{name}_{part.joint}_handle",
         handle=Handle(length, (thickness[0], thickness[1]), part.clearance),
-        open_below=part.open_below,
-        closed_above=part.closed_above,
-        on_at_least=part.on_at_least,
-        off_below=part.off_below,
-        shares_origin=part.shares_origin,
     )
 
 
