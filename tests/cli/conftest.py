@@ -57,7 +57,7 @@ class FakeLoop:
                     self.kill_after -= 1
                 self.ran.append((name, episode))
                 log.append(self.record(load_task(cell[0].folder), episode, plan.environment.seed_base + episode))
-            advance(cell[0], len(plan.grid.episodes(cell)))
+            advance(len(self.ran), len(self.ran), cell[0].name)
 
     def value(self, key: str) -> str | None:
         """Return what the last plan says of one of LeRobot's settings."""

@@ -16,8 +16,8 @@ from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.run.arguments import Arguments, read_arguments
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.run.merging import merge_and_report
-from lerobot_memobench.run.plan import EvaluationPlan, PlannedTask, is_benchmark, make_plan, take_run_options
-from lerobot_memobench.run.run import EvaluationReport, missing, run_evaluation
+from lerobot_memobench.run.plan import EvaluationPlan, is_benchmark, make_plan, take_run_options
+from lerobot_memobench.run.run import EvaluationReport, run_evaluation
 from lerobot_memobench.run.shards import executor_options, plan_shards, run_shards
 
 if TYPE_CHECKING:
@@ -49,16 +49,8 @@ def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:
     Args:
         say_where: whether the report's file is named.
     """
-    left = sum(len(plan.grid.runs_of(number)) for _, number in missing(plan))
-    with counting(console(), "episodes", left) as count:
-        done = 0
-
-        def advance(task: PlannedTask, episodes: int) -> None:
-            nonlocal done
-            done += episodes
-            count(done, left, task.name)
-
-        report = run_evaluation(plan, tell, say, advance)
+    with counting(console(), "episodes") as count:
+        report = run_evaluation(plan, tell, say, count)
     if report is None:
         print(f"part {plan.options.shard} holds no episode: there are fewer batches than parts")
         return 0

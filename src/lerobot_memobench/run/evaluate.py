@@ -28,11 +28,11 @@ from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
 RECORDINGS = "recordings"
 """Folder of rollouts that are recorded as datasets, in that of the evaluation."""
 
-Advance = Callable[[PlannedTask, int], None]
-"""Called with the task and the number of episodes of each batch that has ended."""
+Advance = Callable[[int, int, str], None]
+"""Called after each batch with the episodes that have ended, those that are to be run, and the task's name."""
 
 
-def evaluate(plan: EvaluationPlan, cells: Iterable[Cell], begin: Callable[[], None], advance: Advance) -> None:
+def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: Advance) -> None:
     """Run batches of episodes; the environments write the log.
 
     Args:
@@ -56,6 +56,7 @@ def evaluate(plan: EvaluationPlan, cells: Iterable[Cell], begin: Callable[[], No
     environments = Environments(environment.opener(policy, by, plan.log), plan.eval_settings.use_async_envs)
     reads, seeds = ReadLog.of(plan), BatchSeeds(actor.policy, plan.seed)
     amp = torch.autocast(device_type=device.type) if policy.use_amp else nullcontext()
+    done, total = 0, sum(len(plan.grid.runs_of(number)) for _, number in cells)
     with amp, closing(environments):
         for task, number in cells:
             runs = plan.grid.runs_of(number)
@@ -64,7 +65,8 @@ def evaluate(plan: EvaluationPlan, cells: Iterable[Cell], begin: Callable[[], No
             seeds.begin(task.name, batch.start)
             with _noting(reads, actor.policy, task, batch) as ended, _recording(plan, task, env) as recorder:
                 roll(env, actor, batch, ended, recorder)
-            advance(task, len(batch))
+            done += len(batch)
+            advance(done, total, task.name)
 
 
 class Environments:

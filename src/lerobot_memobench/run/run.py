@@ -26,9 +26,9 @@ from lerobot_memobench.run.card import (
     with_episodes,
     write_card,
 )
-from lerobot_memobench.run.evaluate import evaluate, lerobot_summary
+from lerobot_memobench.run.evaluate import Advance, evaluate, lerobot_summary
 from lerobot_memobench.run.machine import drawn_with
-from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
+from lerobot_memobench.run.plan import Cell, EvaluationPlan
 from lerobot_memobench.run.sealed import RUN_FILE, counted
 
 VIDEOS, LEROBOT_INFO = "videos", "eval_info.json"
@@ -36,9 +36,6 @@ VIDEOS, LEROBOT_INFO = "videos", "eval_info.json"
 
 Tell = Callable[[str], None]
 """Told what a user should know and what stops nothing."""
-
-Advance = Callable[[PlannedTask, int], None]
-"""Called with the task and the number of episodes of each batch that has ended."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +57,14 @@ class EvaluationReport:
 
 
 def run_evaluation(
-    plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: None, advance: Advance = lambda task, episodes: None
+    plan: EvaluationPlan, tell: Tell, begin: Tell = lambda text: None, advance: Advance = lambda *news: None
 ) -> EvaluationReport | None:
     """Run what is missing, write report and card; return None for a part that holds no episode.
 
     Args:
         tell: told what matters and stops nothing, and how to go on when a run breaks off.
         begin: told what is about to be run: the first episode takes a while.
-        advance: called after each batch with its task and its number of episodes.
+        advance: see `evaluate.Advance`.
 
     Raises:
         MemobenchError: the batch is none, the folder holds another evaluation, or weights are missing. Whatever
