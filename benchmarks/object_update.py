@@ -1,11 +1,13 @@
 """Updates and plans of small policies that see objects, by this source and by another one, in turns in one run.
 
-    python benchmarks/object_update.py FOLDER [--rounds 9] [--memory frames bank …] [--words 16]
+    python benchmarks/object_update.py FOLDER [--rounds 9] [--memory frames bank …] [--words 16] [--compile]
 
 FOLDER holds the other state's `lerobot_memobench` (`git worktree add /tmp/before COMMIT`, then `/tmp/before/src`). An
 update is forward, backward, clipping, the policy's own AdamW and the weight average, of 12 episodes x 6 samples. A plan
 is one of the shipped `memobench_small`, whose memory is full. Each side is a process of its own on one thread, which
 waits until it is asked. Prints a Markdown table: medians of CPU milliseconds, and the median ratio before / after.
+With --compile the updates of this source run under policy.compile_model=true; that takes a C++ compiler and minutes,
+and FOLDER may be this source too.
 """
 
 from __future__ import annotations
@@ -48,11 +50,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--memory", nargs="+", default=list(MEMORIES))
     parser.add_argument("--words", type=int, default=16)
+    parser.add_argument("--compile", action="store_true")
     asked = parser.parse_args()
     print("| | before, ms | after, ms | ratio |\n| --- | ---: | ---: | ---: |")
     for name in (*asked.memory, PLAN):
-        sides = [Side(source, name, asked.words) for source in (asked.before, HERE)]
-        for side in sides:
+        sides = [Side(asked.before, name, asked.words), Side(HERE, name, asked.words, asked.compile)]
+        for side in sides * 2:  # the second update still allocates
             side.milliseconds()
         taken = [[side.milliseconds() for side in sides] for _ in range(asked.rounds)]
         before, after = (statistics.median(side) for side in zip(*taken, strict=True))
@@ -65,9 +68,9 @@ def main() -> None:
 class Side:
     """A process that serves."""
 
-    def __init__(self, source: Path, name: str, words: int) -> None:
+    def __init__(self, source: Path, name: str, words: int, compiled: bool = False) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-W", "ignore", __file__, "--serve", name, str(words)],
+            [sys.executable, "-W", "ignore", __file__, "--serve", name, str(words), "compiled" * compiled],
             env={**os.environ, "PYTHONPATH": f"{source}{os.pathsep}{source.parent}"},
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
@@ -80,12 +83,12 @@ class Side:
         return float(self.process.stdout.readline())
 
 
-def serve(name: str, words: int) -> None:
+def serve(name: str, words: int, compiled: bool) -> None:
     """Answer each line with the CPU milliseconds of an update, or of a plan."""
     torch.set_num_threads(1)
     keep_freed_memory()  # as training does
     torch.manual_seed(0)
-    times, work = (MANY, planner(words)) if name == PLAN else (1, updater(settings_of(name), words))
+    times, work = (MANY, planner(words)) if name == PLAN else (1, updater(settings_of(name, compiled), words))
     for _ in sys.stdin:
         started = time.process_time()
         for _ in range(times):
@@ -93,9 +96,10 @@ def serve(name: str, words: int) -> None:
         print(1e3 * (time.process_time() - started) / times, flush=True)
 
 
-def settings_of(memory: str) -> MemobenchMemConfig:
+def settings_of(memory: str, compiled: bool = False) -> MemobenchMemConfig:
     """Return the configuration of a small policy of objects."""
-    settings = config("small", device="cpu", perception="objects", memory=memory)
+    compiling = {"compile_model": True, "compile_mode": "default"} if compiled else {}
+    settings = config("small", device="cpu", perception="objects", memory=memory, **compiling)
     settings.input_features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (SIZE,))
     return settings
 
@@ -152,6 +156,6 @@ def planner(words: int) -> Callable[[], None]:
 
 if __name__ == "__main__":
     if sys.argv[1] == "--serve":
-        serve(sys.argv[2], int(sys.argv[3]))
+        serve(sys.argv[2], int(sys.argv[3]), sys.argv[4] == "compiled")
     else:
         main()

@@ -91,6 +91,7 @@ class Bank(MemoryMechanism):
         state |= {f"{name}_steps": torch.zeros(rows, self.capacity, device=device) for name in sizes}
         return state | {"count": torch.zeros(rows, dtype=torch.int64, device=device)}
 
+    @torch.no_grad()
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
         """Fuse the frame with what it finds, and make an entry of it."""
         count = state["count"]
@@ -98,7 +99,7 @@ class Bank(MemoryMechanism):
         for name, present in self._present(tokens).items():
             entries, steps = state[name], state[f"{name}_steps"]
             fused, _ = self.streams[name](present, entries, steps, count, step)
-            made[name], made[f"{name}_steps"] = append(entries, steps, count, fused.detach().float(), step)
+            made[name], made[f"{name}_steps"] = append(entries, steps, count, fused.float(), step)
         return made
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
