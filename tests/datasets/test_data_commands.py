@@ -76,5 +76,5 @@ def test_push(call, monkeypatch):
     monkeypatch.setattr(push_module, "push", lambda *words, **more: asked.update(more, words=words) or "https://x/y")
     result = call("push", "ds", "--repo-id", "a/b", "--private")
     assert callable(asked.pop("tell"))
-    assert asked == {"words": (Path("ds"), "a/b"), "private": True, "hdf5": False}
+    assert asked == {"words": (Path("ds"), "a/b"), "private": True}
     assert (result.return_value, result.output.strip()) == (0, "dataset: https://x/y")
