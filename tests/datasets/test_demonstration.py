@@ -32,6 +32,7 @@ def test_texts(make_demo):
     found = labels(make_demo(["01000", "00100", "00010"]))
     assert found.simple_subgoal == ["did thing 0"] * 2 + ["did thing 1"] + ["did thing 2"] * 2
     assert found.grounded_subgoal[2] == "did thing 1 with the left hand"
+    assert found.operation.tolist() == [0, 0, 1, 2, -1], "none is left"
     assert found.coarse_subgoal == ["coarse 0"] * 2 + ["coarse 1"] + ["coarse 2"] * 2, "the last one's stays"
     assert found.memory == [
         "",
@@ -49,26 +50,6 @@ def test_prompt_frames(make_demo):
     assert not found.completed[:3].any()
     assert set(found.memory) == {""}
     assert found.key_frames.tolist() == [5, -1]  # frames of the episode, prompt included
-
-
-def test_several_completed_at_one_frame(make_demo):
-    found = labels(make_demo(["00100", "00100", "00001"]))
-    assert found.key_frames.tolist() == [2, 2, 4]
-    assert bits(found.index) == "00022"
-    assert bits(found.event) == "00101"
-    assert found.memory[3] == "did thing 0; did thing 1"
-
-
-def test_satisfied_too_early_counts_only_when_it_still_holds(make_demo):
-    # Checkpoint 1 held first, lost its truth, and never held again once checkpoint 0 was complete.
-    found = labels(make_demo(["000010", "011000"]))
-    assert found.key_frames.tolist() == [4, -1]
-    assert bits(found.completed[:, 1]) == "011111"
-    assert bits(found.event) == "010010"
-    assert bits(found.index) == "000001"
-    # It is still true when its turn comes: completed at that very frame.
-    found = labels(make_demo(["000010", "011111"]))
-    assert found.key_frames.tolist() == [4, 4]
 
 
 def test_task_without_checkpoints(make_demo, make_task):

@@ -55,6 +55,18 @@ def change(path: Path, name: str, row: int) -> None:
     pq.write_table(table.set_column(place, field, changed), path)
 
 
+def test_the_command_names_what_disagrees(two: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert commands.validate(two) == 0
+    assert "2 of 2 episodes agree" in capsys.readouterr().out
+    folder = Path(shutil.copytree(two, tmp_path / "ds"))
+    (path,) = (folder / "data").rglob("*.parquet")
+    change(path, "checkpoint.index", FRAMES + FRAME)
+    assert commands.validate(folder) == 1
+    printed = capsys.readouterr().out
+    assert f"episode 1: checkpoint.index at frame {FRAME}" in printed
+    assert "1 of 2 episodes agree, and files" in printed, "the table has other bytes than those written"
+
+
 def validation(folder: Path) -> list[Verdict]:
     """Return the verdicts on episodes."""
     return [verdict for verdict in validate(folder) if not verdict.of_file]
