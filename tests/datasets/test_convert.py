@@ -19,7 +19,7 @@ from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.hdf5.reading import PublishedFile
+from lerobot_memobench.datasets.hdf5.reading import Extras, PublishedFile
 from lerobot_memobench.datasets.hdf5.restore import restore, task_of
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
@@ -83,7 +83,7 @@ def test_files_by_hand_without_key_frames(stove, tmp_path):
     with PublishedFile(path) as file:
         found = file.read("demo_0")
         task = task_of(file, found)
-        assert found.extras == {}
+        assert found.extras == Extras()
         assert (task.name, task.memory_type, task.family) == (STOVE, "temporal", stove.task.family)
         np.testing.assert_array_equal(restore(task, found).states, stove.states)
     summary = convert(path, tmp_path / "ds")
@@ -132,7 +132,7 @@ def test_what_contradicts_itself_is_said(written, stove):
         found = file.read("demo_0")
         task = task_of(file, found)
     assert digest(restore(task, found)) == digest(stove)
-    foreign = replace(found, extras={})
+    foreign = replace(found, extras=Extras())
 
     def said(reason: str, **change) -> None:
         metadata = found.metadata | change.pop("metadata", {})

@@ -34,7 +34,7 @@ def test_reading_back(path, demos):
             np.testing.assert_array_equal(read.actions, demo.actions)
             assert (read.image_size, read.model_file) == ((SIZE, SIZE), "<mujoco/>")
             assert read.metadata["key_frame"] == labels(demo).key_frames.tolist() == [2, 3]
-            satisfied = truth_from_intervals(read.extras["satisfied_intervals"], len(demo))
+            satisfied = truth_from_intervals(read.extras.satisfied_intervals, len(demo))
             np.testing.assert_array_equal(satisfied, demo.satisfied)
             frames = list(file.images(group))
             for camera in demo.images:

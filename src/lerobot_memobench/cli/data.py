@@ -133,8 +133,9 @@ def convert(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
 ) -> int:
-    """Turn HDF5 demonstrations into a LeRobotDataset and name those that cannot be used. The same command continues a
-    killed run.
+    """Turn HDF5 demonstrations into a LeRobotDataset.
+
+    Those that cannot be used are named. The same command continues a killed run.
     """
     from lerobot_memobench.datasets.convert import convert as run
 

@@ -25,6 +25,7 @@ from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.generation import check_room, run_size
 from lerobot_memobench.datasets.hdf5.archive import Archive, Member, is_archive
 from lerobot_memobench.datasets.hdf5.reading import (
+    NO_SEED,
     Problem,
     PublishedDemo,
     PublishedFile,
@@ -32,7 +33,7 @@ from lerobot_memobench.datasets.hdf5.reading import (
     find_files,
     usable_or_named,
 )
-from lerobot_memobench.datasets.hdf5.restore import NO_SEED, restore, task_of, unlike_the_catalogue, world_of
+from lerobot_memobench.datasets.hdf5.restore import restore, task_of, unlike_the_catalogue, world_of
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from annotated_types import Len
 from numpy.typing import NDArray
+from pydantic import BaseModel, Json
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Malformed, Number, Whole, check_fetched, checked, parsed, refusing
@@ -29,8 +30,8 @@ LIBERO_NAMES = {"image": "agentview_rgb", "wrist_image": "eye_in_hand_rgb"}
 """The same in LIBERO's own files, after which a file of the published layout may be named as well."""
 FILE_OBJECT = re.compile(r"<(_io\.\w+|open file) .*>")
 Image = NDArray[np.uint8]
-AS_JSON = ("fixture_poses", "satisfied_intervals")
-"""Attributes that hold JSON text."""
+NO_SEED = -1
+"""Seed of a demonstration without one."""
 SUFFIX = "_demo.hdf5"
 SUFFIXES = (".hdf5", ".h5")
 SLICE = 32
@@ -39,19 +40,23 @@ LARGEST = 1e10
 """MuJoCo takes a state with a larger number for an unstable simulation, and puts the initial one in its place."""
 
 
-class Extras(TypedDict, total=False):
-    """Attributes that earlier versions of this package added to a demonstration. JSON texts are parsed: fixture to pose
-    (7,), checkpoint to [start, stop) pairs.
+class Extras(BaseModel):
+    """Attributes that earlier versions of this package added to a demonstration; the defaults are those of others.
+
+    Attributes:
+        success: None in files of others.
+        fixture_poses: JSON, fixture to pose (7,).
+        satisfied_intervals: JSON, checkpoint to [start, stop) pairs.
     """
 
-    seed: Whole
-    referent: str
-    variant: Count
-    success: bool
-    fixture_poses: dict[str, Annotated[list[Number], Len(7, 7)]]
-    scene_hash: str
-    satisfied_intervals: list[list[Annotated[list[Count], Len(2, 2)]]]
-    digest: str
+    seed: Whole = NO_SEED
+    referent: str = "fixed"
+    variant: Count = 0
+    success: bool | None = None
+    fixture_poses: Json[dict[str, Annotated[list[Number], Len(7, 7)]]] | None = None
+    scene_hash: str = ""
+    satisfied_intervals: Json[list[list[Annotated[list[Count], Len(2, 2)]]]] | None = None
+    digest: str | None = None
 
 
 @dataclass(frozen=True)
@@ -100,7 +105,7 @@ class PublishedDemo:
         actions: (T, 7) float32.
         metadata: ``meta_data``.
         model_file: MJCF, or "" where there is none.
-        extras: the attributes that earlier versions of this package added; empty for files of others.
+        extras: the attributes that earlier versions of this package added.
         image_size: (height, width).
     """
 
@@ -109,7 +114,7 @@ class PublishedDemo:
     actions: NDArray[np.float32]
     metadata: dict[str, Any]
     model_file: str
-    extras: dict[str, Any]
+    extras: Extras
     image_size: tuple[int, int]
 
 
@@ -383,23 +388,18 @@ def first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-def read_extras(group: h5py.Group) -> dict[str, Any]:
-    """Return those of `Extras` that a group has.
+def read_extras(group: h5py.Group) -> Extras:
+    """Return the `Extras` of a group.
 
     Raises:
         Unusable: one of them is of another type, or no JSON.
     """
-    found = {key: _plain(group.attrs[key]) for key in Extras.__annotations__ if key in group.attrs}
-    for key in AS_JSON:
-        if isinstance(found.get(key), str):
-            try:
-                found[key] = parsed(found[key])
-            except Malformed as error:
-                raise Unusable(f"the attribute {key!r}: {error}") from None
+    found = {key: _plain(group.attrs[key]) for key in Extras.model_fields if key in group.attrs}
     try:
-        return dict(checked(found, Extras))
+        extras: Extras = checked(found, Extras)
     except Malformed as error:
         raise Unusable(f"its attributes: {error}") from None
+    return extras
 
 
 def _plain(value: Any) -> Any:

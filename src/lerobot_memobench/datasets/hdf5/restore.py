@@ -38,8 +38,6 @@ BASE_TOLERANCE = 1e-3
 """How far the arm's base may be from ours, m: pictures, actions and proprioception are of one place."""
 NEAR_TABLE = 0.1
 """How far above or below the table's top a fixture's origin may be, m; LIBERO's are up to 30 mm above it."""
-NO_SEED = -1
-"""Seed of a demonstration without one."""
 UNKNOWN = "tasks"
 """Folder of a task with an unknown memory type."""
 OURS = "memobench"
@@ -57,15 +55,16 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     exec_start = execution_start(task, demo)
     _check_clock(demo.states, exec_start)
     frames = key_frames(task, demo, exec_start)
-    written = demo.extras.get("satisfied_intervals")
+    extras = demo.extras
+    written = extras.satisfied_intervals
     asked = written is None and (not frames or min(frames) < 0)
     read_off = _read_off(sim, task, states, fixture_poses, exec_start, ours=is_ours(demo), asked=asked)
     try:
         restored = Demonstration(
             task=task,
-            seed=int(demo.extras.get("seed", NO_SEED)),
-            referent=str(demo.extras.get("referent", "fixed")),
-            variant=int(demo.extras.get("variant", 0)),
+            seed=extras.seed,
+            referent=extras.referent,
+            variant=extras.variant,
             states=states,
             actions=demo.actions,
             proprio=read_off.proprio,
@@ -76,27 +75,29 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
                 if written is not None
                 else _known_or_read_off(frames, read_off.satisfied)
             ),
-            success=bool(demo.extras.get("success", read_off.success or (bool(frames) and min(frames) >= 0))),
+            success=(
+                (read_off.success or (bool(frames) and min(frames) >= 0)) if extras.success is None else extras.success
+            ),
             fixture_poses=fixture_poses,
-            scene_hash=str(demo.extras.get("scene_hash", "")),
+            scene_hash=extras.scene_hash,
             stand_ins=sim.stand_ins,
             objects=read_off.objects,
         )
         found = digest(restored)
     except MemobenchError as error:
         raise Unusable(str(error)) from None
-    if demo.extras.get("digest", found) != found:
+    if extras.digest not in (None, found):
         raise Unusable("its states, actions or labels are not those that were written (the digest differs)")
     return restored
 
 
 def _placed(sim: Simulation, demo: PublishedDemo) -> tuple[States, dict[str, Pose]]:
     """Return states and poses of the fixtures in the simulation's scene."""
-    if not is_ours(demo) or "fixture_poses" not in demo.extras:
+    if not is_ours(demo) or demo.extras.fixture_poses is None:
         return place(sim, ModelFile(_model_text(demo)), demo.states)
     if demo.states.shape[1] != sim.state_dim:
         raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {sim.task.name}")
-    return demo.states, {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()}
+    return demo.states, {name: np.array(pose) for name, pose in demo.extras.fixture_poses.items()}
 
 
 def _model_text(demo: PublishedDemo) -> str:
@@ -107,7 +108,7 @@ def _model_text(demo: PublishedDemo) -> str:
 
 def is_ours(demo: PublishedDemo) -> bool:
     """Whether an earlier version of this package wrote a demonstration, with truth and success."""
-    return "success" in demo.extras
+    return demo.extras.success is not None
 
 
 def world_of(demo: PublishedDemo) -> World:
@@ -322,7 +323,7 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
         if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
             task = known
     task = task.in_world(world_of(demo))
-    return task.variant(int(demo.extras.get("variant", 0))) if ours is not None else task
+    return task.variant(demo.extras.variant) if ours is not None else task
 
 
 def _bddl_text(file: PublishedFile, name: str) -> str:
