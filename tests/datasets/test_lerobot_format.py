@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-import hashlib
 import json
 import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +21,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH
+from tests.support.kills import hashes
 
 SIZE = 64
 REPO = "local/test"
@@ -48,14 +47,6 @@ def dataset(demos, tmp_path_factory: pytest.TempPathFactory):
 
     root = write_dataset(demos, tmp_path_factory.mktemp("whole") / "ds", repo_id=REPO)
     return LeRobotDataset(REPO, root=root)
-
-
-def tree_hash(root: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 def test_every_frame_comes_back(dataset, demos):
@@ -284,8 +275,8 @@ def test_videos_and_data_are_split_at_lerobots_limits(demos, tmp_path, monkeypat
 
 
 def test_same_episodes_same_bytes(demos, tmp_path):
-    one = tree_hash(write_dataset(demos, tmp_path / "one"))
-    assert one == tree_hash(write_dataset(iter(demos), tmp_path / "two"))
+    one = hashes(write_dataset(demos, tmp_path / "one"))
+    assert one == hashes(write_dataset(iter(demos), tmp_path / "two"))
     manifest = json.loads((tmp_path / "one" / "manifest.json").read_text())
     assert [row["digest"] for row in manifest["episodes"]] == [digest(demo) for demo in demos]
     assert "world" not in manifest["episodes"][0], "which is the package's own"
@@ -332,10 +323,10 @@ def test_the_papers_world_comes_back_and_has_terms_of_its_own(demos, make_task, 
 
 
 def test_a_folder_in_use_is_left_alone(dataset, demos, tmp_path):
-    before = tree_hash(dataset.root)
+    before = hashes(dataset.root)
     with pytest.raises(MemobenchError, match="already holds a finished dataset"):
         write_dataset(demos, dataset.root)
-    assert tree_hash(dataset.root) == before
+    assert hashes(dataset.root) == before
     other = tmp_path / "other"
     other.mkdir()
     (other / "thesis.tex").write_text("precious")

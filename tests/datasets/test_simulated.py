@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -35,6 +34,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import NO_CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks.catalogue import get_task, task_names
+from tests.support.kills import hashes
 from tests.support.short_demonstrations import beginning, drawn_steps
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -54,8 +54,8 @@ def test_a_committed_run_is_whole(suite, solved):
     tasks = json.loads(FULL_RUNS[suite].read_text())["tasks"]
     assert set(tasks) == set(task_names(suite=suite))
     assert all(list(seeds) == [str(SEED + i) for i in range(50)] for seeds in tasks.values())
-    hashes = [entry for seeds in tasks.values() for entry in seeds.values() if re.fullmatch("[0-9a-f]{64}", entry)]
-    assert len(set(hashes)) == len(hashes) == solved
+    found = [entry for seeds in tasks.values() for entry in seeds.values() if re.fullmatch("[0-9a-f]{64}", entry)]
+    assert len(set(found)) == len(found) == solved
 
 
 @pytest.fixture(scope="module")
@@ -77,14 +77,6 @@ def begun(stove) -> Demonstration:
 def dataset_folder(begun, tmp_path_factory) -> Path:
     """What takes few steps to play again."""
     return write_dataset([begun, drawn_steps(BUTTER, SEED, 15, 5)], tmp_path_factory.mktemp("simulated") / "ds")
-
-
-def tree_hash(root: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 def test_a_recorded_demonstration(stove):
@@ -375,7 +367,7 @@ def test_two_workers_killed_and_resumed(tmp_path):
     summary = generate([task], 3, out, images=False, workers=1)
     assert summary.exit_status == 0
     generate([task], 3, tmp_path / "undisturbed", images=False, workers=1)
-    assert tree_hash(out) == tree_hash(tmp_path / "undisturbed")
+    assert hashes(out) == hashes(tmp_path / "undisturbed")
 
 
 RECORD = """
