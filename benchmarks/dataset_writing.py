@@ -37,7 +37,6 @@ from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, labels
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
-from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import (
     EPISODE_INFO,
@@ -47,9 +46,9 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     image_key,
 )
 from lerobot_memobench.datasets.recording import record_demonstration
-from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.published_files import write_published
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 WAYS = ("write", "convert", "generate")
@@ -72,9 +71,7 @@ def main() -> None:
         started = time.perf_counter()
         demos = [record_demonstration(task, DEMONSTRATION_SEED + i, images=True) for i in range(asked.episodes)]
         recording = time.perf_counter() - started
-        staged = [stage_demonstration(demo, folder / "staged" / f"{i}", ("hdf5",)) for i, demo in enumerate(demos)]
-        source = folder / "task.hdf5"
-        write_task_file(source, staged[0].hdf5_attributes or {}, [episode.hdf5 for episode in staged])
+        source = write_published(folder / "task.hdf5", demos)
 
         def loop_from_file(out: Path) -> None:
             with PublishedFile(source) as file:

@@ -15,8 +15,8 @@ from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of, read_json, write_file
-from lerobot_memobench.jobs.executors import run_jobs
 from lerobot_memobench.jobs.processes import Advance
+from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.protocol import SPLITS
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
@@ -112,7 +112,7 @@ class DetectorData:
             for name in self.names
             for seed in seeds
         ]
-        run_jobs(jobs, workers=self.workers, progress=progress, logs=folder / "logs")
+        run_jobs(jobs, workers=self.workers, progress=progress)
         return Pictures([job.folder for job in jobs])
 
 

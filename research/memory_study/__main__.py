@@ -15,8 +15,9 @@ from lerobot_memobench.cli.console import console, counting, say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.io import count_of, write_file
-from lerobot_memobench.jobs.executors import Needs, options_text, read_options, run_jobs
 from lerobot_memobench.jobs.processes import Advance, Job
+from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.slurm import Needs, Slurm, read_options
 from research.command import run
 from research.memory_study.cells import CELLS, Cell, Demonstrations, choose_rates, tuning
 from research.memory_study.figure import draw_all
@@ -53,8 +54,7 @@ def study(
     tune: Annotated[bool, typer.Option("--tune", help="Choose learning rates first, by short trainings.")] = False,
     browse: Annotated[bool, typer.Option("--html", help="Make reports for the browser, one per suite.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
-    executor: Annotated[str, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")] = "processes",
-    executor_option: Annotated[list[str] | None, typer.Option(help="key=value for datatrove's; repeatable.")] = None,
+    slurm: Annotated[str | None, typer.Option(help="Run on Slurm, with these options of sbatch.")] = None,
 ) -> None:
     """Train and evaluate every cell that is not done, then print and keep the tables and figures."""
     read = read_grid(grid)
@@ -89,15 +89,14 @@ def study(
     if plan:
         say(planned(data, tried, cells, workers))
         return
-    options = options_text(executor, read_options(executor_option or []), NEEDS)
-    how = {"executor": executor, "options": options, "logs": out / "logs"}
+    cluster = None if slurm is None else Slurm(read_options(slurm), NEEDS, out / "logs", jobs_per_member=1)
     for what, jobs, at_once in (("demonstrations", data, 1), ("tuning", tried, workers), ("cells", cells, workers)):
         with counting(console(), what, len(jobs)) as count:
 
             def advance(news: Advance, count=count) -> None:  # type: ignore[no-untyped-def]
                 count(news.done, news.total, f"{news.task_name}, seed {news.seed}", found=news.found)
 
-            done = run_jobs(jobs, workers=at_once, progress=advance, jobs_per_rank=1, **how)  # type: ignore[arg-type]
+            done = run_jobs(jobs, workers=at_once, progress=advance, slurm=cluster)
         if not done:
             say(f"{what} are submitted; give the command again when they are through")
             return

@@ -16,8 +16,8 @@ from annotated_types import Len, MaxLen
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Number, Whole, draft_of, file_name, read_json, write_file
-from lerobot_memobench.jobs.executors import run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
+from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.tasks.task import Task
 from research.necessity.demonstrations import follow
 from research.necessity.exploration import Laboratory, search
@@ -323,4 +323,4 @@ def make(studies: Sequence[Study], piece: Piece, workers: int, progress: Progres
     asked = [study for study in studies if piece == "scene" or study.searched]
     jobs = [PieceJob(study, piece, seed) for study in asked for seed in study.settings.seeds]
     if jobs:
-        run_jobs(jobs, workers=workers, progress=progress, logs=studies[0].out / "logs")
+        run_jobs(jobs, workers=workers, progress=progress)

@@ -1,6 +1,6 @@
 """Write files whole, keep names out of data inside their folder, read JSON into an expected shape.
 
-Nothing half-made is ever found, and a disk that has no room, or takes nothing, is told of in a sentence.
+No file is ever half written. An error of the disk, full or read-only, becomes one sentence.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, e
 _IN_WORDS = re.compile(
     "|".join(os.strerror(number) for number in (*FULL, errno.EACCES, errno.EROFS, errno.EIO)), re.IGNORECASE
 )
-"""Libraries in C put what the system said into messages of errors of their own."""
+"""Libraries in C put the system's message into errors of their own."""
 LONGEST_NAME = 255
 """Bytes of a file's name that common file systems take."""
 
 
 @contextlib.contextmanager
 def draft_of(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a place to write to beside ``path``; it takes that name once the block has ended without an error.
+    """Yield a temporary path in the folder of ``path``; it takes that name once the block has ended without an error.
 
     Readers see the earlier file or the whole new one, and processes that write the same file do not meet. The draft
     keeps the ending of ``path``, by which libraries choose a format.
@@ -72,7 +72,7 @@ def write_file(path: Path, content: str | bytes, *, durable: bool = False) -> Pa
 
 
 def remove_drafts(folder: Path) -> None:
-    """Remove what killed processes have left of `draft_of` in a folder that nobody else writes to."""
+    """Remove the drafts of killed processes from a folder to which no other process writes."""
     for draft in folder.glob(f".*-*{DRAFT}*"):
         draft.unlink(missing_ok=True)
 
@@ -81,7 +81,7 @@ def file_name(text: object, what: str) -> str:
     """Return a name that came out of data, if it names a file in a folder and nothing anywhere else.
 
     Args:
-        text: the name as it was read. what: what it is, for the message: ``the task's name in demo.hdf5``.
+        text: the name as it was read. what: its role, for the message: ``the task's name in demo.hdf5``.
 
     Raises:
         MemobenchError: it is no text, is empty, begins with a dot, or holds a separator or a control character.
@@ -106,10 +106,10 @@ def cache_folder() -> Path:
 
 
 def as_path(word: str) -> str:
-    """Return a word of a command line whose path, if it or its value is one, every library reads as a path.
+    """Return a word of a command line in which every library recognises a path.
 
-    What begins with ``~/`` leads to the home folder: not every shell expands it behind ``key=``, and none in quotes.
-    What is there and holds a colon becomes absolute: Arrow and FFmpeg read ``run: 2`` as an address.
+    ``~/`` at the beginning is expanded: not every shell does that behind ``key=``, and none in quotes.
+    An existing path with a colon becomes absolute: Arrow and FFmpeg read ``run: 2`` as an address.
     """
     key, equals, value = word.partition("=")
     path = value if equals else word
@@ -133,7 +133,7 @@ def _hash_of(path: str, *version: int) -> str:
 
 
 def disk_refusal(error: BaseException) -> str | None:
-    """Return what a disk answered to writing, as the system puts it, where that led to an error; None where not."""
+    """Return the system's message where an error came from writing to a disk, else None."""
     for current in chain(error):
         number = getattr(current, "errno", None)
         if number in (*FULL, *CLOSED):
@@ -146,10 +146,10 @@ def disk_refusal(error: BaseException) -> str | None:
 
 @contextlib.contextmanager
 def telling_of_the_disk(out: Path, kept: str = "") -> Iterator[None]:
-    """Turn what the disk answers to writing below ``out`` into one sentence.
+    """Turn an error of the disk in writing below ``out`` into one sentence.
 
     Args:
-        out: the folder that is written. kept: ends the sentence: what is there, and how to go on.
+        out: the folder that is written. kept: ends the sentence: finished work, and how to go on.
 
     Raises:
         MemobenchError: the disk is full, or takes nothing.
@@ -176,7 +176,7 @@ def _is_of(path: Path, out: Path) -> bool:
 
 
 def in_words(size: float) -> str:
-    """Return bytes as people say them: ``45.8 GiB``."""
+    """Return a number of bytes with its unit, such as ``45.8 GiB``."""
     number, units = float(size), ["B", "KiB", "MiB", "GiB", "TiB"]
     while number >= 1024 and len(units) > 1:
         number /= 1024
@@ -204,9 +204,9 @@ def _to_disk(path: Path) -> None:
 
 # -- reading JSON: whatever a file holds ends in a value of the expected shape, or in a sentence -----------------------
 #
-# What a file may hold is a type: a `TypedDict`, a list of them. It is held against what was read without turning one
-# type into another: "5" is no number, true is no 1. Keys that a type does not name are let pass, since a later version
-# may write more. pydantic is imported when the first file is read, which costs as much as the rest of a short command.
+# The schema of a file is a type: a pydantic model, a `TypedDict`, a list of them. No type is turned into another: "5"
+# is no number, true is no 1. Keys that a type does not name pass, since a later version may write more. pydantic is
+# imported when the first file is read, which costs as much as the rest of a short command.
 
 LARGEST = 2**53
 """Beyond it not every integer is a double, so neither a browser nor an array of numbers would hold it."""
@@ -220,7 +220,7 @@ LONGEST = 80
 """Characters of what was found that a message repeats."""
 
 LONGEST_REASON = 200
-"""Characters of what a library says that a message repeats."""
+"""Characters of a library's message that a message of ours repeats."""
 
 EXPECTED = {
     "string_type": "text",
@@ -241,7 +241,7 @@ EXPECTED = {
 
 
 class Malformed(MemobenchError):
-    """What was read is not of the expected shape; the message is the reason alone."""
+    """Content that is not of the expected shape; the message is the reason alone."""
 
 
 PACKED = ".gz"
@@ -279,7 +279,7 @@ def check_fetched(path: Path) -> None:
 
 
 def file_bytes(path: Path) -> bytes:
-    """Return what a file holds; where only the same file compressed by ``gzip`` is there, what that one holds.
+    """Return the content of a file, or of the same file compressed by ``gzip`` where only that exists.
 
     Raises:
         FileNotFoundError: there is neither. OSError: it cannot be read, is damaged, or becomes too large.
@@ -301,14 +301,14 @@ def file_bytes(path: Path) -> bytes:
 
 
 def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any:
-    """Return what a JSON file of ours holds, also where it is compressed (`file_bytes`).
+    """Return the content of a JSON file, which may be compressed (`file_bytes`).
 
     Args:
-        schema: the type that it must have. advice: ends the sentence: what to do.
+        schema: the type that it must have. advice: ends the message with the fix.
         nan: whether NaN and Infinity are numbers, as of a training that diverged.
 
     Raises:
-        FileNotFoundError: there is none, which is the caller's to judge.
+        FileNotFoundError: there is none.
         MemobenchError: it cannot be read or is not of the schema, named with the place in it.
     """
     try:
@@ -322,7 +322,7 @@ def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any
 
 
 def parsed(content: bytes | str, *, nan: bool = False) -> Any:
-    """Return the value that JSON text says; NaN (unless ``nan``), lone surrogates and bad UTF-8 are no JSON.
+    """Return the value of a JSON text; NaN (unless ``nan``), lone surrogates and bad UTF-8 are no JSON.
 
     Raises:
         Malformed: it is no JSON, or nested deeper than any file of ours.
@@ -337,30 +337,29 @@ def parsed(content: bytes | str, *, nan: bool = False) -> Any:
 
 
 def checked(value: Any, schema: Any) -> Any:
-    """Return ``value`` itself, if it is of the type ``schema``.
+    """Return ``value`` if it is of the type ``schema``: as the model where the schema is one, else itself.
 
     Raises:
-        Malformed: with the first place that is not: what was found there, and what was expected.
+        Malformed: with the first place that is not: its value, and the value that was expected.
     """
-    from pydantic import ValidationError
+    from pydantic import BaseModel, ValidationError
 
     try:
-        _adapter(schema).validate_python(value, strict=True)
+        found = _adapter(schema).validate_python(value, strict=True)
     except ValidationError as error:
         raise Malformed(first_fault(error.errors(include_url=False), value)) from None
-    return value
+    return found if isinstance(found, BaseModel) else value
 
 
 @contextlib.contextmanager
-def refusing(told: Callable[[str], MemobenchError], of: Path | None = None) -> Iterator[None]:
-    """Let nothing but a `MemobenchError` out of a block that does nothing but read what may be damaged.
+def refusing(as_error: Callable[[str], MemobenchError], of: Path | None = None) -> Iterator[None]:
+    """Turn every error of a block that reads possibly damaged files into a `MemobenchError`.
 
     LeRobot, pyarrow, PyAV, h5py and NumPy answer damaged files with errors of every type. To be kept around reading
     alone: an error in writing, such as a full disk, is not the file's.
 
     Args:
-        told: makes the error, from what was raised in at most a line. The file and what to do stand beside that: of
-            what a library says only the first characters are left.
+        as_error: makes the error from a library's message, shortened to one line. It adds the file and the fix.
         of: the file or folder that is read; a Git LFS pointer in its place is named before damage is (`check_fetched`).
     """
     try:
@@ -371,7 +370,7 @@ def refusing(told: Callable[[str], MemobenchError], of: Path | None = None) -> I
         if of is not None:
             with contextlib.suppress(OSError):
                 check_fetched(of)
-        raise told(f"{type(error).__name__}: {cut(' '.join(str(error).split()), LONGEST_REASON)}") from error
+        raise as_error(f"{type(error).__name__}: {cut(' '.join(str(error).split()), LONGEST_REASON)}") from error
 
 
 @cache
@@ -390,11 +389,11 @@ def first_fault(errors: Iterable[ErrorDetails], value: Any) -> str:
             str(e["loc"][-1]) for p, _, e in (first, *others) if e["type"] == "missing" and p == place
         )
         return f"found no {', '.join(missing)}" + (f" in {place}" if place else "")
-    told = f"found {f'{place} = ' if place else ''}{short(found)}"
+    start = f"found {f'{place} = ' if place else ''}{short(found)}"
     if error["type"] in ("value_error", "assertion_error"):  # a check of ours, in its own words
-        return f"{told}: {error['ctx']['error']}"
+        return f"{start}: {error['ctx']['error']}"
     alternatives = dict.fromkeys(_expected(e) for p, _, e in (first, *others) if p == place)
-    return f"{told}, expected {' or '.join(alternatives)}"
+    return f"{start}, expected {' or '.join(alternatives)}"
 
 
 def _place(location: Iterable[int | str], value: Any) -> tuple[str, Any]:
@@ -418,12 +417,12 @@ def _expected(error: ErrorDetails) -> str:
 
 
 def short(value: Any) -> str:
-    """Return what was found, as far as a sentence can hold it."""
+    """Return the representation of a value, shortened to fit into a sentence."""
     return cut(repr(value))
 
 
 def cut(text: str, longest: int = LONGEST) -> str:
-    """Return a text, as far as a sentence can hold it."""
+    """Return a text, shortened to fit into a sentence."""
     return text if len(text) <= longest else text[: longest - 1] + "…"
 
 

@@ -185,7 +185,7 @@ def test_generate_tells_what_became_of_every_seed(
     monkeypatch.setattr(generation, "generate", generate)
     out = tmp_path / "demos"
     words = ["generate", "--tasks", TASK, "--episodes", "2", "--out", str(out), "--no-images", "--referent", "random"]
-    words += ["--format", "lerobot", "--format", "hdf5", "--executor", "local", "--executor-option", "local_tasks=4"]
+    words += ["--slurm", "--partition=cpu --time=8:00:00"]
     assert main(words) == (0 if solved == 2 else 1)
     assert callable(asked.pop("tell"))
     assert asked == {
@@ -199,12 +199,9 @@ def test_generate_tells_what_became_of_every_seed(
         "image_size": 256,
         "demonstration_prompt": True,
         "perturb": False,
-        "policy": None,
         "workers": 1,
-        "formats": ("lerobot", "hdf5"),
         "finish": False,
-        "executor": "local",
-        "executor_options": {"local_tasks": 4},
+        "slurm": generation.slurm_of(out, ("--partition=cpu", "--time=8:00:00")),
     }
     printed = capsys.readouterr().out
     assert ("no dataset was written" in printed) == (solved == 0)

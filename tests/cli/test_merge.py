@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
-import dill
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -18,7 +16,10 @@ from lerobot_memobench.cli.evaluate import SHARD_PROGRAM
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.slurm import run_part
 from lerobot_memobench.run import shards
+from tests.support.sbatch import Sbatch
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"
@@ -186,61 +187,28 @@ def test_a_lost_part_is_run_again(here: Any) -> None:
     assert here.ran == [(STOVE, 2), (STOVE, 3)]
 
 
-def test_datatroves_local_executor_runs_parts(here: Any) -> None:
-    assert lerobot([*COMMAND, "output_dir=out", "shards=2", "workers=1", "executor=local"]) == 0
-    assert here.ran == [(task, k) for task in (STOVE, DRAWER) for k in range(4)]
-    assert len(read_episodes("out")) == 8
-
-
-SBATCH = """#!/bin/sh
-echo "$@" >> "$SBATCH_LOG"
-for word in "$@"; do script="$word"; done
-cat "$script" >> "$SBATCH_LOG"
-echo "Submitted batch job 4711"
-"""
-
-
 def test_slurm_gets_a_job_per_part_and_one_that_merges(
     here: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With a stand-in for sbatch: what it is given, and what the jobs then do when they run."""
-    log, tools = tmp_path / "sbatch.log", tmp_path / "bin"
-    tools.mkdir()
-    (tools / "sbatch").write_text(SBATCH)
-    (tools / "scontrol").write_text("#!/bin/sh\necho node1\n")
-    for tool in tools.iterdir():
-        tool.chmod(0o755)
-    monkeypatch.setenv("SLURM_NODELIST", "node1")
-    monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("SBATCH_LOG", str(log))
-    options = ["executor=slurm", "executor_option=partition=gpu", "executor_option=time=08:00:00"]
-    options += ["executor_option=account=lab", "executor_option=requeue=false"]
-    assert lerobot([*COMMAND, "output_dir=out", "shards=4", "workers=2", *options]) == 0
-    told = capsys.readouterr().out
-    assert "jobs are submitted" in told
-    assert "each job asks for 2 cores, 8 GB, no GPU, account=lab;" in told
+    sbatch = Sbatch(tmp_path / "bin", monkeypatch)
+    words = ["slurm=--partition=gpu --time=08:00:00 --account=lab --no-requeue", "workers=2"]
+    assert lerobot([*COMMAND, "output_dir=out", "shards=4", *words]) == 0
+    printed = capsys.readouterr().out
+    assert "jobs are submitted" in printed
+    assert "--cpus-per-task=2 --mem=8G --partition=gpu" in printed
     assert here.ran == []
-    script = log.read_text()
-    for line in (
-        "#SBATCH --partition=gpu",
-        "#SBATCH --array=0-3%2",
-        "--dependency=afterany:4711",  # a failed part does not leave it waiting
-        "#SBATCH --kill-on-invalid-dep=yes",
-        "#SBATCH --account=lab",
-        "#SBATCH --cpus-per-task=2",
-        "#SBATCH --mem-per-cpu=4G",
-    ):
-        assert line in script, line
-    assert "requeue" not in script
+    make, finish = sbatch.calls
+    assert {"--array=0-3%2", "--account=lab", "--no-requeue"} <= set(make)
+    assert "--dependency=afterany:4711" in finish  # a failed part does not leave it waiting
 
     def run(part: str, rank: int = 0) -> None:
         monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))
-        with open(tmp_path / "out" / "logs" / part / "executor.pik", "rb") as file:
-            dill.load(file).run()  # noqa: S301 - datatrove wrote it, in this test
+        run_part(part, tmp_path / "out" / "logs")
 
     for rank in (0, 1, 3):
         run("make", rank)
-    with pytest.raises(SystemExit, match=r"^memobench: 1 of 4 jobs .*shard-3-of-4.* resume=true"):
+    with pytest.raises(MemobenchError, match=r"^1 of 4 jobs .*shard-3-of-4.* resume=true"):
         run("finish")
     assert not Path("out/report.md").exists()
     run("make", 2)

@@ -194,8 +194,7 @@ def test_two_runs_in_one_folder(fake_loop: Any, capsys: pytest.CaptureFixture[st
         (["--config_path=x.yaml"], "x.yaml: there is no such file"),
         (["shard=3/2", "output_dir=out"], "i from 1 to n"),
         (["shards=9", "output_dir=out"], "more than the 4 batches"),
-        (["shards=2", "executor=slrm", "output_dir=out"], "slurm"),
-        (["shards=2", "executor=slurm", "output_dir=out"], "partition"),
+        (["shards=2", "slurm=gpu", "output_dir=out"], "--partition=gpu"),
     ],
 )
 def test_what_cannot_be_asked_for(

@@ -14,13 +14,12 @@ from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import generation
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.hdf5.archive import Archive
-from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from tests.support.kills import hashes, killed_at
+from tests.support.published_files import write_published
 from tests.support.short_demonstrations import drawn_steps, with_pictures
 
 DRAWER, BUTTER = "check_the_middle_drawer_of_the_cabinet", "put_the_butter_into_the_bowl_from_the_prompt_video"
@@ -33,8 +32,7 @@ def folder(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("archive")
     for task, place in ((DRAWER, "temporal"), (BUTTER, "object")):
         demo = with_pictures(drawn_steps(task, 10_000, FRAMES), 16)
-        staged = stage_demonstration(demo, root / "staged" / task, ("hdf5",))
-        write_task_file(root / "hdf5" / place / f"{task}_demo.hdf5", staged.hdf5_attributes, [staged.hdf5] * 2)
+        write_published(root / "hdf5" / place / f"{task}_demo.hdf5", [demo] * 2)
     (root / "hdf5" / "notes.h5").write_text("no HDF5")
     return root / "hdf5"
 

@@ -32,7 +32,8 @@ def test_texts(make_demo):
     found = labels(make_demo(["01000", "00100", "00010"]))
     assert found.simple_subgoal == ["did thing 0"] * 2 + ["did thing 1"] + ["did thing 2"] * 2
     assert found.grounded_subgoal[2] == "did thing 1 with the left hand"
-    assert found.coarse_subgoal == ["coarse 0"] * 2 + ["coarse 1"] + ["coarse 2"] * 2
+    assert found.operation.tolist() == [0, 0, 1, 2, -1], "none is left"
+    assert found.coarse_subgoal == ["coarse 0"] * 2 + ["coarse 1"] + ["coarse 2"] * 2, "the last one's stays"
     assert found.memory == [
         "",
         "",
@@ -42,15 +43,6 @@ def test_texts(make_demo):
     ]
 
 
-def test_after_the_last_checkpoint_its_text_stays(make_demo):
-    found = labels(make_demo(["01000", "00100"]))
-    assert found.operation.tolist() == [0, 0, 1, -1, -1]
-    assert found.index.tolist() == [0, 0, 1, 2, 2]
-    assert found.simple_subgoal[-1] == "did thing 1"
-    assert found.grounded_subgoal[-1] == "did thing 1 with the left hand"
-    assert found.coarse_subgoal[-1] == "coarse 1"
-
-
 def test_prompt_frames(make_demo):
     found = labels(make_demo(["000001", "000000"], exec_start=3))
     assert bits(found.phase) == "000111"
@@ -58,51 +50,6 @@ def test_prompt_frames(make_demo):
     assert not found.completed[:3].any()
     assert set(found.memory) == {""}
     assert found.key_frames.tolist() == [5, -1]  # frames of the episode, prompt included
-
-
-def test_event_on_the_last_frame(make_demo):
-    found = labels(make_demo(["0001"]))
-    assert bits(found.event) == "0001"
-    assert bits(found.index) == "0000"
-    assert found.key_frames.tolist() == [3]
-
-
-def test_several_completed_at_one_frame(make_demo):
-    found = labels(make_demo(["00100", "00100", "00001"]))
-    assert found.key_frames.tolist() == [2, 2, 4]
-    assert bits(found.index) == "00022"
-    assert bits(found.event) == "00101"
-    assert found.memory[3] == "did thing 0; did thing 1"
-
-
-def test_satisfied_too_early_counts_only_when_it_still_holds(make_demo):
-    # Checkpoint 1 held first, lost its truth, and never held again once checkpoint 0 was complete.
-    found = labels(make_demo(["000010", "011000"]))
-    assert found.key_frames.tolist() == [4, -1]
-    assert bits(found.completed[:, 1]) == "011111"
-    assert bits(found.event) == "010010"
-    assert bits(found.index) == "000001"
-    # It is still true when its turn comes: completed at that very frame.
-    found = labels(make_demo(["000010", "011111"]))
-    assert found.key_frames.tolist() == [4, 4]
-
-
-def test_nothing_later_is_completed_when_one_is_missing(make_demo):
-    found = labels(make_demo(["0100", "0000", "0011"]))
-    assert found.key_frames.tolist() == [1, -1, -1]
-    assert bits(found.index) == "0011"
-
-
-def test_repeated_satisfaction_is_one_event(make_demo):
-    found = labels(make_demo(["010101"]))
-    assert bits(found.event) == "010000"
-
-
-def test_true_from_the_first_frame(make_demo):
-    found = labels(make_demo(["111"]))
-    assert found.key_frames.tolist() == [0]
-    assert bits(found.index) == "011"
-    assert bits(found.event) == "100"
 
 
 def test_task_without_checkpoints(make_demo, make_task):

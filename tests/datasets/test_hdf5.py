@@ -1,19 +1,15 @@
-"""The published layout, written and read, without a simulator."""
+"""Reading the published layout, without a simulator."""
 
 from __future__ import annotations
-
-import json
-from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.demonstration import digest, labels
+from lerobot_memobench.datasets.demonstration import labels
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile, Unusable, find_files, truth_from_intervals
-from lerobot_memobench.datasets.hdf5.writing import data_attributes, write_task_file
-from lerobot_memobench.datasets.staging import EpisodeStage, stage_demonstration
 from lerobot_memobench.errors import MemobenchError
+from tests.support.published_files import write_published
 
 SIZE = 32
 ROWS = ["0010011", "0001111"]
@@ -21,67 +17,25 @@ ROWS = ["0010011", "0001111"]
 
 @pytest.fixture
 def demos(make_demo):
-    return [replace(make_demo(ROWS, seed=10_000 + k, size=SIZE), model_xml="<mujoco/>") for k in range(2)]
+    return [make_demo(ROWS, seed=10_000 + k, size=SIZE) for k in range(2)]
 
 
 @pytest.fixture
 def path(demos, tmp_path):
-    staged = [stage_demonstration(demo, tmp_path / f"{k}", ("hdf5",)) for k, demo in enumerate(demos)]
-    out = tmp_path / "hdf5" / "synthetic_task_demo.hdf5"
-    write_task_file(out, staged[0].hdf5_attributes, [episode.hdf5 for episode in staged])
-    return out
-
-
-def test_the_layout_as_published(path, demos):
-    with h5py.File(path) as file:
-        assert set(file) == {"data"}
-        data = file["data"]
-        assert set(data) == {"demo_0", "demo_1"}
-        assert data.attrs["bddl_file_name"] == "temporal/synthetic_task/task_config.bddl"
-        assert data.attrs["bddl_file_content"] == "synthetic_task"
-        assert json.loads(data.attrs["problem_info"])["language_instruction"] == "do the synthetic task"
-        assert json.loads(data.attrs["env_info"])["env_kwargs"]["control_freq"] == 20
-        for k, demo in enumerate(demos):
-            group = data[f"demo_{k}"]
-            assert set(group) == {"states", "actions", "obs"}
-            assert set(group["obs"]) == {"agentview_image", "robot0_eye_in_hand_image"}
-            assert group["states"].dtype == np.float64
-            np.testing.assert_array_equal(group["states"], demo.states)
-            np.testing.assert_array_equal(group["actions"], demo.actions)
-            np.testing.assert_array_equal(group["obs/agentview_image"], demo.images["image"])
-            np.testing.assert_array_equal(group["obs/robot0_eye_in_hand_image"], demo.images["wrist_image"])
-            assert group.attrs["num_samples"] == 7
-            assert group.attrs["model_file"] == "<mujoco/>"
-            metadata = json.loads(group.attrs["meta_data"])
-            assert metadata["key_frame"] == labels(demo).key_frames.tolist() == [2, 3]
-            assert metadata["timestep_exec_start_idx"] == 0
-            assert group.attrs["seed"] == demo.seed
-            assert group.attrs["digest"] == digest(demo)
-            intervals = json.loads(group.attrs["satisfied_intervals"])
-            assert intervals == [[[2, 3], [5, 7]], [[3, 7]]]
-            np.testing.assert_array_equal(truth_from_intervals(intervals, 7), demo.satisfied)
-
-
-def test_a_long_model_file_and_a_list_of_the_execution_start(make_demo, make_task, tmp_path):
-    task = replace(make_task("S"), metadata={"timestep_exec_start_idx": [-1], "own": "kept"})
-    demo = replace(make_demo(["000011"], task=task, exec_start=2, size=SIZE), model_xml="<a>" + "x" * 300_000 + "</a>")
-    staged = stage_demonstration(demo, tmp_path / "0", ("hdf5",))
-    write_task_file(tmp_path / "a.hdf5", data_attributes(task), [staged.hdf5])
-    with PublishedFile(tmp_path / "a.hdf5") as file:
-        read = file.read("demo_0")
-    assert len(read.model_file) > 300_000
-    assert read.metadata == {"timestep_exec_start_idx": [2], "key_frame": [4], "own": "kept"}
+    return write_published(tmp_path / "hdf5" / "synthetic_task_demo.hdf5", demos, scene="<mujoco/>")
 
 
 def test_reading_back(path, demos):
     with PublishedFile(path) as file:
-        assert file.groups() == ["demo_0", "demo_1"]
-        assert file.announced() == 2
+        assert (file.groups(), file.announced()) == (["demo_0", "demo_1"], 2)
         for group, demo in zip(file.groups(), demos, strict=True):
             read = file.read(group)
             np.testing.assert_array_equal(read.states, demo.states)
             np.testing.assert_array_equal(read.actions, demo.actions)
-            assert read.image_size == (SIZE, SIZE)
+            assert (read.image_size, read.model_file) == ((SIZE, SIZE), "<mujoco/>")
+            assert read.metadata["key_frame"] == labels(demo).key_frames.tolist() == [2, 3]
+            satisfied = truth_from_intervals(read.extras.satisfied_intervals, len(demo))
+            np.testing.assert_array_equal(satisfied, demo.satisfied)
             frames = list(file.images(group))
             for camera in demo.images:
                 np.testing.assert_array_equal([frame[camera] for frame in frames], demo.images[camera])
@@ -192,27 +146,3 @@ def test_finding_files(path, tmp_path):
     (tmp_path / "nothing").mkdir()
     with pytest.raises(MemobenchError, match="found no HDF5 file"):
         find_files(tmp_path / "nothing")
-
-
-def test_frames_streamed_give_the_bytes_of_frames_in_memory(demos, tmp_path):
-    whole = stage_demonstration(demos[0], tmp_path / "whole", ("lerobot", "hdf5"))
-    with EpisodeStage(tmp_path / "streamed", ("lerobot", "hdf5")) as stage:
-        for t in range(len(demos[0])):
-            stage.add_images({camera: frames[t] for camera, frames in demos[0].images.items()})
-        streamed = stage.publish(replace(demos[0], images=None))
-    assert streamed.record == whole.record
-    assert set(whole.record["files"]) == {"arrays.npz", "demonstration.hdf5", "image.mp4", "wrist_image.mp4"}
-
-
-def test_an_episode_that_is_not_published_leaves_nothing(demos, tmp_path):
-    images = {camera: frames[0] for camera, frames in demos[0].images.items()}
-    stage = EpisodeStage(tmp_path / "a" / "0", ("lerobot", "hdf5"))
-    with stage:
-        stage.add_images(images)
-        assert len(list((tmp_path / "a").iterdir())) == 1
-    assert list((tmp_path / "a").iterdir()) == []
-    with EpisodeStage(tmp_path / "a" / "0") as stage:
-        stage.add_images(images)
-        with pytest.raises(MemobenchError, match="1 images of a demonstration of 7 frames"):
-            stage.publish(replace(demos[0], images=None))
-    assert list((tmp_path / "a").iterdir()) == []

@@ -105,7 +105,7 @@ def test_deleted_episodes(ours, demos, tmp_path):
     edited = delete(ours, tmp_path / "edited", 0)
     said = check(edited, demos[1:], tmp_path / "out")
     assert len(said) == 1
-    assert "Lost are which seeds had failed, and the simulator's states" in said[0]
+    assert "Lost are the failed seeds, and the simulator's states" in said[0]
     card = (edited / "README.md").read_text()
     assert "2 demonstrations of 2 robot manipulation tasks" in card
     assert card.count(said[0]) == 1
@@ -197,7 +197,7 @@ def test_what_is_lost_is_said(ours, make_demo, tmp_path):
             place = table.column_names.index(EPISODE_INFO)
             table = table.set_column(place, table.schema.field(EPISODE_INFO), [[""] * len(table)])
         pq.write_table(table, path)
-    with pytest.raises(MemobenchError, match="has no episode of this benchmark: of each, it tells neither task nor"):
+    with pytest.raises(MemobenchError, match="has no episode of this benchmark: of each, it has neither task nor"):
         describe(stranger, tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert [verdict.disagreement for verdict in validate(stranger)] == [STRANGER]
@@ -205,7 +205,7 @@ def test_what_is_lost_is_said(ours, make_demo, tmp_path):
     merged = merge(tmp_path / "merged", stranger, delete(ours, tmp_path / "edited", 1, 2))
     said: list[str] = []
     describe(merged, tmp_path / "out", said.append)
-    assert said[0].startswith("1 of 2 episodes (0) are left out: of each, it tells neither task nor seed")
+    assert said[0].startswith("1 of 2 episodes (0) are left out: of each, it has neither task nor seed")
     assert [verdict.disagreement for verdict in validate(merged)] == [STRANGER, None]
     assert episodes_where(merged, task_name=STOVE) == [1]
 

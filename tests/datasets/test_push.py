@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.datasets.feature_cache.building import keep_from_the_hub
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.push import push
 from lerobot_memobench.errors import MemobenchError
@@ -109,7 +108,7 @@ def test_push_load_and_stream(hub, machine, folder, tmp_path):
     code = PUSH.format(folder=str(folder), repo=REPO)
     pushed = machine(code, tmp_path / "home")
     told, address = pushed.stdout.splitlines()
-    assert told == f"told: the feature caches in {folder} stay here: they are made anew where the dataset is trained on"
+    assert told == f"told: the feature caches in {folder} stay here; training makes them again elsewhere"
     assert address == f"{hub.address}/datasets/{REPO}", pushed.stderr
     there = hub.repos[REPO]
     ours = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
@@ -158,37 +157,11 @@ def test_an_earlier_larger_dataset_leaves_nothing(hub, machine, folder, make_dem
     hub.repos[REPO] |= {"feature_cache/old/tokens.bin": b"old", "hdf5/old_demo.hdf5": b"old", "notes.md": b"mine"}
     hub.requests.clear()
     pushed = machine(PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home")
-    assert (
-        "told: 4 files that this dataset does not have, such as data/chunk-000/file-001.parquet, are" in pushed.stdout
-    )
+    assert pushed.returncode == 0, pushed.stderr
     ours = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert set(hub.repos[REPO]) - {".gitattributes"} == ours | {"notes.md"}
     loaded = machine(COUNT.format(repo=REPO), tmp_path / "elsewhere", token=None)
     assert loaded.stdout.split() == ["2", "12", "12"], loaded.stderr
-    again = machine(PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home")
-    assert "told" not in again.stdout
-
-
-LEROBOTS_PUSH = """
-from huggingface_hub.repocard import RepoCard
-from lerobot.datasets import LeRobotDataset
-RepoCard.validate = lambda *_, **__: None  # it asks huggingface.co, whatever the endpoint is
-LeRobotDataset({repo!r}, root={folder!r}).push_to_hub()
-"""
-
-
-def test_lerobots_own_push_leaves_feature_caches_here(hub, machine, folder, tmp_path):
-    keep_from_the_hub(folder)
-    (folder / "feature_cache" / "tiny").mkdir(parents=True)
-    (folder / "feature_cache" / "tiny" / "tokens.bin").write_bytes(b"0" * 100)
-    pushed = machine(LEROBOTS_PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home")
-    assert pushed.returncode == 0, pushed.stderr
-    assert "meta/info.json" in hub.repos[REPO]
-    assert [name for name in hub.repos[REPO] if name.startswith("feature_cache")] == []
-    (folder / ".gitignore").write_text("mine\n")
-    keep_from_the_hub(folder)
-    keep_from_the_hub(folder)
-    assert (folder / ".gitignore").read_text() == "mine\n/feature_cache/\n"
 
 
 def test_the_card_on_the_hub_loads_from_there(hub, machine, folder, tmp_path):
@@ -200,27 +173,12 @@ def test_the_card_on_the_hub_loads_from_there(hub, machine, folder, tmp_path):
     assert 'LeRobotDataset("somebody/else")' in example
     ran = machine(example + "print(len(dataset), len(execution))", tmp_path / "elsewhere", token=None)
     assert ran.stdout.split() == ["12", "10"], ran.stderr
-    assert card.startswith("---\nlicense: apache-2.0\n")
+    assert "\nlicense: apache-2.0\n" in card
     for part in (
         "## Limitations",
         "name what only the prompt shows",
         "## Licence\n\nApache-2.0",
         "leaves out the frames",
-    ):
-        assert part in card, part
-
-
-def test_a_dataset_without_a_card_is_pushed_with_one(hub, machine, folder, tmp_path):
-    for lost in ("README.md", "manifest.json"):
-        (folder / lost).unlink()
-    shutil.rmtree(folder / "states")
-    assert machine(PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home").returncode == 0
-    card = hub.repos[REPO]["README.md"].decode()
-    for part in (
-        "2 demonstrations of 2 robot",
-        "has edited this dataset",
-        f'LeRobotDataset("{REPO}")',
-        "other_task | SU",
     ):
         assert part in card, part
 
@@ -239,11 +197,11 @@ def test_a_broken_off_upload_goes_on(hub, machine, folder, tmp_path):
     assert not any(request.startswith("PUT /lfs/") for request in hub.requests)
     assert "meta/info.json" in hub.repos[REPO]
 
-    del hub.repos[REPO]["manifest.json"]
+    for lost in ("README.md", "manifest.json"):  # it then gets a card of its frames
+        (folder / lost).unlink()
     assert machine(code, tmp_path / "home").returncode == 0
-    assert "manifest.json" in hub.repos[REPO]
-    assert machine(PUSH.format(folder=str(folder), repo="somebody/copy"), tmp_path / "home").returncode == 0
-    assert set(hub.repos["somebody/copy"]) == set(hub.repos[REPO])
+    assert "manifest.json" not in hub.repos[REPO]
+    assert "has edited this dataset" in hub.repos[REPO]["README.md"].decode()
 
 
 KILL = """
@@ -259,7 +217,7 @@ HfApi.{name} = killed
 
 @pytest.mark.parametrize(
     ("name", "after"),
-    [("create_repo", True), ("preupload_lfs_files", True), ("upload_folder", True), ("upload_file", True)],
+    [("create_repo", True), ("preupload_lfs_files", True), ("upload_file", False), ("upload_file", True)],
 )
 def test_a_killed_upload_goes_on(hub, machine, folder, tmp_path, name, after):
     code = PUSH.format(folder=str(folder), repo=REPO)

@@ -1,30 +1,20 @@
-"""Independent pieces of work: run, found finished again, told of once each."""
+"""Independent jobs: run here or on Slurm, found finished again, reported once each; and locks."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
-import dill
 import pytest
 from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import (
-    Datatrove,
-    Needs,
-    asked_for,
-    check_executor,
-    options_text,
-    read_options,
-    run_jobs,
-)
 from lerobot_memobench.jobs.processes import Advance, locked, taking_turns
+from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.slurm import Needs, Slurm, read_options, run_part
 from tests.support.note_job import Killed, Note
-
-needs_datatrove = pytest.mark.skipif(find_spec("datatrove") is None, reason="datatrove is not installed")
+from tests.support.sbatch import Sbatch
 
 
 @pytest.fixture
@@ -35,120 +25,101 @@ def jobs(tmp_path: Path) -> list[Note]:
     return made
 
 
-@pytest.mark.parametrize(
-    ("executor", "workers"),
-    [("processes", 1), ("processes", 2), pytest.param("local", 2, marks=needs_datatrove)],
-)
-def test_what_is_finished_is_not_run_again(jobs: list[Note], tmp_path: Path, executor: str, workers: int) -> None:
+@pytest.mark.parametrize("workers", [1, 2])
+def test_finished_jobs_are_reported_first_and_not_run_again(jobs: list[Note], workers: int) -> None:
     jobs[2].run()
     heard: list[Advance] = []
-    assert run_jobs(jobs, workers=workers, progress=heard.append, executor=executor, logs=tmp_path / "logs")
+    assert run_jobs(jobs, workers=workers, progress=heard.append)
     assert [job.runs for job in jobs] == [1, 1, 1, 1]
     assert [news.done for news in heard] == [1, 2, 3, 4]
-    assert heard[0].seed == 2  # found ones are told first
+    assert heard[0].seed == 2
     assert {news.seed: news.failure for news in heard} == {0: None, 1: "odd", 2: None, 3: "odd"}
     assert {(news.total, news.found) for news in heard} == {(4, 1)}
+    assert run_jobs(jobs, slurm=Slurm((), Needs(), Path("/nowhere"))), "nothing is submitted where all is finished"
 
 
-def test_nothing_is_begun_when_all_is_there(jobs: list[Note], tmp_path: Path) -> None:
-    for job in jobs:
-        job.run()
-    assert run_jobs(jobs, logs=tmp_path / "logs")
+def test_a_killed_worker_ends_in_a_sentence(jobs: list[Note]) -> None:
+    with pytest.raises(MemobenchError, match="worker processes was killed"):
+        run_jobs([jobs[0], Killed(jobs[1].folder, 1), *jobs[2:]], workers=2)
+
+
+# --- Slurm ---
+
+
+def test_slurm_runs_an_array_and_then_a_last_job(
+    jobs: list[Note], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sbatch = Sbatch(tmp_path / "bin", monkeypatch)
+    finished = tmp_path / "finished"
+    jobs[0].run()
+    slurm = Slurm(read_options("--partition=gpu --gres=gpu:1"), Needs(2, 9, gpus=1), tmp_path / "logs", 1)
+    assert not run_jobs(jobs, workers=2, slurm=slurm, finish=finished.touch)
+    make, finish = sbatch.calls
+    assert {"--array=0-2%2", "--cpus-per-task=2", "--mem=9G", "--partition=gpu", "--gres=gpu:1"} <= set(make)
+    assert not any(word.startswith("--gpus") for word in make), "the user's own words ask for GPUs"
+    assert {"--dependency=afterany:4711", "--partition=gpu"} <= set(finish)
+    assert "--gres=gpu:1" not in finish
+    for member in ("0", "2"):
+        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", member)
+        run_part("make", tmp_path / "logs")
+    assert [job.finished() for job in jobs] == [True, True, False, True]
+    with pytest.raises(MemobenchError, match=r"1 of 3 jobs ended without a result \(2\)"):
+        run_part("finish", tmp_path / "logs")
+    assert not finished.exists()
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "1")
+    run_part("make", tmp_path / "logs")
+    run_part("make", tmp_path / "logs")  # requeued
+    run_part("finish", tmp_path / "logs")
+    assert finished.exists()
     assert [job.runs for job in jobs] == [1, 1, 1, 1]
 
 
+def test_the_submitted_command_is_a_program(jobs: list[Note], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sbatch = Sbatch(tmp_path / "bin", monkeypatch)
+    run_jobs(jobs, slurm=Slurm(read_options("--partition=cpu"), Needs(), tmp_path / "a log's folder"))
+    ((*_, wrapped),) = sbatch.calls
+    command = wrapped.removeprefix("--wrap=")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "0")
+    subprocess.run(command, shell=True, check=True, cwd="/")
+    assert [job.runs for job in jobs] == [1, 1, 1, 1], "neighbours are one member's"
+
+
 @pytest.mark.parametrize(
-    ("executor", "options"),
+    ("options", "requested"),
     [
-        ("processes", {}),
-        pytest.param("local", {}, marks=needs_datatrove),
-        pytest.param(
-            "ray",
-            {"mem_per_cpu_gb": 1},
-            marks=[pytest.mark.slow, pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")],
-        ),
+        ("--time=1:00", {"--cpus-per-task=2", "--mem=8G", "--gpus-per-task=1"}),
+        ("--cpus-per-task=8", {"--cpus-per-task=8", "--mem=8G"}),
+        ("--mem-per-cpu=3G", {"--mem-per-cpu=3G"}),
+        ("--gpus=2", {"--gpus=2"}),
     ],
 )
-def test_a_killed_worker_ends_in_a_sentence(
-    executor: str, options: dict[str, int], jobs: list[Note], tmp_path: Path
-) -> None:
-    if executor == "ray":
-        import ray
-
-        ray.init(num_cpus=2, include_dashboard=False, logging_level="ERROR", object_store_memory=80_000_000)
-    try:
-        killed = [jobs[0], Killed(jobs[1].folder, 1), *jobs[2:]]
-        with pytest.raises(MemobenchError, match=r"worker processes was killed|1 of 4 jobs ended without a result"):
-            run_jobs(killed, workers=2, executor=executor, options=options, logs=tmp_path / "logs", jobs_per_rank=1)
-    finally:
-        if executor == "ray":
-            ray.shutdown()
+def test_a_job_requests_its_needs_unless_the_user_does(options: str, requested: set[str]) -> None:
+    found = Slurm(read_options(options), Needs(cores=2, memory_gb=8, gpus=1), Path("logs")).requested
+    assert requested <= set({word.partition("=")[0]: word for word in found}.values())  # the last of a name counts
+    assert sum(word.startswith("--mem") for word in found) == 1
+    assert sum(word.startswith(("--gpus", "--gres")) for word in found) == 1
 
 
-@needs_datatrove
-def test_a_datatrove_rank_takes_neighbours_and_can_be_pickled(jobs: list[Note]) -> None:
-    from lerobot_memobench.jobs.datatrove_steps import JobsStep
-
-    step = dill.loads(dill.dumps(JobsStep(jobs)))  # noqa: S301 - pickled in this line
-    list(step.run(rank=1, world_size=2))
-    assert [job.finished() for job in jobs] == [False, False, True, True]
+@pytest.mark.parametrize("text", ["", "partition=cpu", "--partition cpu", "-p cpu"])
+def test_options_that_sbatch_does_not_take(text: str) -> None:
+    with pytest.raises(MemobenchError, match="--partition=gpu"):
+        read_options(text)
 
 
-@needs_datatrove
-def test_words_for_sbatch_are_handed_on_and_false_is_false() -> None:
-    from datatrove.executor import SlurmPipelineExecutor
-
-    words = ["partition=gpu", "time=08:00:00", "account=lab", "gres=gpu:a100:1", "requeue=false", "srun_args.mpi=none"]
-    words += ["sbatch_args.exclusive=true", "sbatch_args.mail-type=END", "requeue_signals=SIGUSR1,SIGTERM", "nice=0"]
-    options = read_options(words)
-    check_executor("slurm", options)
-    told = options_text("slurm", options, Needs(cores=2, memory_gb=9, gpus=1))
-    making = Datatrove("slurm", 1, Path("logs"), 1, told).arguments
-    assert making["sbatch_args"] == {
-        "account": "lab",
-        "gres": "gpu:a100:1",
-        "exclusive": "",
-        "mail-type": "END",
-        "nice": "0",
-        "kill-on-invalid-dep": "yes",
-    }
-    assert making["srun_args"] == {"mpi": "none"}
-    assert making["requeue"] is False
-    assert making["requeue_signals"] == ("SIGUSR1", "SIGTERM")
-    asked = SlurmPipelineExecutor([], tasks=1, **making).get_sbatch_args()
-    assert (asked["cpus-per-task"], asked["mem-per-cpu"], asked["account"]) == (2, "5G", "lab")
-    assert "gpus" not in asked  # gres= asks for it
-    assert "requeue" not in asked
-    assert "2 cores, 10 GB, account=lab, gres=gpu:a100:1" in asked_for(told)
+def test_a_refusal_of_sbatch_is_a_sentence(jobs: list[Note], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slurm = Slurm(("--partition=none",), Needs(), tmp_path / "logs")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(MemobenchError, match="no sbatch"):
+        run_jobs(jobs, slurm=slurm)
+    Sbatch(tmp_path / "bin", monkeypatch, refuses="invalid partition")
+    with pytest.raises(MemobenchError, match=r"refused the jobs .*invalid partition"):
+        run_jobs(jobs, slurm=slurm)
 
 
-def test_a_job_on_slurm_asks_for_what_it_needs_unless_told_otherwise() -> None:
-    needs = Needs(cores=2, memory_gb=8, gpus=1)
-    assert options_text("slurm", {}, needs) == {"cpus_per_task": 2, "mem_per_cpu_gb": 4, "gpus_per_task": 1}
-    own = {"cpus_per_task": 8, "mem_per_cpu_gb": 3, "gpus_per_task": 0}
-    assert options_text("slurm", own, needs) == own
-    assert "8 cores, 24 GB, no GPU" in asked_for(own)
-    assert options_text("local", {}, needs) == {}
+# --- locks ---
 
 
-@needs_datatrove
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ("requeue=maybe", "found requeue=maybe for executor 'slurm'; expected true or false"),
-        ("cpus_per_task=many", "found cpus_per_task=many for executor 'slurm'; expected a whole number"),
-        ("gpus_per_task=true", "expected a whole number"),
-        ("acount=lab", "found option 'acount' for executor 'slurm', did you mean 'account'"),
-        ("env.x=1", "found option 'env.x'"),
-        ("sbatch_args=account", "found option 'sbatch_args'"),
-    ],
-)
-def test_options_that_slurm_does_not_take(option: str, message: str) -> None:
-    with pytest.raises(MemobenchError, match=message):
-        check_executor("slurm", read_options(["partition=gpu", "time=1:00", option]))
-
-
-def test_one_run_at_a_time_in_a_folder(tmp_path: Path) -> None:
+def test_one_run_at_a_time_in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with (
         locked(tmp_path, tmp_path),
         pytest.raises(MemobenchError, match="another run is writing to"),
@@ -157,25 +128,16 @@ def test_one_run_at_a_time_in_a_folder(tmp_path: Path) -> None:
         pass
     with locked(tmp_path, tmp_path):  # free again, and nothing is left behind
         assert list(tmp_path.iterdir()) == []
-
-
-def test_no_folder_is_held_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "win32")
     with pytest.raises(MemobenchError, match="WSL2"), locked(tmp_path, tmp_path):
         pass
 
 
-def test_one_after_another_at_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "cache.lock"
-    with taking_turns(path), path.open() as other:
-        assert not lock_descriptor(other.fileno(), blocking=False)
-    with path.open() as other:
-        assert lock_descriptor(other.fileno(), blocking=False)
-
-
 @pytest.mark.parametrize("hold", ["taking_turns(path)", "locked(path.parent, path.parent)"])
 def test_a_killed_process_lets_go(tmp_path: Path, hold: str) -> None:
     path = tmp_path / "cache.lock"
+    with taking_turns(path), path.open() as other:
+        assert not lock_descriptor(other.fileno(), blocking=False)
     code = f"""
 import pathlib, time
 from lerobot_memobench.jobs.processes import locked, taking_turns
@@ -191,15 +153,3 @@ with {hold}:
         holder.wait()
     with taking_turns(path), locked(tmp_path, tmp_path):
         pass
-
-
-def test_executor_options() -> None:
-    assert read_options(["partition=cpu", "mem_per_cpu_gb=4", "env_command=a=b"]) == {
-        "partition": "cpu",
-        "mem_per_cpu_gb": 4,
-        "env_command": "a=b",
-    }
-    told = read_options(["requeue=false", "with_srun=True", "condaenv=none", "qos="])
-    assert told == {"requeue": False, "with_srun": True, "condaenv": None, "qos": ""}
-    with pytest.raises(MemobenchError, match="expected key=value"):
-        read_options(["partition"])

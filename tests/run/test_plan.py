@@ -30,7 +30,7 @@ from lerobot_memobench.run.plan import (
     policy_config,
     take_run_options,
 )
-from lerobot_memobench.run.shards import executor_options, plan_shards
+from lerobot_memobench.run.shards import plan_shards, slurm_of
 from lerobot_memobench.sim import robot
 
 STOVE, DRAWER = "turn_on_the_stove_and_turn_it_off", "check_the_top_drawer_of_the_cabinet"
@@ -185,7 +185,7 @@ def test_the_device_is_decided_where_the_episodes_are_run(here: bool, monkeypatc
     """Not on the login node that hands the parts to Slurm; each part decides on its own machine."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: here)
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
-    slurm = ["shards=2", "executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
+    slurm = ["shards=2", "slurm=--partition=a"]
     for parts in (slurm, ["shards=2"]):
         (job, _) = plan_shards(plan_line([*LINE, "output_dir=out", *parts]), ("-m", "part"), print)
         assert not any("policy.device" in word for word in job.arguments)
@@ -204,20 +204,20 @@ def test_without_the_arm_nothing_begins(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize(
     ("parameters", "words", "needs"),
     [
-        (900_000, [], (2, 4, 0)),
-        (3_500_000_000, [], (2, 18, 1)),  # 14 GB of weights, twice, beside 8 GB
-        (900_000, ["device=cuda"], (2, 4, 1)),
-        (3_500_000_000, ["device=cpu"], (2, 18, 0)),
+        (900_000, [], (2, 8, 0)),
+        (3_500_000_000, [], (2, 36, 1)),  # 14 GB of weights, twice, beside 8 GB
+        (900_000, ["device=cuda"], (2, 8, 1)),
+        (3_500_000_000, ["device=cpu"], (2, 36, 0)),
     ],
 )
 def test_a_part_on_slurm_asks_for_what_its_policy_needs(
     parameters: int, words: list[str], needs: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lerobot_memobench.run.shards.parameters_of", lambda path: parameters)
-    slurm = ["executor=slurm", "executor_option=partition=a", "executor_option=time=1:00"]
     line = [*LINE[:3], "policy=memobench_small", "obs_type=environment_state_agent_pos", *words]
-    options = executor_options(plan_line([*line, "output_dir=out", "shards=2", *slurm]))
-    assert (options["cpus_per_task"], options["mem_per_cpu_gb"], options["gpus_per_task"]) == needs
+    slurm = slurm_of(plan_line([*line, "output_dir=out", "shards=2", "slurm=--partition=a"]))
+    assert slurm is not None
+    assert (slurm.needs.cores, slurm.needs.memory_gb, slurm.needs.gpus) == needs
 
 
 @pytest.mark.parametrize(
@@ -384,12 +384,10 @@ def test_run_options_are_taken_out_of_the_arguments() -> None:
     assert not run_options().any
 
 
-def test_executors_and_their_options() -> None:
-    taken = run_options(
-        "shards=8", "workers=2", "executor=slurm", "executor_option=partition=gpu", "executor_option=mem=4"
-    )
-    assert (taken.shards, taken.workers, taken.executor) == (8, 2, "slurm")
-    assert taken.executor_options == {"partition": "gpu", "mem": 4}
+def test_parts_run_here_or_on_slurm() -> None:
+    taken = run_options("shards=8", "workers=2", "slurm=--partition=gpu --mem=4G")
+    assert (taken.shards, taken.workers, taken.slurm) == (8, 2, ("--partition=gpu", "--mem=4G"))
+    assert run_options("shards=8").slurm is None
 
 
 @pytest.mark.parametrize(
@@ -403,7 +401,7 @@ def test_executors_and_their_options() -> None:
         ("shards=0", "from 1 on"),
         ("shards=many", "from 1 on"),
         ("resume=yes", "true or false"),
-        ("executor=slurm", "shards=8"),
+        ("slurm=--partition=gpu", "shards=8"),
         ("workers=3", "shards=8"),
     ],
 )

@@ -1,4 +1,4 @@
-"""A policy server for tests, written from the deployed ones and not from our client: openpi's websocket, REST.
+"""openpi's policy server for tests, written from the deployed ones and not from our client.
 
 The frames are packed here on their own, so that an error in the client's packing does not cancel out. Run as a script
 (``python policy_server.py PORT [question over which it dies]``) it is a server in a process of its own.
@@ -12,8 +12,6 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
-from email.parser import BytesParser
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import msgpack
@@ -105,61 +103,6 @@ class PolicyServer:
 
     def __exit__(self, *error: object) -> None:
         self.die()
-
-
-class RestServer:
-    """A REST server: POST bodies are parsed as their type says; ``answer`` gives state and text.
-
-    Attributes:
-        heard: (path, question) in the order of arrival; the parts of a form are bytes.
-    """
-
-    def __init__(self, answer: Callable[[dict[str, Any]], tuple[int, str]], *, port: int = 0) -> None:
-        server = self
-        self.heard: list[tuple[str, Any]] = []
-
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def do_GET(self) -> None:
-                self._reply(404, "{}")
-
-            def do_POST(self) -> None:
-                body = self.rfile.read(int(self.headers["Content-Length"]))
-                kind = self.headers["Content-Type"]
-                question = form(kind, body) if kind.startswith("multipart") else {"json": body.decode()}
-                server.heard.append((self.path, question))
-                self._reply(*answer(question))
-
-            def _reply(self, state: int, text: str) -> None:
-                self.send_response(state)
-                self.send_header("Content-Length", str(len(text.encode())))
-                self.end_headers()
-                self.wfile.write(text.encode())
-
-            def log_message(self, *words: Any) -> None:
-                pass
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
-        self._server.daemon_threads = True
-        self.port = self._server.server_address[1]
-        threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True).start()
-
-    def __enter__(self) -> RestServer:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-
-
-def form(kind: str, body: bytes) -> dict[str, bytes]:
-    """Return the parts of a multipart form."""
-    message = BytesParser().parsebytes(b"Content-Type: " + kind.encode() + b"\r\n\r\n" + body)
-    return {
-        str(part.get_param("name", header="content-disposition")): bytes(part.get_payload(decode=True) or b"")  # type: ignore[arg-type]
-        for part in message.get_payload()  # type: ignore[union-attr]
-    }
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import torch
 
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
-from tests.support.policy_server import PolicyServer, RestServer, robomme
+from tests.support.policy_server import PolicyServer, robomme
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 SIDE = 32
@@ -42,7 +42,7 @@ def batch(*steps: int | None, phase: int = 1, task: str = "do it") -> dict[str, 
     }
 
 
-def make(server: PolicyServer | RestServer | int, **settings: Any) -> RemotePolicy:
+def make(server: PolicyServer | int, **settings: Any) -> RemotePolicy:
     port = server if isinstance(server, int) else server.port
     policy = RemotePolicy(RemoteConfig(port=port, **{**PATIENT, **settings}))
     policy.reset()

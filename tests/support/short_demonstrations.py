@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.hdf5.writing import model_file
 from lerobot_memobench.datasets.replay import resimulate
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.rendering import RenderSettings
@@ -32,7 +31,7 @@ def beginning(demo: Demonstration, frames: int) -> Demonstration:
 
 
 def with_pictures(demo: Demonstration, size: int) -> Demonstration:
-    """Return it with what the cameras show, and the scene's model file."""
+    """Return it with the cameras' images."""
     sim = Simulation(demo.task, RenderSettings(size, size))
     sim.reset(demo.seed)
     images: dict[str, list[np.ndarray]] = {name: [] for name in CAMERAS}
@@ -40,5 +39,4 @@ def with_pictures(demo: Demonstration, size: int) -> Demonstration:
         sim.set_state(state, demo.fixture_poses)
         for name, camera in CAMERAS.items():
             images[name].append(sim.render(camera))
-    xml = model_file(demo.task, demo.fixture_poses)
-    return replace(demo, images={name: np.stack(frames) for name, frames in images.items()}, model_xml=xml)
+    return replace(demo, images={name: np.stack(frames) for name, frames in images.items()})

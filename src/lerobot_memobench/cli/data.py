@@ -11,10 +11,9 @@ import typer
 from rich.table import Table
 
 from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, WhichWorld, World, console, counting, say
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
-from lerobot_memobench.jobs.executors import asked_for, options_text, read_options
+from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
@@ -24,26 +23,10 @@ if TYPE_CHECKING:
 
 
 class Referent(StrEnum):
-    """What the goal of object and procedural tasks is."""
+    """Who chooses the goal of object and procedural tasks."""
 
     FIXED = "fixed"
     RANDOM = "random"
-
-
-class Format(StrEnum):
-    """What demonstrations are written as."""
-
-    LEROBOT = "lerobot"
-    HDF5 = "hdf5"
-
-
-class Executor(StrEnum):
-    """What runs the episodes."""
-
-    PROCESSES = "processes"
-    LOCAL = "local"
-    SLURM = "slurm"
-    RAY = "ray"
 
 
 def generate(
@@ -65,35 +48,24 @@ def generate(
     perturb: Annotated[
         bool, typer.Option("--perturb", help="Move the arm off its way at random; action is what the expert does then.")
     ] = False,
-    policy: Annotated[
-        str | None,
-        typer.Option(help="A checkpoint, or a policy of the package, that moves the arm now and then; as --perturb."),
-    ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
-    formats: Annotated[
-        list[Format] | None, typer.Option("--format", help="lerobot (default), hdf5, or both by naming both.")
-    ] = None,
     finish: Annotated[
         bool, typer.Option("--finish", help="Make the dataset of an unfinished run's episodes, and no other episode.")
     ] = False,
-    executor: Annotated[
-        Executor, typer.Option(help="processes here, or datatrove's: local, slurm, ray.")
-    ] = Executor.PROCESSES,
-    executor_option: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="key=value for datatrove's executor, e.g. partition=cpu, account=me, gres=gpu:1; repeatable."
-        ),
+    slurm: Annotated[
+        str | None,
+        typer.Option(help='Run on Slurm, with these options of sbatch: "--partition=cpu --time=8:00:00".'),
     ] = None,
 ) -> int:
     """Make a LeRobotDataset of expert demonstrations. The same command continues a killed run."""
-    options = read_options(executor_option or [])
+    options = None if slurm is None else read_options(slurm)
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name).in_world(world.value) for name in resolve_tasks(tasks, suite)]
-    from lerobot_memobench.datasets.generation import NEEDS, episodes_of
+    from lerobot_memobench.datasets.generation import episodes_of, slurm_of
     from lerobot_memobench.datasets.generation import generate as run
 
+    cluster = None if options is None else slurm_of(out, options)
     screen = console()
     total = sum(episodes_of(task, episodes, prompted_episodes) for task in chosen)
     with counting(screen, "episodes", total) as count:
@@ -113,37 +85,21 @@ def generate(
             image_size=image_size,
             demonstration_prompt=demonstration_prompt,
             perturb=perturb,
-            policy=_folder_of(policy),
             workers=workers,
-            formats=tuple(format_.value for format_ in formats or [Format.LEROBOT]),
-            executor=executor.value,
-            executor_options=options,
+            slurm=cluster,
             finish=finish,
             progress=advance,
             tell=partial(screen.print, soft_wrap=True),
             **named,
         )
     _print_summary(summary, out)
-    if summary.submitted:
-        say(asked_for(options_text(executor.value, options, NEEDS)))
+    if cluster is not None and summary.submitted:
+        say(cluster.summary)
     return summary.exit_status
 
 
-def _folder_of(policy: str | None) -> str | None:
-    """Return the folder of the policy that moves the arm."""
-    if policy is None:
-        return None
-    from lerobot_memobench.policies.checkpoint import check_checkpoint, local_folder
-
-    folder = local_folder(policy)
-    if folder is None:
-        raise MemobenchError(f"there is no checkpoint in {policy}; name a training run's folder, or memobench_small")
-    check_checkpoint(str(folder))
-    return str(folder.absolute())
-
-
 def _print_summary(summary: GenerationSummary, out: Path) -> None:
-    """Print what became of every seed, and where the dataset is."""
+    """Print the outcome of every seed and the place of the dataset."""
     console().print(Unbroken(_summary_table(summary)), crop=False)
     for failure in summary.failures:
         say(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
@@ -177,8 +133,9 @@ def convert(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
 ) -> int:
-    """Turn HDF5 demonstrations into a LeRobotDataset. What cannot be used is named. The same command continues a killed
-    run.
+    """Turn HDF5 demonstrations into a LeRobotDataset.
+
+    Those that cannot be used are named. The same command continues a killed run.
     """
     from lerobot_memobench.datasets.convert import convert as run
 
@@ -224,9 +181,7 @@ def cache(
     visual_encoder: Annotated[
         str | None, typer.Option(help="At size small, the encoder of pictures (policy.visual_encoder); the package's.")
     ] = None,
-    weights: Annotated[
-        str | None, typer.Option(help="Folder or repository whose image tower is used (size pi05).")
-    ] = None,
+    weights: Annotated[str | None, typer.Option(help="Folder or repository with the image tower (size pi05).")] = None,
     device: Annotated[str | None, typer.Option(help="cuda or cpu; the best there is by default.")] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Frames per pass of the image tower.")] = 64,
     out: Annotated[
@@ -271,7 +226,7 @@ def cache(
 
 
 def validate(
-    folder: Annotated[Path, typer.Argument(help="Folder of a dataset, of HDF5 files of this package, or of both.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     suite: OfSuite = None,
 ) -> int:
@@ -304,14 +259,13 @@ def push(
     folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
     repo_id: Annotated[str, typer.Option(help="Where to, user/name on the Hugging Face hub.")],
     private: Annotated[bool | None, typer.Option(help="Whether a repository that has to be made is private.")] = None,
-    hdf5: Annotated[bool, typer.Option("--hdf5", help="Upload the HDF5 files as well.")] = False,
 ) -> int:
     """Upload a dataset to the Hugging Face hub. The token is that of `hf auth login` or HF_TOKEN. The same command
     continues a broken upload. Files of an earlier dataset there are deleted.
     """
     from lerobot_memobench.datasets.push import push as run
 
-    say(f"dataset: {run(folder, repo_id, private=private, hdf5=hdf5, tell=say)}")
+    say(f"dataset: {run(folder, repo_id, private=private, tell=say)}")
     return 0
 
 

@@ -11,14 +11,13 @@ from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.report import table
 from lerobot_memobench.evaluation.report_tables import failure_line
 from lerobot_memobench.io import count_of
-from lerobot_memobench.jobs.executors import asked_for
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.run.arguments import Arguments, read_arguments
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.run.merging import merge_and_report
 from lerobot_memobench.run.plan import EvaluationPlan, is_benchmark, make_plan, take_run_options
 from lerobot_memobench.run.run import EvaluationReport, run_evaluation
-from lerobot_memobench.run.shards import executor_options, plan_shards, run_shards
+from lerobot_memobench.run.shards import plan_shards, run_shards, slurm_of
 
 if TYPE_CHECKING:
     from lerobot_memobench.jobs.processes import Advance
@@ -72,7 +71,8 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
     if report is not None:
         return print_merged(report)
     say(f"jobs are submitted; the last of them merges the parts in {plan.output.absolute()}")
-    say(asked_for(executor_options(plan)))
+    if (slurm := slurm_of(plan)) is not None:
+        say(slurm.summary)
     return 0
 
 

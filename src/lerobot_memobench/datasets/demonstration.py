@@ -54,15 +54,14 @@ class Demonstration:
         proprio: (T, 8) float32, end-effector position 3, axis-angle 3, gripper joints 2.
         images: ``{"image", "wrist_image"}`` to (T, H, W, 3) uint8, or None.
         exec_start: the frame at which execution starts; the frames before it are the demonstration prompt, and those
-            in which the robot idles, whose actions are zeros.
+            in which the robot idles and the actions are zeros.
         satisfied: (T, K) bool, predicate of checkpoint k true at frame t; false throughout the prompt. The
             world is evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
         success: whether the goal was reached.
         objects: (T, SIZE) float32, the visible objects (`sim.object_slots`).
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
-        model_xml: the scene as MJCF, or empty.
         scene_hash: hash of the initial scene, or empty.
-        stand_ins: classes of the scene whose scans were missing, so that others stood in for them.
+        stand_ins: classes of the scene with missing scans, for which others were used.
         executed: (T, 7) float32, the actions really applied where the arm was moved off its way; None: ``actions``.
 
     Raises:
@@ -82,7 +81,6 @@ class Demonstration:
     success: bool
     objects: NDArray[np.float32]
     fixture_poses: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    model_xml: str = ""
     scene_hash: str = ""
     stand_ins: tuple[str, ...] = ()
     executed: NDArray[np.float32] | None = None
@@ -207,7 +205,7 @@ def labels(demo: Demonstration) -> Labels:
     key_frames = _ordered_completion(demo.satisfied)
     index = np.searchsorted(key_frames[key_frames >= 0], np.arange(length), side="left").astype(np.int64)
     ever = np.logical_or.accumulate(demo.satisfied, axis=0)
-    # One entry per value of index, 0 ... K; the last stands for "none left". A code is a position in "SUC".
+    # One entry per value of index, 0 ... K; the last means "none left". A code is a position in "SUC".
     codes = [OPERATIONS.index(checkpoint.operation) for checkpoint in task.checkpoints] + [-1]
     texts = {level: _subgoals(task, number) for number, level in enumerate(LEVELS)}
     subtasks = subtask_texts(task)

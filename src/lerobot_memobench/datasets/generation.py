@@ -10,22 +10,18 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
-
-from lerobot_memobench.datasets.hdf5.reading import SUFFIX, PublishedFile, Unusable
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.card import SCRIPTED
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
-    HDF5_FOLDER,
+    STAGING,
     check_destination,
     check_whole,
     is_dataset,
@@ -34,37 +30,33 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
 from lerobot_memobench.datasets.staging import (
     FINISHED_EARLY,
-    FORMATS,
-    HDF5,
-    LEROBOT,
-    STAGING,
     compare_requests,
     episodes_folder,
     remove_staging,
     staged,
 )
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import file_hash, file_name, free_bytes, in_words, telling_of_the_disk
-from lerobot_memobench.jobs.executors import ELSEWHERE, Needs, check_executor, options_text, run_jobs
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import free_bytes, in_words, telling_of_the_disk
 from lerobot_memobench.jobs.processes import ProgressCallback
+from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
 from lerobot_memobench.sim.worlds import KINDS
 from lerobot_memobench.tasks.task import MEMOBENCH, Task, referent_text
 
-WEIGHTS = "model.safetensors"
 NEEDS = Needs(cores=1, memory_gb=4)
-"""Of one job on Slurm, which makes one episode after another."""
+"""Resources of one job on Slurm, which makes one episode after another."""
 FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
 }
 """Frames of a demonstration, prompt included, on average over the full runs (docs/research/demonstration_runs.md).
-Those in which a robot idles take next to no time and room."""
-FRAME_BYTES, PICTURES_BYTES, HDF5_BYTES = 800, 5_400, 130_000
-"""Of a frame in a LeRobotDataset without pictures; of both cameras' videos and of lossless pictures, at 256 × 256."""
+Frames in which a robot idles take next to no time and room."""
+FRAME_BYTES, PICTURES_BYTES = 800, 5_400
+"""Bytes of a frame without pictures, and of both cameras' videos per frame at 256 × 256."""
 FRAME_SECONDS, PICTURES_SECONDS = 0.0045, 0.011
-"""Of one core: to make a frame, and to draw and encode both cameras at 256 × 256."""
+"""Seconds of one core to make a frame, and to draw and encode both cameras at 256 × 256."""
 
 
 def generate(
@@ -79,11 +71,8 @@ def generate(
     image_size: int = IMAGE_SIZE,
     demonstration_prompt: bool = True,
     perturb: bool = False,
-    policy: str | None = None,
-    formats: Collection[str] = (LEROBOT,),
     workers: int = 1,
-    executor: str = "processes",
-    executor_options: Mapping[str, Any] | None = None,
+    slurm: Slurm | None = None,
     repo_id: str = DEFAULT_REPO_ID,
     finish: bool = False,
     progress: ProgressCallback | None = None,
@@ -97,17 +86,16 @@ def generate(
     Args:
         tasks: to demonstrate. episodes, prompted_episodes: of each, without and with a prompt. out: destination.
         seed_base: episode i has the scene of seed ``seed_base`` + i.
-        formats: ``lerobot``, a LeRobotDataset in ``out``; ``hdf5``, a file per task in the published layout in
-            ``out``/hdf5; or both.
-        workers: episodes made at a time. executor, executor_options: where (`jobs.executors`); the result is the same.
-            On Slurm the call returns when the jobs are submitted, the last of which writes the dataset.
+        workers: episodes made at a time.
+        slurm: make them on Slurm (`slurm_of`); the call returns when the jobs are submitted, and the last of them
+            writes the dataset.
         finish: make the dataset of an unfinished run's episodes, and no other episode.
         tell: called, before the first episode, with about how large the dataset will be and how long it will take.
-        referent, images, image_size, demonstration_prompt, perturb, policy: see `recording.RecordingSettings`.
+        referent, images, image_size, demonstration_prompt, perturb: see `recording.RecordingSettings`.
 
     Raises:
         MemobenchError: nothing to do, seeds of a guarded split, ``out`` holds something else or a damaged dataset,
-            another run is writing there, its disk has no room (what is finished stays), or an episode could not be run
+            another run is writing there, its disk has no room (finished episodes stay), or an episode could not be run
             at all (which no later run would change).
     """
     most = episodes if prompted_episodes is None else prompted_episodes
@@ -118,7 +106,6 @@ def generate(
         )
     most = max(episodes_of(task, episodes, prompted_episodes) for task in tasks)
     _check_seeds(range(seed_base, seed_base + most))
-    check_executor(executor, executor_options)
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
     if hiding is not None and not demonstration_prompt:
         raise MemobenchError(
@@ -126,29 +113,30 @@ def generate(
             "be found; leave out --no-demonstration-prompt"
         )
     referent = referent_text(referent, drawn=all(task.drawn for task in tasks))
-    if perturb and policy is not None:
-        raise MemobenchError("the arm is to be moved both at random and by a policy; leave out --perturb or --policy")
-    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb, policy)
-    formats = _checked_formats(formats, settings, tasks)
-    plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, formats, repo_id)
-    options = options_text(executor, executor_options or {}, NEEDS)
+    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb)
+    plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, repo_id)
     if finish:
         return _finish_early(plan, Path(out))
-    if executor not in ELSEWHERE:  # there, each part finds out
+    if slurm is None:  # there, each job checks its own machine
         KINDS[plan.world].check()
-    return _carry_out(plan, Path(out), workers, executor=executor, options=options, progress=progress, tell=tell)
+    return _carry_out(plan, Path(out), workers, slurm=slurm, progress=progress, tell=tell)
+
+
+def slurm_of(out: Path, options: tuple[str, ...]) -> Slurm:
+    """Return how `generate` submits to Slurm. Its logs outlive the run, so they have a folder next to the dataset."""
+    out = out.absolute()
+    return Slurm(options, NEEDS, out.with_name(f"{out.name}_slurm"))
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """Episodes and formats that a run is asked for, wherever and however they are made."""
+    """Episodes that a run is asked for, wherever they are made."""
 
     tasks: tuple[Task, ...]
     episodes: int
     prompted_episodes: int | None
     seed_base: int
     settings: RecordingSettings
-    formats: tuple[str, ...]
     repo_id: str
 
     def __post_init__(self) -> None:
@@ -168,14 +156,12 @@ class _Plan:
         """Settings that must agree for two runs to be one."""
         return {
             "tasks": [task.name for task in self.tasks],
-            "formats": list(self.formats),
             "episodes": self.episodes,
             "prompted_episodes": self.prompted_episodes,
             "seed_base": self.seed_base,
             **({} if self.world == MEMOBENCH else {"world": self.world}),
             "hold_frames": HOLD_FRAMES,
             **asdict(self.settings),
-            "policy": self.settings.policy and policy_text(self.settings.policy),
             "task_files": [task_hash(task) for task in self.tasks],
             "versions": _versions(),
         }
@@ -188,8 +174,6 @@ class _Plan:
         seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
         seeds += "" if self.world == MEMOBENCH else f", world {self.world}"
         moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""
-        if self.settings.policy is not None:
-            moved = f", the arm moved by the policy {policy_text(self.settings.policy)} for some steps at a time"
         return f"`memobench generate`, {seeds}, referent {self.settings.referent}{prompts}{moved}. {SCRIPTED}"
 
     def jobs(self, folder: Path) -> list[RecordingJob]:
@@ -200,7 +184,7 @@ class _Plan:
             for i in range(episodes_of(task, self.episodes, self.prompted_episodes))
         ]
         return [
-            RecordingJob(task, seed, self.settings, folder / f"{number:06d}", self.formats)
+            RecordingJob(task, seed, self.settings, folder / f"{number:06d}")
             for number, (task, seed) in enumerate(seeds)
         ]
 
@@ -213,28 +197,25 @@ def _carry_out(
     out: Path,
     workers: int = 1,
     *,
-    executor: str = "processes",
-    options: Mapping[str, Any] | None = None,
+    slurm: Slurm | None = None,
     progress: ProgressCallback | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> GenerationSummary:
     """Make what is missing, then the dataset; on Slurm that is done by a last job, which calls this again."""
-    if is_finished(out):
+    if is_dataset(out):
         return _finished(out, plan)
     check_destination(out)
     with (
-        telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
+        telling_of_the_disk(out, "finished episodes stay, and the same command goes on from there"),
         episodes_folder(out, plan.request) as folder,
     ):
         jobs = plan.jobs(folder)
-        _tell_of_the_run(plan, jobs, out, workers, tell)
+        _report_size(plan, jobs, out, workers, tell)
         complete = run_jobs(
             jobs,
             workers=workers,
             progress=progress,
-            executor=executor,
-            options=options,
-            logs=_logs(out, executor),
+            slurm=slurm,
             finish=partial(_carry_out, plan, out.absolute()),
         )
         if not complete:
@@ -246,7 +227,7 @@ def _finish_early(plan: _Plan, out: Path) -> GenerationSummary:
     """Make the dataset of the episodes that an unfinished run has left."""
     if is_dataset(out) or not (out / STAGING).is_dir():
         raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see what it made")
-    with telling_of_the_disk(out, "what is finished stays"), episodes_folder(out, plan.request) as folder:
+    with telling_of_the_disk(out, "finished episodes stay"), episodes_folder(out, plan.request) as folder:
         jobs = plan.jobs(folder)
         there = [job for job in jobs if job.finished()]
         made_by = f"{plan.made_by} The run was finished early: {len(there)} of {len(jobs)} seeds were run."
@@ -261,7 +242,7 @@ def _assembled(
     summary = summarise([{**episode.info, "failure": episode.failure} for episode in episodes], plan.tasks, out)
     if summary.folder is not None:
         manifest = {"request": request}
-        assemble(episodes, out, formats=plan.formats, repo_id=plan.repo_id, made_by=made_by, manifest=manifest)
+        assemble(episodes, out, repo_id=plan.repo_id, made_by=made_by, manifest=manifest)
         shutil.rmtree(out / STAGING)
     return summary
 
@@ -283,48 +264,8 @@ def _check_seeds(seeds: range) -> None:
             )
 
 
-def _checked_formats(formats: Collection[str], settings: RecordingSettings, tasks: Sequence[Task]) -> tuple[str, ...]:
-    """Return the formats in their order, each once."""
-    given = [formats] if isinstance(formats, str) else list(formats)
-    for name in given:
-        if name not in FORMATS:
-            raise MemobenchError(f"found format {name!r}, {nearest(name, FORMATS)}")
-    if not given:
-        raise MemobenchError(f"no format was asked for; name {' or '.join(FORMATS)}, or both")
-    if HDF5 in given and (settings.perturb or settings.policy is not None):
-        raise MemobenchError(
-            "format 'hdf5' was asked for with the arm moved off its way, but its layout has one action per frame, and "
-            "needs two: what is to be done and what was; write format lerobot alone"
-        )
-    if HDF5 in given and not settings.images:
-        raise MemobenchError("format 'hdf5' was asked for without images, which its layout holds; record them as well")
-    if HDF5 in given and any(task.world != MEMOBENCH for task in tasks):
-        raise MemobenchError(
-            f"format 'hdf5' was asked for with world={tasks[0].world}, but it holds scenes of world={MEMOBENCH} "
-            "alone; write format lerobot"
-        )
-    return tuple(name for name in FORMATS if name in given)
-
-
-def _logs(out: Path, executor: str) -> Path:
-    """Slurm's logs outlive the run, and its last job still writes to them when the staging folder is gone."""
-    out = out.absolute()
-    return out.with_name(f"{out.name}_slurm") if executor == "slurm" else out / STAGING / "logs"
-
-
-def is_finished(out: Path) -> bool:
-    """Whether ``out`` holds everything that a run had to make: its manifest comes last, or the dataset after it."""
-    if is_dataset(out):
-        return True
-    try:
-        formats = read_manifest(out).get("request", {}).get("formats")
-    except (FileNotFoundError, MemobenchError):
-        return False
-    return isinstance(formats, list) and LEROBOT not in formats and (out / HDF5_FOLDER).is_dir()
-
-
 def _finished(out: Path, plan: _Plan) -> GenerationSummary:
-    """Report a dataset that is finished already; remove what a kill in the last moment left beside it."""
+    """Report a dataset that is finished already; remove the staging folder that a kill in the last moment left."""
     try:
         manifest = read_manifest(out)
         earlier = manifest["request"]
@@ -335,37 +276,9 @@ def _finished(out: Path, plan: _Plan) -> GenerationSummary:
     request = {**plan.request, FINISHED_EARLY: False}
     earlier = {**earlier, "versions": request["versions"]}  # a finished dataset stays valid under newer versions
     compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
-    if LEROBOT in plan.formats:
-        check_whole(out)
-    if HDF5 in plan.formats:
-        _check_hdf5(out, Counter(row["task_name"] for row in manifest["episodes"] if row["failure"] is None))
+    check_whole(out)
     remove_staging(out)
     return summarise(manifest["episodes"], plan.tasks, out)
-
-
-def _check_hdf5(out: Path, made: Mapping[str, int]) -> None:
-    """Raise where a file has not as many demonstrations as were made of its task."""
-    for name, count in made.items():
-        path = out / HDF5_FOLDER / f"{file_name(name, 'a task in the manifest')}{SUFFIX}"
-        try:
-            with PublishedFile(path) as file:
-                there = len(file.groups())
-        except Unusable as error:
-            raise MemobenchError(f"{path}: {error}; delete {out} and generate again") from None
-        if there != count:
-            raise MemobenchError(
-                f"{path} has {there} demonstrations, the manifest {count}; delete {out} and generate again"
-            )
-
-
-def policy_text(checkpoint: str) -> str:
-    """Return a checkpoint's name, or its training run's, and the hash of its weights: another one is another run."""
-    weights = Path(checkpoint) / WEIGHTS
-    if not weights.is_file():
-        raise MemobenchError(f"{checkpoint} holds no {WEIGHTS}; name the folder of a policy's checkpoint")
-    parts = [part for part in Path(checkpoint).parts if part != PRETRAINED_MODEL_DIR]
-    name = parts[parts.index(CHECKPOINTS_DIR) - 1] if CHECKPOINTS_DIR in parts[1:] else parts[-1]
-    return f"{name} {file_hash(weights)[:16]}"
 
 
 def task_hash(task: Task) -> str:
@@ -388,38 +301,37 @@ def _versions() -> dict[str, str]:
 # --- size and time ---
 
 
-def run_size(frames: int, formats: Collection[str], image_size: int | None) -> int:
+def run_size(frames: int, image_size: int | None) -> int:
     """Return about how many bytes so many frames take; ``image_size`` is None without pictures."""
     area = 0.0 if image_size is None else (image_size / IMAGE_SIZE) ** 2
-    lerobot = (FRAME_BYTES + PICTURES_BYTES * area) * (LEROBOT in formats)
-    return round(frames * (lerobot + HDF5_BYTES * area * (HDF5 in formats)))
+    return round(frames * (FRAME_BYTES + PICTURES_BYTES * area))
 
 
 def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], what: str, work: int = 0) -> None:
-    """Tell what a run will take of the disk, and refuse one that cannot fit.
+    """Report how much of the disk a run will take, and refuse one that cannot fit.
 
-    Finished episodes stand beside the dataset that is made of them until it is whole, so at its end a run needs twice
-    its size.
+    Finished episodes are kept until the dataset that is made of them is whole, so at its end a run needs twice its
+    size.
 
     Args:
         out: its destination. size: of the dataset, about. there: bytes of it that are staged already.
-        what: begins the sentence: how much will be made. work: further bytes that are needed meanwhile.
+        what: begins the sentence with the amount of work. work: further bytes that are needed meanwhile.
 
     Raises:
         MemobenchError: not even one copy has room.
     """
     free, most = free_bytes(out), max(2 * size - there, 0) + work
-    told = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
+    sizes = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
     if free < size - there + work:
-        raise MemobenchError(f"{what} would take {told}: make room, name a folder on another disk, or ask for less")
+        raise MemobenchError(f"{what} would take {sizes}: make room, name a folder on another disk, or ask for less")
     warning = "; THAT MAY NOT BE ENOUGH: a full disk ends the run, and the same command then goes on" * (free < most)
-    tell(f"{what}: {told}{warning}")
+    tell(f"{what}: {sizes}{warning}")
 
 
-def _tell_of_the_run(
+def _report_size(
     plan: _Plan, jobs: Sequence[RecordingJob], out: Path, workers: int, tell: Callable[[str], None]
 ) -> None:
-    """Tell size and time of what is to be made, before it is."""
+    """Report size and time of the missing episodes before they are made."""
     missing = [job for job in jobs if not job.folder.exists()]
     if not missing:
         return
@@ -430,9 +342,9 @@ def _tell_of_the_run(
     seconds = left * (FRAME_SECONDS + PICTURES_SECONDS * ((pictures or 0) / IMAGE_SIZE) ** 2)
     minutes = seconds / 60 / max(min(workers, cores()), 1)
     time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
-    size = run_size(frames, plan.formats, pictures)
+    size = run_size(frames, pictures)
     what = f"{len(missing)} demonstrations of some {left:,} frames, in about {time} with {workers} at a time"
-    check_room(out, size, size - run_size(left, plan.formats, pictures), tell, what)
+    check_room(out, size, size - run_size(left, pictures), tell, what)
 
 
 # --- the outcome ---

@@ -38,8 +38,8 @@ DROP_CHANCE = 0.05
 DROP_AFTER, DROP_STEPS = (15, 50), 8
 """That begins at least the first, and less than the second, number of steps after they began to close, and lasts."""
 LATE_CHANCE, LATE_STEPS = 0.2, (3, 16)
-"""Probability that fingers stay shut, told to open: for at least the first, and less than the second, number
-of steps. A policy without such frames stands for ever where it should have let go."""
+"""Probability that fingers stay shut when they should open: for at least the first, and less than the second, number
+of steps. A policy without such frames waits for ever where it should have let go."""
 COMING_TO_REST = 0.4
 """Largest component of a displacement, at home's detent, by which an expert means to stay there (2 cm)."""
 
@@ -54,9 +54,9 @@ class Perturbation:
         self._clean = rng.random() < CLEAN
         self._left = 0
         self._push: Array = np.zeros(6)
-        self._closed = 0  # steps for which the fingers have been told to close
+        self._closed = 0  # steps since the command to close the fingers
         self._open = range(0)  # the steps, counted so, in which they are open all the same
-        self._late = 0  # steps for which they stay shut, told to open
+        self._late = 0  # steps for which they stay shut although they should open
 
     def executed(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
         """Return the action (7,) to execute in place of the expert's. Call once per step.

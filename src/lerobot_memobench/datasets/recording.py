@@ -1,4 +1,4 @@
-"""One demonstration: the scripted expert carries out a task from a seed, and what happens is kept."""
+"""One demonstration: the scripted expert carries out a task from a seed, and everything is recorded."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.dagger import Learner
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.hdf5.writing import model_file
 from lerobot_memobench.datasets.perturbation import Perturbation
-from lerobot_memobench.datasets.staging import HDF5, LEROBOT, EpisodeStage, StagedJob, stage_failure
+from lerobot_memobench.datasets.staging import EpisodeStage, StagedJob, stage_failure
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, IMAGE_SIZE
@@ -37,14 +35,13 @@ Images = dict[str, NDArray[np.uint8]]
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """Settings of a demonstration beside task and seed.
+    """Settings of a demonstration besides task and seed.
 
     Attributes:
         referent: ``"fixed"``, the task's own goal, or ``"random"``, the seed's; of a strict task ``"drawn"``.
         images: whether the cameras are recorded. image_size: their height and width, pixels.
         demonstration_prompt: whether the episode begins with the prompt, where the task has one.
         perturb: move the arm off its way at random (`datasets.perturbation`).
-        policy: folder of a checkpoint that moves the arm in turn with the expert (`datasets.dagger`).
     """
 
     referent: str = "fixed"
@@ -52,7 +49,6 @@ class RecordingSettings:
     image_size: int = IMAGE_SIZE
     demonstration_prompt: bool = True
     perturb: bool = False
-    policy: str | None = None
 
 
 def record_demonstration(task: Task, seed: int, *, variant: int = 0, **settings: Any) -> Demonstration:
@@ -96,7 +92,7 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
     episode.reset(seed)
     sim, fixture_poses = episode.sim, episode.sim.fixture_poses()
     states, proprio, objects, satisfied, actions, executed = [], [], [], [], [], []
-    disturb = _disturbance(episode, seed, settings)
+    disturb = Perturbation(generator(episode.published, seed, PERTURBATION)) if settings.perturb else None
     reached = rests = False
     held = idle = 0
     images: Images | None = None
@@ -109,8 +105,6 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
         proprio.append(hand)
         objects.append(seen)
         satisfied.append(episode.progress.satisfied)
-        if isinstance(disturb, Learner):
-            disturb.observe(episode, objects[-1], images)
         if images is not None:
             show(images)
         reached = reached or episode.success
@@ -147,14 +141,6 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
     )
 
 
-def _disturbance(episode: Episode, seed: int, settings: RecordingSettings) -> Perturbation | Learner | None:
-    """Return the disturbance or the learner that moves the arm off the expert's way, if any."""
-    rng = generator(episode.published, seed, PERTURBATION)
-    if settings.policy is not None:
-        return Learner(settings.policy, rng)
-    return Perturbation(rng) if settings.perturb else None
-
-
 def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
     if episode.fault is not None:
         return episode.fault.why
@@ -177,7 +163,6 @@ class RecordingJob(StagedJob):
     seed: int
     settings: RecordingSettings
     folder: Path
-    formats: tuple[str, ...] = (LEROBOT,)
 
     @property
     def task_name(self) -> str:
@@ -189,12 +174,10 @@ class RecordingJob(StagedJob):
         where = f"{self.task.name}, seed {self.seed}"
         try:
             episode = compiled_episode(self.task, self.settings)
-            with EpisodeStage(self.folder, self.formats) as stage:
+            with EpisodeStage(self.folder) as stage:
                 demo = record(episode, self.seed, self.settings, stage.add_images)
                 reason = _failure_reason(demo, episode)
                 if reason is None:
-                    if HDF5 in self.formats:
-                        demo = replace(demo, model_xml=model_file(self.task, demo.fixture_poses))
                     stage.publish(demo)
                     return
         except MemobenchError as error:
@@ -206,7 +189,7 @@ class RecordingJob(StagedJob):
 
 
 def _failed_info(demo: Demonstration) -> dict[str, Any]:
-    """What is kept of a seed without a demonstration."""
+    """Return the fields that are kept of a seed without a demonstration."""
     return {
         "task_name": demo.task.name,
         "memory_type": demo.task.memory_type,

@@ -60,10 +60,9 @@ def replay(
     """Play an episode again and return the first disagreement, or None.
 
     Compared are states (where recorded), proprioception, visible objects, instruction, numbering and every label
-    column, language rows, success, key frames, the scene's hash and the episode's: it is of the states too, and so
-    stands for them where LeRobot's dataset tools have left them behind. ``task`` replaces the catalogue's task of that
-    name, for datasets of tasks of one's own. ``pictures`` returns what was recorded of the cameras, of which some
-    frames are compared.
+    column, language rows, success, key frames, the scene's hash and the episode's: it covers the
+    states, which LeRobot's dataset tools leave behind. ``task`` replaces the catalogue's task of that
+    name, for datasets of tasks of one's own. ``pictures`` returns recorded pictures, to compare some frames.
 
     Raises:
         MemobenchError: no such task, the actions are gone, or there are pictures and nothing to draw them with.
@@ -116,9 +115,9 @@ class _PictureCheck:
             return
         for camera, frames in self._recorded.items():
             drawn, recorded = sim.render(CAMERAS[camera]), frames[self._frames.index(frame)]
-            told = _unlike(drawn, recorded)
-            if told:
-                self.difference = Disagreement(image_key(camera), frame, told, "what the simulator draws")
+            difference = _unlike(drawn, recorded)
+            if difference:
+                self.difference = Disagreement(image_key(camera), frame, difference, "what the simulator draws")
                 return
 
 

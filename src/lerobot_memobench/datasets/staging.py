@@ -9,7 +9,6 @@ episode's file names and bytes depend on the episode alone, never on the worker 
     <staging>/episodes/000012/episode.json        identity, digest, statistics, hash of each file
                               arrays.npz          states, actions, proprio, label columns (no pickle)
                               image.mp4, wrist_image.mp4
-                              demonstration.hdf5  in the published layout, when that was asked for
 
 Frames go to the encoder while the episode is being made, so a worker's memory does not grow with its length.
 """
@@ -22,23 +21,24 @@ import os
 import re
 import shutil
 import socket
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, NotRequired, TypedDict
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Len
 from numpy.typing import NDArray
+from pydantic import BaseModel, model_validator
 
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, digest, labels, persistent_rows
-from lerobot_memobench.datasets.hdf5.writing import EpisodeFile, data_attributes
+from lerobot_memobench.datasets.lerobot_format.layout import STAGING
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
-    Malformed,
     Number,
     Whole,
     checked,
@@ -53,60 +53,25 @@ from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.tasks.task import MEMOBENCH
 
-STAGING = ".staging"
-"""Folder of a run within its destination."""
 TEMPORARY = ".tmp-"
 REQUEST_FILE = "request.json"
 FINISHED_EARLY = "finished_early"
 """Key of a dataset's request: whether episodes of it were left out."""
+UNASKED: dict[str, Any] = {
+    "formats": ["lerobot"],
+    "policy": None,
+    "perturb": False,
+    "prompted_episodes": None,
+    FINISHED_EARLY: False,
+    "world": MEMOBENCH,
+}
+"""Values of the keys that requests of earlier or later versions may lack."""
 RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
-HDF5_FILE = "demonstration.hdf5"
-LEROBOT, HDF5 = "lerobot", "hdf5"
-FORMATS = (LEROBOT, HDF5)
-"""Of a run's episodes."""
 ADVICE = "it is damaged; delete the folder that it is in and run the command again"
 
 
 # --- a finished episode ---
-
-
-class Info(TypedDict):
-    """Fields of an episode for meta/episodes, manifest and card (see ``episode_info``)."""
-
-    task_name: str
-    memory_type: str
-    family: str
-    language: str
-    operations: str
-    seed: Whole
-    referent: str
-    variant: Count
-    success: bool
-    frames: Count
-    exec_start_index: Count
-    key_frames: list[Whole]
-    scene_hash: str
-    world: NotRequired[str]
-    stand_ins: NotRequired[list[str]]
-    fixture_poses: dict[str, list[Number]]
-    digest: str
-
-
-class Identity(TypedDict):
-    """Fields of an episode that could not be made."""
-
-    task_name: str
-    seed: Whole
-
-
-class Row(TypedDict, total=False):
-    """One of LeRobot's persistent language rows; `persistent_rows` writes them."""
-
-    role: str
-    content: str | None
-    style: str | None
-    timestamp: Number
 
 
 Frames = Annotated[list[Count], Len(1, 1)]
@@ -115,15 +80,50 @@ Pixels = Annotated[list[Annotated[list[Annotated[list[Number], Len(1, 1)]], Len(
 """A statistic of a camera's channels, (3, 1, 1)."""
 
 
-class Record(TypedDict):
-    """``episode.json``."""
+class Identity(BaseModel):
+    """Fields of an episode that could not be made."""
+
+    task_name: str
+    seed: Whole
+
+
+class Info(EpisodeRecord):
+    """Fields of an episode for meta/episodes, manifest and card (see ``episode_info``)."""
+
+    language: str
+    frames: Count
+
+
+class Row(BaseModel, extra="allow"):
+    """One of LeRobot's persistent language rows; `persistent_rows` writes them."""
+
+    role: str | None = None
+    content: str | None = None
+    style: str | None = None
+    timestamp: Number | None = None
+
+
+class Record(BaseModel):
+    """``episode.json``.
+
+    Attributes:
+        failure: why there is no demonstration of this seed, or None.
+        info: of `Info`, or where it failed of `Identity`, and maybe more.
+        language_persistent: LeRobot's persistent language rows (see ``persistent_rows``).
+        image_stats: camera to the statistics of its pixels (see ``ImageHistograms``).
+        files: name to sha256 of the other files.
+    """
 
     failure: str | None
-    info: Identity
+    info: dict[str, Any]
     language_persistent: list[Row]
     image_stats: dict[str, dict[str, Pixels | Frames]]
     files: dict[str, str]
-    hdf5: NotRequired[dict[str, Any] | None]
+
+    @model_validator(mode="after")
+    def _check_info(self) -> Record:
+        checked(self.info, Info if self.failure is None else Identity)
+        return self
 
 
 @dataclass(frozen=True)
@@ -131,42 +131,27 @@ class StagedEpisode:
     """A finished episode's folder; ``record`` is its episode.json, the rest is read when asked for."""
 
     folder: Path
-    record: dict[str, Any]
+    record: Record
 
     @property
     def failure(self) -> str | None:
         """Why there is no demonstration of this seed, or None."""
-        return self.record["failure"]
+        return self.record.failure
 
     @property
     def info(self) -> dict[str, Any]:
         """Identity and per-episode metadata (see ``episode_info``)."""
-        return self.record["info"]
+        return self.record.info
 
     @property
     def language_rows(self) -> list[LanguageRow]:
         """LeRobot's persistent language rows (see ``persistent_rows``)."""
-        return self.record["language_persistent"]
+        return [row.model_dump(exclude_unset=True) for row in self.record.language_persistent]
 
     @property
     def has_images(self) -> bool:
         """Whether its cameras were recorded."""
-        return bool(self.record["image_stats"])
-
-    @property
-    def hdf5(self) -> Path:
-        """The demonstration in the published layout, alone at the root of a file of its own."""
-        return self.folder / HDF5_FILE
-
-    @property
-    def hdf5_attributes(self) -> dict[str, Any] | None:
-        """Attributes of its task's HDF5 file; None where HDF5 was not asked for."""
-        return self.record.get("hdf5")
-
-    @property
-    def video_bytes(self) -> int:
-        """Size of its videos."""
-        return sum(self.video(camera).stat().st_size for camera in self.record["image_stats"])
+        return bool(self.record.image_stats)
 
     def video(self, camera: str) -> Path:
         """Return the file of a camera's video."""
@@ -174,7 +159,7 @@ class StagedEpisode:
 
     def image_stats(self, camera: str) -> Stats:
         """Return the statistics of a camera's pixels (see ``ImageHistograms``)."""
-        return {name: np.array(value) for name, value in self.record["image_stats"][camera].items()}
+        return {name: np.array(value) for name, value in self.record.image_stats[camera].items()}
 
     def arrays(self) -> dict[str, NDArray]:
         """Read states, actions, proprio and label columns; text columns are arrays of str."""
@@ -182,29 +167,23 @@ class StagedEpisode:
             return dict(data)
 
     def check(self) -> None:
-        """Raise a MemobenchError that names the first file whose bytes are not those that were written."""
-        for name, expected in self.record["files"].items():
+        """Raise a MemobenchError that names the first file with other bytes than those that were written."""
+        for name, expected in self.record.files.items():
             path = self.folder / file_name(name, f"a file that {self.folder / RECORD_FILE} names")
             found = file_hash(path) if path.is_file() else "missing"
             if found != expected:
                 raise MemobenchError(
                     f"{path} is damaged (sha256 {found[:12]}, written as {expected[:12]}); "
-                    f"delete the folder {self.folder} and generate again to make this episode anew"
+                    f"delete the folder {self.folder} and generate again to make this episode again"
                 )
 
 
 def read_staged(folder: Path) -> StagedEpisode | None:
     """Return the finished episode in ``folder``, or None when there is none."""
     try:
-        record = read_json(folder / RECORD_FILE, Record, ADVICE)
+        return StagedEpisode(folder, read_json(folder / RECORD_FILE, Record, ADVICE))
     except FileNotFoundError:
         return None
-    if record["failure"] is None:
-        try:
-            checked(record["info"], Info)
-        except Malformed as error:
-            raise MemobenchError(f"{folder / RECORD_FILE}: {error} in info; {ADVICE}") from None
-    return StagedEpisode(folder, record)
 
 
 class StagedJob:
@@ -239,20 +218,14 @@ class EpisodeStage:
 
     Args:
         folder: where the finished episode goes; the same one, if there, is kept.
-        formats: which of ``FORMATS`` to write.
     """
 
-    def __init__(self, folder: Path, formats: Collection[str] = (LEROBOT,)) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._formats = tuple(formats)
         self._temporary = temporary_folder(folder)
-        self._videos: dict[str, VideoWriter] = {}
-        self._histograms: dict[str, ImageHistograms] = {}
-        self._hdf5 = EpisodeFile(self._temporary / HDF5_FILE) if HDF5 in self._formats else None
+        self._videos = {camera: VideoWriter(self._temporary / f"{camera}.mp4") for camera in CAMERAS}
+        self._histograms = {camera: ImageHistograms() for camera in CAMERAS}
         self._frames = 0
-        if LEROBOT in self._formats:
-            self._videos = {camera: VideoWriter(self._temporary / f"{camera}.mp4") for camera in CAMERAS}
-            self._histograms = {camera: ImageHistograms() for camera in CAMERAS}
 
     def __enter__(self) -> EpisodeStage:
         return self
@@ -260,10 +233,9 @@ class EpisodeStage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        files: list[VideoWriter | EpisodeFile] = [*self._videos.values()]
-        for file in files if self._hdf5 is None else [*files, self._hdf5]:
+        for video in self._videos.values():
             with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all of it is deleted
-                file.abandon()
+                video.abandon()
         shutil.rmtree(self._temporary, ignore_errors=True)
 
     def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
@@ -272,8 +244,6 @@ class EpisodeStage:
         for camera, video in self._videos.items():
             video.add(images[camera])
             self._histograms[camera].add(images[camera])
-        if self._hdf5 is not None:
-            self._hdf5.add_images(images)
 
     def publish(self, demo: Demonstration) -> StagedEpisode:
         """Add everything but the images, which have been given, and make it a finished episode."""
@@ -292,26 +262,16 @@ class EpisodeStage:
             camera: {name: value.tolist() for name, value in histograms.stats().items()}
             for camera, histograms in shown.items()
         }
-        record = {
-            "failure": None,
-            "info": info,
-            "language_persistent": persistent_rows(found),
-            "image_stats": stats,
+        columns: dict[str, Any] = {
+            "states": demo.states,
+            "actions": demo.actions,
+            "proprio": demo.proprio,
+            "objects": demo.objects,
+            **({} if demo.executed is None else {"executed": demo.executed}),
+            **found.columns(),
         }
-        if LEROBOT in self._formats:
-            columns: dict[str, Any] = {
-                "states": demo.states,
-                "actions": demo.actions,
-                "proprio": demo.proprio,
-                "objects": demo.objects,
-                **({} if demo.executed is None else {"executed": demo.executed}),
-                **found.columns(),
-            }
-            np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
-        if self._hdf5 is not None:
-            self._hdf5.finish(demo)
-            record["hdf5"] = data_attributes(demo.task)
-        return _publish(self._temporary, self._folder, record)
+        np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
+        return _publish(self._temporary, self._folder, None, info, persistent_rows(found), stats)
 
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:
@@ -350,9 +310,9 @@ def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None
         ) from None
 
 
-def stage_demonstration(demo: Demonstration, folder: Path, formats: Collection[str] = (LEROBOT,)) -> StagedEpisode:
+def stage_demonstration(demo: Demonstration, folder: Path) -> StagedEpisode:
     """Write a demonstration that is in memory, images included, to ``folder``; the same one, if there, is kept."""
-    with EpisodeStage(folder, formats) as stage:
+    with EpisodeStage(folder) as stage:
         if demo.images is not None:
             for frame in range(len(demo)):
                 stage.add_images({camera: demo.images[camera][frame] for camera in CAMERAS})
@@ -360,26 +320,39 @@ def stage_demonstration(demo: Demonstration, folder: Path, formats: Collection[s
 
 
 def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpisode:
-    """Remember that a seed has no demonstration, so that a resumed run reports it as well."""
-    record = {"failure": reason, "info": info, "language_persistent": [], "image_stats": {}}
+    """Keep the reason why a seed has no demonstration, so that a resumed run reports it as well."""
     temporary = temporary_folder(folder)
     try:
-        return _publish(temporary, folder, record)
+        return _publish(temporary, folder, reason, info, [], {})
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _publish(temporary: Path, folder: Path, record: dict[str, Any]) -> StagedEpisode:
+def _publish(
+    temporary: Path,
+    folder: Path,
+    failure: str | None,
+    info: dict[str, Any],
+    language_rows: list[LanguageRow],
+    image_stats: dict[str, Any],
+) -> StagedEpisode:
     """Add the record, bring everything to the disk, then give the folder its name."""
-    record["files"] = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
-    (temporary / RECORD_FILE).write_text(json.dumps(record))
+    files = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
+    record = Record(
+        failure=failure,
+        info=info,
+        language_persistent=[Row(**row) for row in language_rows],
+        image_stats=image_stats,
+        files=files,
+    )
+    (temporary / RECORD_FILE).write_text(record.model_dump_json(exclude_unset=True))
     flush_to_disk([*temporary.iterdir(), temporary])
     try:
         temporary.rename(folder)
     except OSError:
         staged = read_staged(folder)  # another worker was first
         shutil.rmtree(temporary, ignore_errors=True)
-        if staged is None or staged.info != record["info"]:
+        if staged is None or staged.info != info:
             raise MemobenchError(
                 f"{folder} holds something else than the episode to be written there; delete it and run again"
             ) from None
@@ -389,7 +362,7 @@ def _publish(temporary: Path, folder: Path, record: dict[str, Any]) -> StagedEpi
 
 
 def temporary_folder(folder: Path) -> Path:
-    """Make and return an empty folder beside ``folder``, to be renamed to it when it is whole."""
+    """Make and return an empty folder, to be renamed to ``folder`` when it is whole."""
     temporary = folder.parent / f"{TEMPORARY}{_host()}-{os.getpid()}-{folder.name}"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
@@ -424,11 +397,11 @@ def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
         remove_drafts(staging)
         asked = staging / REQUEST_FILE
         try:
-            earlier = read_json(asked, dict[str, Any], "delete the folder that it is in to start anew")
+            earlier = read_json(asked, dict[str, Any], "delete the folder that it is in to start again")
         except FileNotFoundError:
             write_file(asked, json.dumps(request, indent=1), durable=True)
         else:
-            advice = f"delete {staging} to start anew or name another folder"
+            advice = f"delete {staging} to start again or name another folder"
             compare_requests(earlier, request, f"{out} holds an unfinished run", advice)
         folder = staging / "episodes"
         folder.mkdir(exist_ok=True)
@@ -445,15 +418,10 @@ def remove_staging(out: Path) -> None:
 
 def compare_requests(earlier: dict[str, Any], request: dict[str, Any], what: str, advice: str) -> None:
     """Raise with the first thing that was asked for differently."""
-    before = {
-        **{"formats": [LEROBOT], "perturb": False, "policy": None, "prompted_episodes": None, FINISHED_EARLY: False},
-        "world": MEMOBENCH,
-    }
-    earlier = {**before, **earlier}  # written before there was a choice
-    for key, value in {"world": MEMOBENCH, **request}.items():
-        if earlier.get(key) != value:
-            there = short(earlier.get(key))
-            raise MemobenchError(f"{what} with {key}={there}, now {short(value)} was asked for; {advice}")
+    for key, value in {**UNASKED, **request}.items():
+        there = {**UNASKED, **earlier}.get(key)
+        if there != value:
+            raise MemobenchError(f"{what} with {key}={short(there)}, now {short(value)} was asked for; {advice}")
 
 
 def clean_temporaries(folder: Path) -> None:

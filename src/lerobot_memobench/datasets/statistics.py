@@ -37,7 +37,7 @@ deviation: they are of pictures before they were encoded."""
 
 
 def measured(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the features of which LeRobot keeps statistics: numbers and pictures, and neither clock nor numbering."""
+    """Return the features with statistics in LeRobot: numbers and pictures, but neither clock nor numbering."""
     from lerobot.utils.constants import DEFAULT_FEATURES
 
     counted = {*CLOCK, *DEFAULT_FEATURES}  # LeRobot's tools leave those of the numbering as they were
@@ -96,7 +96,7 @@ def check_statistics(folder: Path, names: Iterable[str]) -> None:
     Raises:
         MemobenchError: naming the first that differs.
     """
-    features, told = read_info(folder)["features"], recorded(folder)
+    features, kept = read_info(folder)["features"], recorded(folder)
     for name, stats in compute(folder, names).items():
         pictures = features[name]["dtype"] in PICTURES
         low, high = (np.zeros(1), np.ones(1)) if pictures else (stats["min"].ravel(), stats["max"].ravel())
@@ -104,7 +104,7 @@ def check_statistics(folder: Path, names: Iterable[str]) -> None:
         for key, value in stats.items():
             bounded = key.startswith("q") or (pictures and key != "mean" and key != "std")
             least, most = (low, high) if bounded else (value.ravel(), value.ravel())
-            there = told.get(name, {}).get(key)
+            there = kept.get(name, {}).get(key)
             if not (pictures and key == "count") and not _within(there, value.size, least - slack, most + slack):
                 raise MemobenchError(
                     f"{key} of {name} is {short(there)}, and the frames have {short(value.tolist())}; {ADVICE}"
@@ -141,7 +141,7 @@ def needed_by(policy: Any, features: Mapping[str, Mapping[str, Any]], imagenet: 
 
 
 def lacking(folder: Path, needed: Mapping[str, Collection[str]]) -> list[str]:
-    """Return the features of which a dataset lacks one of the statistics that are ``needed``."""
+    """Return the features that lack one of the ``needed`` statistics in a dataset."""
     there = recorded(folder)
     return [name for name, keys in needed.items() if set(keys) - set(there.get(name, {}))]
 
@@ -150,7 +150,7 @@ def complete(folder: Path, names: Sequence[str], tell: Callable[[str], None]) ->
     """Compute statistics of a dataset's features and write into its ``meta/stats.json`` those that it lacks.
 
     Args:
-        tell: told of which features, before they are computed.
+        tell: called with the features before they are computed.
 
     Raises:
         MemobenchError: a column is missing or damaged, or the folder cannot be written.

@@ -1,7 +1,4 @@
-"""Validate a folder: replay every episode, read every file to its end, and name what is not as it was recorded.
-
-The folder may hold a LeRobotDataset, HDF5 files of this package in the published layout, or both.
-"""
+"""Validate a dataset: replay every episode, read every file to its end, and name the first difference of each."""
 
 from __future__ import annotations
 
@@ -18,35 +15,37 @@ from numpy.typing import NDArray
 from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER as CACHES
 from lerobot_memobench.datasets.feature_cache.layout import check_cache
-from lerobot_memobench.datasets.hdf5.reading import PublishedFile, Unusable, find_files, usable_or_named
-from lerobot_memobench.datasets.hdf5.restore import restore, task_of
-from lerobot_memobench.datasets.lerobot_format.files import (
-    NO_HASHES,
-    check_file,
-    check_manifest,
-    dataset_files,
-)
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
     INFO_FILE,
     MANIFEST_FILE,
     STATS_FILE,
+    Written,
     check_clock,
     check_whole,
+    dataset_files,
     episode_count,
     image_key,
     is_dataset,
     read_info,
     read_manifest,
+    read_to_end,
 )
 from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace, check_idling, list_episodes, read_episode
 from lerobot_memobench.datasets.replay import Pictures, replay
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import refusing
+from lerobot_memobench.io import check_fetched, file_hash, refusing
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.tasks.task import Task
+
+COMPARED = ("task_name", "seed", "referent", "variant", "success", "scene_hash", "digest")
+"""Fields of an episode in the manifest that its record has too."""
+NO_HASHES = (
+    "there are no hashes of files, as in datasets of earlier versions and after LeRobot's dataset tools: damage to a "
+    "picture that can still be decoded and is not drawn again is not found"
+)
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Verdict:
     """Outcome of replaying one episode, or of checking a file.
 
     Attributes:
-        subject: ``episode 3`` of the dataset, a file and its group, or a file.
+        subject: ``episode 3`` of the dataset, or a file.
         disagreement: the first one, as a sentence; None when everything agrees.
         note: on a file, what is no disagreement.
         of_file: whether the subject is a file.
@@ -67,47 +66,34 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class _Check:
-    """An episode to be replayed, in any process: of a dataset (``index``), or of an HDF5 file (``group``; "" stands
-    for a file without any that can be read, and replaying it says why).
-    """
+class _EpisodeCheck:
+    """Episode ``index`` of the dataset in ``folder``, to be replayed in any process."""
 
-    path: Path
-    name: str
-    index: int | None = None
-    group: str = ""
+    folder: Path
+    index: int
     tasks: Mapping[str, Task] | None = None
 
     def run(self) -> Verdict:
         """Replay it."""
+        name = f"episode {self.index}"
         try:
             with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}")):
-                return Verdict(self.name, self._replay())
-        except MemobenchError as error:  # whatever one episode says, the others are replayed
-            return Verdict(self.name, str(error))
+                return Verdict(name, self._replay())
+        except MemobenchError as error:  # the other episodes are replayed all the same
+            return Verdict(name, str(error))
 
     def _replay(self) -> str | None:
-        if self.index is not None:
-            episode = read_episode(self.path, self.index)
-            if episode.seed < 0:
-                return "it has no seed, so its scene cannot be made again"
-            task, pictures = (self.tasks or {}).get(episode.task_name), _pictures(self.path, self.index)
-            found = replay(episode, task=task, pictures=pictures)
-            return None if found is None else str(found)
-        with PublishedFile(self.path) as file:
-            published = file.read(self.group)
-            for _ in file.images(self.group):
-                pass  # each picture is decoded, and eight of them are drawn again
-            if "seed" not in published.extras or int(published.extras["seed"]) < 0:
-                return "it has no seed, so its scene cannot be made again"
-            restored = restore(task_of(file, published), published)
-            found = replay(restored, pictures=lambda frames: file.pictures(self.group, frames))
-            return None if found is None else str(found)
+        episode = read_episode(self.folder, self.index)
+        if episode.seed < 0:
+            return "it has no seed, so its scene cannot be made again"
+        task, pictures = (self.tasks or {}).get(episode.task_name), _pictures(self.folder, self.index)
+        found = replay(episode, task=task, pictures=pictures)
+        return None if found is None else str(found)
 
 
 @dataclass(frozen=True)
 class _FileCheck:
-    """A file of the dataset in ``folder``, or what it says, to be checked in any process."""
+    """A check of a file of the dataset in ``folder``, or of its agreement with others; runs in any process."""
 
     folder: Path
     name: str
@@ -133,28 +119,28 @@ def validate(
     tasks: Mapping[str, Task] | None = None,
     progress: ValidationProgress | None = None,
 ) -> list[Verdict]:
-    """Replay the episodes of a folder (or of an HDF5 file) and check its files.
+    """Replay the episodes of a dataset and check its files.
 
     States, success, instruction, numbering, every checkpoint column, subgoal texts, language rows, key frames and the
     scene must come out exactly; some frames of each camera must be near to what the simulator draws. Every file is read
     to its end and compared with its hash, statistics with those of the frames, the manifest with the episodes.
 
     Returns:
-        A verdict for each episode, in their order, then one for each file that disagrees or of which there is a note.
+        A verdict for each episode, in their order, then one for each file with a disagreement or a note.
 
     Args:
-        folder: what to check.
+        folder: of the dataset.
         workers: processes.
         tasks: tasks by name that are not those of the catalogue.
         progress: called after each episode and file.
 
     Raises:
-        MemobenchError: there is nothing to check.
+        MemobenchError: there is no dataset.
     """
     folder = Path(folder).absolute()
     if workers < 1:
         raise MemobenchError(f"{workers} workers were asked for; it must be at least 1")
-    checks: list[_Check | _FileCheck] = [*_checks(folder, tasks), *_file_checks(folder)]
+    checks: list[_EpisodeCheck | _FileCheck] = [*_episode_checks(folder, tasks), *_file_checks(folder)]
     verdicts: dict[int, Verdict] = {}
 
     def note(number: int, verdict: Verdict) -> None:
@@ -199,16 +185,12 @@ def exit_status(verdicts: Sequence[Verdict]) -> int:
 
 
 def _file_checks(folder: Path) -> Iterator[_FileCheck]:
-    """Yield a check of each file of a dataset, or of those HDF5 files of one that ``folder`` names."""
-    root = next((place for place in (folder, *folder.parents[:2]) if (place / MANIFEST_FILE).is_file()), folder)
+    """Yield a check of each file of a dataset, and of the agreement between files."""
     written = None
     with contextlib.suppress(MemobenchError, FileNotFoundError):  # `check_manifest` names its damage
-        written = read_manifest(root).get("files")
-    for name in sorted({*dataset_files(root), *(written or {})}):
-        if (root / name).is_relative_to(folder):
-            yield _FileCheck(root, name, partial(check_file, root / name, (written or {}).get(name)))
-    if not is_dataset(folder):
-        return
+        written = read_manifest(folder).get("files")
+    for name in sorted({*dataset_files(folder), *(written or {})}):
+        yield _FileCheck(folder, name, partial(check_file, folder / name, (written or {}).get(name)))
     if written is None:
         yield _FileCheck(folder, MANIFEST_FILE, partial(str, NO_HASHES))
     yield _FileCheck(folder, INFO_FILE.as_posix(), partial(check_whole, folder))
@@ -223,26 +205,58 @@ def _file_checks(folder: Path) -> Iterator[_FileCheck]:
             yield _FileCheck(folder, f"{CACHES}/{cache.name}", partial(check_cache, cache))
 
 
-def _checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
-    checks: list[_Check] = []
-    if is_dataset(folder):
-        check_clock(read_info(folder)["features"], folder)
-        places: Sequence[EpisodePlace] = ()
-        with contextlib.suppress(MemobenchError):  # a damaged file: each episode tells it below
-            places = list_episodes(folder)
-        check_idling(folder, places)
-        total = range(episode_count(folder))
-        checks += [_Check(folder, f"episode {index}", index=index, tasks=tasks) for index in total]
-    has_files = folder.is_file() or any(path.suffix in (".hdf5", ".h5") for path in folder.rglob("*"))
-    if not checks and not has_files:
+def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_EpisodeCheck]:
+    if not is_dataset(folder):
         raise MemobenchError(
-            f"{folder} holds neither a dataset (meta/info.json) nor HDF5 files; name the folder of generated ones"
+            f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
+            "when `memobench convert` reads them"
         )
-    for path in find_files(folder) if has_files else ():
-        name = path.name if path == folder else path.relative_to(folder).as_posix()
-        try:
-            with PublishedFile(path) as file, usable_or_named():
-                checks += [_Check(path, f"{name}, {group}", group=group) for group in file.groups()]
-        except Unusable:
-            checks.append(_Check(path, name))
-    return checks
+    check_clock(read_info(folder)["features"], folder)
+    places: Sequence[EpisodePlace] = ()
+    with contextlib.suppress(MemobenchError):  # a damaged file: each episode names it below
+        places = list_episodes(folder)
+    check_idling(folder, places)
+    return [_EpisodeCheck(folder, index, tasks) for index in range(episode_count(folder))]
+
+
+# --- files ---
+
+
+def check_file(path: Path, written: Written | None) -> str | None:
+    """Read a file to its end and compare it with what was written; return a note where it was written again.
+
+    Other bytes in a file of the same size are damage; a tool that encodes or writes again leaves another size.
+
+    Raises:
+        MemobenchError: it is missing or damaged.
+    """
+    if not path.is_file():
+        raise MemobenchError(f"the file is missing; {ADVICE}")
+    check_fetched(path)
+    if path.suffix in (".parquet", ".mp4"):
+        read_to_end(path)
+    if written is None or file_hash(path) == written["sha256"]:
+        return None
+    if path.stat().st_size == written["bytes"]:
+        raise MemobenchError(
+            f"its size is that in {MANIFEST_FILE}, and its bytes are not: it was damaged or edited; take the dataset "
+            "from its source again, or generate it"
+        )
+    return f"encoded or written again since {MANIFEST_FILE} was: its content is checked, its bytes are not"
+
+
+def check_manifest(folder: Path) -> None:
+    """Compare seeds, hashes and lengths in the manifest of the dataset in ``folder`` with its episodes.
+
+    Raises:
+        MemobenchError: naming the first episode and field that differ.
+    """
+    rows = {row.get("episode_index"): row for row in read_manifest(folder)["episodes"] if row["failure"] is None}
+    for place in list_episodes(folder) if None not in rows else ():  # a manifest of an earlier version
+        row = rows.pop(place.index, {})
+        held = {key: getattr(place.record, key) for key in COMPARED} if place.record is not None else {}
+        for key, value in {"frames": place.length, **held}.items():
+            if row.get(key) != value and value is not None:
+                raise MemobenchError(f"episode {place.index} has {key}={value!r}, {MANIFEST_FILE} {row.get(key)!r}")
+    if rows:
+        raise MemobenchError(f"it names episode {next(iter(rows))}, and the dataset has none of that number")

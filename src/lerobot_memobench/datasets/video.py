@@ -44,7 +44,7 @@ def _encoder() -> RGBEncoderConfig:
 class VideoWriter:
     """A video that is being encoded frame by frame, so that an episode's images are never in memory together.
 
-    One thread, so that the bytes do not depend on the machine's cores or on what runs beside.
+    One thread, so that the bytes do not depend on the machine's cores or on other processes.
     """
 
     def __init__(self, path: Path) -> None:

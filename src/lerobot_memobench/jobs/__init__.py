@@ -1,1 +1,1 @@
-"""How are many independent pieces of work run, here, on Slurm, on Ray, and found finished again?"""
+"""How are many independent pieces of work run, here or on Slurm, and found finished again?"""

@@ -1,4 +1,4 @@
-"""A job, the processes of this machine that run jobs, how one ends that is told to, and who may write to a folder."""
+"""Jobs, the processes of this machine that run them, their end by a signal, and locks on folders and files."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
+import psutil
 from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError, unsupported_system
@@ -33,7 +34,7 @@ class Job(Protocol):
 
     @property
     def task_name(self) -> str:
-        """What the job is called when its end is told."""
+        """Name in messages and progress."""
 
     @property
     def seed(self) -> int:
@@ -51,10 +52,7 @@ class Job(Protocol):
 
 @dataclass(frozen=True)
 class Advance:
-    """Told to the progress callback after each job: how many are finished, and the newest one's identity.
-
-    ``found`` of those finished were so before this run began.
-    """
+    """Progress after a job: how many of ``total`` are done, ``found`` of them before this run, and the newest job."""
 
     done: int
     total: int
@@ -86,13 +84,13 @@ def check_finished(jobs: Sequence[Job], logs: Path) -> None:
     )
 
 
-def run_in_processes(jobs: Sequence[Job], workers: int, tell: Callable[[Job], None]) -> None:
-    """Run the jobs, ``workers`` at a time; ``tell`` of each in the order in which they end."""
+def run_in_processes(jobs: Sequence[Job], workers: int, done: Callable[[Job], None]) -> None:
+    """Run the jobs, ``workers`` at a time; call ``done`` with each in the order in which they end."""
     with process_pool(min(workers, len(jobs))) as pool:
         futures: dict[Future[None], Job] = {pool.submit(job.run): job for job in jobs}
         for future in as_completed(futures):
             future.result()
-            tell(futures[future])
+            done(futures[future])
 
 
 class WorkerKilledError(MemobenchError):
@@ -146,14 +144,14 @@ def _begin_worker() -> None:
 
 @contextlib.contextmanager
 def saying_how_to_go_on(program: str, how: Callable[[], str]) -> Iterator[None]:
-    """While this lasts, say how to go on where SIGTERM ends the process, or where a worker of it is killed.
+    """Print how to go on where SIGTERM ends the process in this block, or a worker of it is killed.
 
     SIGTERM (a job is preempted, its time is up) ends this process and all that it has started. Nothing is waited for:
     the files on the disk are whole, as after any kill. In another thread than the main one, and where the signal has
     another handler, the signal is left alone.
 
     Args:
-        program: as it is typed. how: returns how to go on. An inner one takes the place of an outer one meanwhile.
+        program: name of the command. how: returns how to go on. An inner block replaces an outer one.
 
     Raises:
         WorkerKilledError: a worker process was killed.
@@ -192,38 +190,24 @@ def saying_how_to_go_on(program: str, how: Callable[[], str]) -> Iterator[None]:
 
 def _kill_descendants() -> None:
     """Kill every process that descends from this one; each is stopped first, so that none starts another meanwhile."""
-    if sys.platform != "linux":
-        for child in multiprocessing.active_children():
-            child.kill()
-        return
-    stopped: set[int] = set()
-    while new := _descendants(os.getpid()) - stopped:
-        for pid in new:
-            _send(pid, signal.SIGSTOP)
+    stopped: set[psutil.Process] = set()
+    while new := _descendants() - stopped:
+        for process in new:
+            with contextlib.suppress(psutil.Error):
+                process.suspend()
         stopped |= new
-    for pid in stopped:
-        _send(pid, signal.SIGKILL)
+    for process in stopped:
+        with contextlib.suppress(psutil.Error):
+            process.kill()
 
 
-def _send(pid: int, number: int) -> None:
-    with contextlib.suppress(OSError):
-        os.kill(pid, number)
-
-
-def _descendants(root: int) -> set[int]:
-    """Return the processes that descend from one, but for multiprocessing's own tracker, which ends last and tidies."""
-    children: dict[int, list[int]] = {}
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdecimal():
-            with contextlib.suppress(OSError):
-                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-                if b"resource_tracker" not in (folder / "cmdline").read_bytes():
-                    children.setdefault(parent, []).append(int(folder.name))
-    found: set[int] = set()
-    waiting = [root]
-    while waiting:
-        waiting += (new := children.get(waiting.pop(), []))
-        found.update(new)
+def _descendants() -> set[psutil.Process]:
+    """Return the descendants of this process, but for multiprocessing's resource tracker, which tidies up."""
+    found = set()
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            if not any("resource_tracker" in word for word in process.cmdline()):
+                found.add(process)
     return found
 
 

@@ -1,12 +1,12 @@
-"""Who gets how many threads: one rule for every process of ours, and for the libraries in it.
+"""Number of threads: one rule for every process of ours, and for the libraries in it.
 
 A rollout is one step after another: a small policy, physics and both pictures take one core, and a second thread of
-torch or of the renderer only waits busily for the next step. So whatever simulates has one thread of each, and more
-cores mean more processes. What learns, and a large policy that acts, multiplies large matrices: it takes the cores that
-its process has, shared with those of ours that run beside it.
+torch or of the renderer only waits busily for the next step. So a process that simulates has one thread of each, and
+more cores mean more processes. Training, and a large policy that acts, multiply large matrices: they take all cores of
+their process, shared among our processes on the same machine.
 
-`use_threads` says so in the environment, before the libraries load; processes that are started later inherit it.
-`limit_torch` says it to torch once a policy's size is known. What a user has set in the environment stays.
+`use_threads` sets the environment before the libraries load; processes that are started later inherit it.
+`limit_torch` sets torch's threads once a policy's size is known. Variables that a user has set stay.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from collections.abc import Mapping
 from pathlib import Path
 
 ACTING, LEARNING = "acting", "learning"
-"""What a process does: simulate, draw and let a policy act, or train and encode."""
+"""Roles of a process: simulate, draw and let a policy act; or train and encode."""
 LARGE = 20_000_000
 """Parameters from which on a policy that acts is large: an action chunk of a smaller one takes a core some 50 ms."""
 
 TORCH = "OMP_NUM_THREADS"
 ONE_EACH = {"OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
-"""Of numpy, whose matrices are small here, and of llvmpipe, which draws without a GPU."""
+"""Threads of numpy, for small matrices, and of llvmpipe, which draws without a GPU."""
 SPINNING = {"GOMP_SPINCOUNT": "2000"}
-"""How long torch's idle threads wait busily: by default for milliseconds, in which nobody else gets their core."""
+"""How long torch's idle threads keep their core: milliseconds by default."""
 CHOSEN_HERE = "MEMOBENCH_THREADS"
-"""Variable that names those set by this rule: a process that is started from here decides anew, a user's own stay."""
+"""Variable with the names of those set by this rule: a child process may set them again, a user's own stay."""
 BESIDE = "MEMOBENCH_PROCESSES"
-"""Variable that tells a process how many of ours, itself included, share its cores."""
+"""Variable with the number of our processes, this one included, that share the cores."""
 
 _CGROUPS = Path("/sys/fs/cgroup")
 
@@ -56,7 +56,7 @@ def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int 
 
 
 def use_threads(role: str) -> None:
-    """Set this process's environment as the rule says; to be called before numpy, torch or a renderer is loaded."""
+    """Set this process's environment by the rule. Call it before numpy, torch or a renderer is loaded."""
     given = os.environ
     ours = set(filter(None, given.get(CHOSEN_HERE, "").split(",")))
     wanted = dict(ONE_EACH)

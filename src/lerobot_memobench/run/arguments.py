@@ -65,7 +65,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
 them."""
 RUN_OPTIONS = (
     *("split", "memory_reads", "resume"),
-    *("shard", "shards", "workers", "executor", "executor_option"),
+    *("shard", "shards", "workers", "slurm"),
 )
 """Keys of `lerobot eval env=memobench` that are none of LeRobot's (`plan.RunOptions`)."""
 TRAINING_OPTIONS = ("prompt_frames", "obs_type")

@@ -9,8 +9,8 @@ from __future__ import annotations
 import datetime as dt
 import itertools
 import shlex
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,7 +18,7 @@ from lerobot_memobench.envs.command_line import overrides, quiet, read_rename_ma
 from lerobot_memobench.envs.observations import OBJECTS, PIXELS, check_obs_type, obs_type_of, prompt_in
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card
-from lerobot_memobench.jobs.executors import ELSEWHERE, read_options
+from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.compatibility import REFUSAL, check_features
@@ -62,7 +62,6 @@ LARGEST_BATCH = 64
 VIDEO_EPISODES = 10
 """Episodes of each task that are recorded as videos, as many as LeRobot renders of an environment without videos of its
 own; none where only objects are observed, so that nothing is drawn unasked."""
-PROCESSES = "processes"
 EVALUATED = (PAPER, VALIDATION, SEALED)
 """Splits that ``split=`` names."""
 
@@ -211,7 +210,7 @@ def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequenc
     )
     check_split(plan)
     check_scenes(plan)
-    if options.executor not in ELSEWHERE:  # there, each part finds out
+    if options.slurm is None:  # there, each part checks its own machine
         _check_simulator(environment)
     return plan
 
@@ -487,7 +486,7 @@ def check_memory_reads(policy: Any) -> None:
     config.check_memory_reads()
 
 
-# --- how it is run: resume=, shard=, shards=, workers=, executor= … ---
+# --- how it is run: resume=, shard=, shards=, workers=, slurm= … ---
 
 
 @dataclass(frozen=True)
@@ -501,7 +500,7 @@ class RunOptions:
         shard: run this part alone.
         shards: run so many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
         workers: 0: as many as shards.
-        executor, executor_options: see `jobs.executors.run_jobs`.
+        slurm: options of sbatch for jobs on Slurm; None: they run here.
     """
 
     split: str | None = None
@@ -510,8 +509,7 @@ class RunOptions:
     shard: Shard | None = None
     shards: int = 0
     workers: int = 0
-    executor: str = PROCESSES
-    executor_options: Mapping[str, Any] = field(default_factory=dict)
+    slurm: tuple[str, ...] | None = None
 
     @property
     def any(self) -> bool:
@@ -542,15 +540,14 @@ def take_run_options(given: Arguments) -> tuple[RunOptions, Arguments]:
         shard=Shard.parse(last["shard"]) if "shard" in last else None,
         shards=_count("shards", last.get("shards")),
         workers=_count("workers", last.get("workers")),
-        executor=last.get("executor", PROCESSES),
-        executor_options=read_options(found["executor_option"]) if "executor_option" in found else {},
+        slurm=read_options(last["slurm"]) if "slurm" in last else None,
     )
     if options.shards and options.shard is not None:
         raise MemobenchError(
             f"both shard={options.shard} and shards={options.shards} are given; shard= runs one part, shards= all of "
             "them"
         )
-    idle = [key for key in ("workers", "executor", "executor_option") if key in found]
+    idle = [key for key in ("workers", "slurm") if key in found]
     if idle and not options.shards:
         raise MemobenchError(
             f"{idle[0]}= says how parts of an evaluation are run; say how many parts, such as shards=8"

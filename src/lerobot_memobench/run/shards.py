@@ -1,4 +1,4 @@
-"""``lerobot eval … shards=8 executor=slurm``: the parts of an evaluation as jobs of their own, then merged.
+"""``lerobot eval … shards=8``: the parts of an evaluation as jobs of their own, then merged.
 
 A part is the same command with ``shard=i/n resume=true`` in a process of its own, here or on another machine that sees
 the same folder; so a killed part is gone on with, and a finished one is left alone.
@@ -17,8 +17,9 @@ from typing import Any
 from lerobot_memobench.envs.acting import parameters_of
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.executors import Needs, check_executor, options_text, run_jobs
 from lerobot_memobench.jobs.processes import ProgressCallback
+from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import LARGE, sharing
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.card import card_of
@@ -127,10 +128,9 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
         tell: told what matters and stops nothing.
 
     Raises:
-        MemobenchError: the executor, the number of parts or what is in the folders forbids it.
+        MemobenchError: the number of parts or what is in the folders forbids it.
     """
     options, grid, out = plan.options, plan.grid, plan.output.absolute()
-    check_executor(options.executor, options.executor_options)
     if options.shards > len(grid.cells()):
         raise MemobenchError(
             f"shards={options.shards} is more than the {len(grid.cells())} batches that the evaluation consists of; "
@@ -145,7 +145,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
             referent=plan.environment.referent,
             directory=Path.cwd(),
-            beside=1 if options.executor == "slurm" else min(options.workers or options.shards, options.shards),
+            beside=1 if options.slurm is not None else min(options.workers or options.shards, options.shards),
         )
         for shard in (Shard(k + 1, options.shards) for k in range(options.shards))
     ]
@@ -173,13 +173,18 @@ def _check_folders(plan: EvaluationPlan, out: Path, jobs: Sequence[ShardJob], te
             check_new(folder)
 
 
-def executor_options(plan: EvaluationPlan) -> dict[str, Any]:
-    """Return the executor's options, complete: a large policy is given a GPU, and room for its weights twice."""
+def slurm_of(plan: EvaluationPlan) -> Slurm | None:
+    """Return how the parts are submitted to Slurm, None where they run here.
+
+    A large policy requests a GPU, and memory for its weights twice.
+    """
     options, device = plan.options, plan.arguments.get("policy.device")
+    if options.slurm is None:
+        return None
     parameters = parameters_of(plan.policy_path) or 0 if plan.policy_path is not None else 0
     on_gpu = device.startswith("cuda") if device else parameters >= LARGE
     needs = Needs(cores=2, memory_gb=8 + 2 * 4 * parameters // 10**9, gpus=int(on_gpu))
-    return options_text(options.executor, options.executor_options, needs)
+    return Slurm(options.slurm, needs, plan.output.absolute() / LOGS, jobs_per_member=1)
 
 
 def run_shards(
@@ -199,10 +204,7 @@ def run_shards(
             jobs,
             workers=options.workers or len(jobs),
             progress=progress,
-            executor=options.executor,
-            options=executor_options(plan),
-            logs=out / LOGS,
+            slurm=slurm_of(plan),
             finish=partial(finish, out, folders),
-            jobs_per_rank=1,
         )
         return merge_held(out, [folder for folder in folders if has_log(folder)]) if complete else None

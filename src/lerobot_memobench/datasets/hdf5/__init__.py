@@ -12,11 +12,8 @@
 completed in order) and ``timestep_exec_start_idx`` (the frame at which execution starts) filled in. Frame t shows
 the observation before ``actions[t]``.
 
-The authors' files are of LIBERO's scenes, and so are the tasks that ``restore`` makes of them; ``placing`` puts their
-states in the order of the task's joints, ``archive`` reads them out of a zip.
-
-What this package knows beyond the layout is in further attributes, so that every reader of the layout finds what
-it expects and nothing else among the arrays: of ``data`` ``task_metadata``; of a demonstration ``seed``,
-``referent``, ``variant``, ``success``, ``fixture_poses``, ``scene_hash``, ``satisfied_intervals`` and ``digest``.
-Images are compressed with gzip, losslessly, a frame per chunk: a third of the published files' size.
+`reading` reads and checks a file, `archive` takes files out of a zip, `model_file` reads a file's scene, and `restore`
+makes a demonstration of a group. Files that earlier versions of this package wrote have further attributes: of ``data``
+``task_metadata``; of a demonstration ``seed``, ``referent``, ``variant``, ``success``, ``fixture_poses``,
+``scene_hash``, ``satisfied_intervals`` and ``digest``.
 """

@@ -76,7 +76,7 @@ def parse(text: str) -> ElementTree.Element:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of a scene: its type, and where its positions and velocities stand in a state.
+    """A joint of a scene: its type, and the places of its positions and velocities in a state.
 
     ``body``: the name of the body that it moves.
     """

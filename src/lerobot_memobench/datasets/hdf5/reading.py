@@ -1,4 +1,4 @@
-"""Read files in the published layout, this package's or others', and say what is wrong with them."""
+"""Read and check files in the published layout."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from annotated_types import Len
 from numpy.typing import NDArray
+from pydantic import BaseModel, Json
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Malformed, Number, Whole, check_fetched, checked, parsed, refusing
@@ -29,8 +30,8 @@ LIBERO_NAMES = {"image": "agentview_rgb", "wrist_image": "eye_in_hand_rgb"}
 """The same in LIBERO's own files, after which a file of the published layout may be named as well."""
 FILE_OBJECT = re.compile(r"<(_io\.\w+|open file) .*>")
 Image = NDArray[np.uint8]
-AS_JSON = ("fixture_poses", "satisfied_intervals")
-"""Attributes that hold JSON text."""
+NO_SEED = -1
+"""Seed of a demonstration without one."""
 SUFFIX = "_demo.hdf5"
 SUFFIXES = (".hdf5", ".h5")
 SLICE = 32
@@ -39,19 +40,23 @@ LARGEST = 1e10
 """MuJoCo takes a state with a larger number for an unstable simulation, and puts the initial one in its place."""
 
 
-class Extras(TypedDict, total=False):
-    """Attributes of a demonstration that only this package writes; JSON texts as what they say: fixture to pose (7,),
-    checkpoint to [start, stop) pairs.
+class Extras(BaseModel):
+    """Attributes that earlier versions of this package added to a demonstration; the defaults are those of others.
+
+    Attributes:
+        success: None in files of others.
+        fixture_poses: JSON, fixture to pose (7,).
+        satisfied_intervals: JSON, checkpoint to [start, stop) pairs.
     """
 
-    seed: Whole
-    referent: str
-    variant: Count
-    success: bool
-    fixture_poses: dict[str, Annotated[list[Number], Len(7, 7)]]
-    scene_hash: str
-    satisfied_intervals: list[list[Annotated[list[Count], Len(2, 2)]]]
-    digest: str
+    seed: Whole = NO_SEED
+    referent: str = "fixed"
+    variant: Count = 0
+    success: bool | None = None
+    fixture_poses: Json[dict[str, Annotated[list[Number], Len(7, 7)]]] | None = None
+    scene_hash: str = ""
+    satisfied_intervals: Json[list[list[Annotated[list[Count], Len(2, 2)]]]] | None = None
+    digest: str | None = None
 
 
 @dataclass(frozen=True)
@@ -71,8 +76,8 @@ class Unusable(MemobenchError):
 
 
 def usable_or_named() -> AbstractContextManager[None]:
-    """As `refusing`: whatever a file says, it ends only itself."""
-    return refusing(lambda why: Unusable(f"what it says cannot be used ({why})"))
+    """As `refusing`: an unusable file or group does not end the others."""
+    return refusing(lambda why: Unusable(f"its content cannot be used ({why})"))
 
 
 def find_files(source: Path) -> list[Path]:
@@ -100,7 +105,7 @@ class PublishedDemo:
         actions: (T, 7) float32.
         metadata: ``meta_data``.
         model_file: MJCF, or "" where there is none.
-        extras: the attributes that only this package writes; empty for files of others.
+        extras: the attributes that earlier versions of this package added.
         image_size: (height, width).
     """
 
@@ -109,7 +114,7 @@ class PublishedDemo:
     actions: NDArray[np.float32]
     metadata: dict[str, Any]
     model_file: str
-    extras: dict[str, Any]
+    extras: Extras
     image_size: tuple[int, int]
 
 
@@ -160,7 +165,7 @@ class PublishedFile:
 
     @property
     def lacks_its_text(self) -> bool:
-        """Whether the name of an open file stands where the task's text should be."""
+        """Whether the name of an open file was stored in place of the task's text."""
         return names_a_file_object(self.bddl_text)
 
     def attribute(self, name: str) -> str | None:
@@ -172,7 +177,7 @@ class PublishedFile:
         return sorted(self._data, key=lambda name: (demo_number(name) is None, demo_number(name) or 0, name))
 
     def announced(self) -> int | None:
-        """Return how many demonstrations the file says it has, where it does."""
+        """Return ``num_demos``, the number of demonstrations that the file claims, None where there is none."""
         value = self._data.attrs.get("num_demos")
         return int(value) if isinstance(value, int | np.integer) else None
 
@@ -180,7 +185,7 @@ class PublishedFile:
         """Read and check one demonstration, all but its pixels.
 
         Raises:
-            Unusable: with the first thing that is not as the layout says.
+            Unusable: with the first difference to the layout.
         """
         try:
             return self._read(group)
@@ -238,11 +243,6 @@ class PublishedFile:
                     frame = {camera: np.ascontiguousarray(picture[::-1]) for camera, picture in frame.items()}
                 yield frame
 
-    def pictures(self, group: str, frames: Sequence[int]) -> dict[str, Image]:
-        """Return both cameras' pictures at ``frames``, ascending numbers (n,): (n, H, W, 3) uint8 each."""
-        obs = self._data[group]["obs"]
-        return {camera: obs[name][list(frames)] for camera, name in image_names(obs).items()}
-
 
 # --- parts of a file, each checked ---
 
@@ -259,19 +259,17 @@ def _not_opened(path: Path, error: OSError) -> str:
 
 
 def _missing(group: h5py.Group, name: str) -> str:
-    """Return what stands in the place of an array or a group that is not there."""
+    """Return a sentence on an array or a group that is not there."""
     import h5py
 
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
-        return (
-            f"{name!r} is a link into the file {link.filename!r}, which cannot be opened; put that file beside this one"
-        )
+        return f"{name!r} is a link into the file {link.filename!r}, which cannot be opened; put it next to this file"
     return f"{name!r} is missing"
 
 
 def _check_layout(data: h5py.Group) -> None:
-    """Say of a file of LIBERO or robomimic, whose layouts are near to the published one, what it lacks."""
+    """Refuse a file of LIBERO or robomimic, which have similar layouts, and name the missing parts."""
     import h5py
 
     first = next((data.get(name) for name in data if demo_number(name) is not None), None)
@@ -283,18 +281,18 @@ def _check_layout(data: h5py.Group) -> None:
     layout = "LIBERO's" if "agentview_rgb" in obs else "robomimic's" if "env_args" in data.attrs else None
     if layout is not None:
         raise Unusable(
-            f"it is in {layout} layout, which lacks {', '.join(['the checkpoints (meta_data)', *lacks])}: nothing says "
-            "what has to be remembered; train on it by LeRobot's own datasets, or describe its task as "
-            "docs/develop/add_a_task.md says"
+            f"it is in {layout} layout, which lacks {', '.join(['the checkpoints (meta_data)', *lacks])}: without them "
+            "nothing is known of memory; train on it by LeRobot's own datasets, or describe its task as "
+            "docs/develop/add_a_task.md shows"
         )
 
 
 def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None:
-    """Raise unless all arrays have as many frames as ``num_samples`` says, and have some."""
+    """Raise unless all arrays have ``num_samples`` frames, and at least one."""
     lengths = {key: len(found) for key, found in arrays.items()}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{key} {length}" for key, length in lengths.items())
-        raise Unusable(f"its arrays have different lengths: {told}")
+        listed = ", ".join(f"{key} {length}" for key, length in lengths.items())
+        raise Unusable(f"its arrays have different lengths: {listed}")
     length = lengths["states"]
     if not length:
         raise Unusable("it has no frames")
@@ -356,7 +354,7 @@ def json_object(text: str, what: str) -> dict[str, Any]:
 
 
 def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: Any) -> h5py.Dataset:
-    """Return an array of one of the types and of a shape in which None stands for any length."""
+    """Return an array of one of the types and of a shape in which None means any length."""
     import h5py
 
     found = group.get(name)
@@ -390,23 +388,18 @@ def first_line(error: BaseException) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
-def read_extras(group: h5py.Group) -> dict[str, Any]:
-    """Return those of `Extras` that a group has.
+def read_extras(group: h5py.Group) -> Extras:
+    """Return the `Extras` of a group.
 
     Raises:
         Unusable: one of them is of another type, or no JSON.
     """
-    found = {key: _plain(group.attrs[key]) for key in Extras.__annotations__ if key in group.attrs}
-    for key in AS_JSON:
-        if isinstance(found.get(key), str):
-            try:
-                found[key] = parsed(found[key])
-            except Malformed as error:
-                raise Unusable(f"the attribute {key!r}: {error}") from None
+    found = {key: _plain(group.attrs[key]) for key in Extras.model_fields if key in group.attrs}
     try:
-        return dict(checked(found, Extras))
+        extras: Extras = checked(found, Extras)
     except Malformed as error:
         raise Unusable(f"its attributes: {error}") from None
+    return extras
 
 
 def _plain(value: Any) -> Any:
@@ -421,14 +414,8 @@ def _plain(value: Any) -> Any:
 # --- truth as intervals ---
 
 
-def truth_to_intervals(satisfied: NDArray[np.bool_]) -> list[list[list[int]]]:
-    """Return where each column of a (T, K) truth is true, as [start, stop) pairs."""
-    edges = np.diff(satisfied.astype(np.int8), axis=0, prepend=0, append=0)
-    return [np.flatnonzero(column).reshape(-1, 2).tolist() for column in edges.T]
-
-
 def truth_from_intervals(intervals: Sequence[Sequence[Sequence[int]]], length: int) -> NDArray[np.bool_]:
-    """Undo `truth_to_intervals` for K checkpoints: (T, K)."""
+    """Return the truth (T, K) of K checkpoints from the [start, stop) pairs where each is true."""
     truth = np.zeros((length, len(intervals)), dtype=np.bool_)
     for k, pairs in enumerate(intervals):
         for start, stop in pairs:

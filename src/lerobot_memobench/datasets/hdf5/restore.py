@@ -18,25 +18,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
-from lerobot_memobench.datasets.hdf5.model_file import ModelFile, Pose, parse
-from lerobot_memobench.datasets.hdf5.placing import States, place
+from lerobot_memobench.datasets.hdf5.model_file import ModelFile, Pose, joints_of, parse
 from lerobot_memobench.datasets.hdf5.reading import SUFFIX, PublishedDemo, PublishedFile, Unusable, truth_from_intervals
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name
 from lerobot_memobench.protocol import UPSTREAM_EVALUATIONS
+from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
 from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import BDDL_FILE, LIBERO, MEMOBENCH, MEMORY_TYPES, METADATA_FILE, Task, World
 
-NO_SEED = -1
-"""Seed of a demonstration that does not say it."""
+States = NDArray[np.float64]
+
+BASE = "robot0_base"
+BASE_TOLERANCE = 1e-3
+"""How far the arm's base may be from ours, m: pictures, actions and proprioception are of one place."""
+NEAR_TABLE = 0.1
+"""How far above or below the table's top a fixture's origin may be, m; LIBERO's are up to 30 mm above it."""
 UNKNOWN = "tasks"
-"""Folder of a task whose memory type nothing tells."""
+"""Folder of a task with an unknown memory type."""
 OURS = "memobench"
-"""Name of the models that this package writes of its own world."""
+"""Name of the models that earlier versions of this package wrote of its own world."""
 
 
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
@@ -50,15 +55,16 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     exec_start = execution_start(task, demo)
     _check_clock(demo.states, exec_start)
     frames = key_frames(task, demo, exec_start)
-    written = demo.extras.get("satisfied_intervals")
+    extras = demo.extras
+    written = extras.satisfied_intervals
     asked = written is None and (not frames or min(frames) < 0)
     read_off = _read_off(sim, task, states, fixture_poses, exec_start, ours=is_ours(demo), asked=asked)
     try:
         restored = Demonstration(
             task=task,
-            seed=int(demo.extras.get("seed", NO_SEED)),
-            referent=str(demo.extras.get("referent", "fixed")),
-            variant=int(demo.extras.get("variant", 0)),
+            seed=extras.seed,
+            referent=extras.referent,
+            variant=extras.variant,
             states=states,
             actions=demo.actions,
             proprio=read_off.proprio,
@@ -69,28 +75,29 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
                 if written is not None
                 else _known_or_read_off(frames, read_off.satisfied)
             ),
-            success=bool(demo.extras.get("success", read_off.success or (bool(frames) and min(frames) >= 0))),
+            success=(
+                (read_off.success or (bool(frames) and min(frames) >= 0)) if extras.success is None else extras.success
+            ),
             fixture_poses=fixture_poses,
-            model_xml="" if task.world == LIBERO else demo.model_file,
-            scene_hash=str(demo.extras.get("scene_hash", "")),
+            scene_hash=extras.scene_hash,
             stand_ins=sim.stand_ins,
             objects=read_off.objects,
         )
         found = digest(restored)
     except MemobenchError as error:
         raise Unusable(str(error)) from None
-    if demo.extras.get("digest", found) != found:
+    if extras.digest not in (None, found):
         raise Unusable("its states, actions or labels are not those that were written (the digest differs)")
     return restored
 
 
 def _placed(sim: Simulation, demo: PublishedDemo) -> tuple[States, dict[str, Pose]]:
     """Return states and poses of the fixtures in the simulation's scene."""
-    if not is_ours(demo) or "fixture_poses" not in demo.extras:
+    if not is_ours(demo) or demo.extras.fixture_poses is None:
         return place(sim, ModelFile(_model_text(demo)), demo.states)
     if demo.states.shape[1] != sim.state_dim:
         raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {sim.task.name}")
-    return demo.states, {name: np.array(pose) for name, pose in demo.extras["fixture_poses"].items()}
+    return demo.states, {name: np.array(pose) for name, pose in demo.extras.fixture_poses.items()}
 
 
 def _model_text(demo: PublishedDemo) -> str:
@@ -100,8 +107,8 @@ def _model_text(demo: PublishedDemo) -> str:
 
 
 def is_ours(demo: PublishedDemo) -> bool:
-    """Whether this package wrote a demonstration: its prompt is known, and truth and success are written."""
-    return "success" in demo.extras
+    """Whether an earlier version of this package wrote a demonstration, with truth and success."""
+    return demo.extras.success is not None
 
 
 def world_of(demo: PublishedDemo) -> World:
@@ -204,7 +211,7 @@ def _read_off(
 
 
 def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
-    """Raise when the frames are not in the order of their time, which may start anew where the prompt ends.
+    """Raise when the frames are not in the order of their time, which may start again where the prompt ends.
 
     That is where the execution starts, or where the scene is first as it then is: the robot idles in between.
 
@@ -230,6 +237,64 @@ def _simulation(task: Task) -> Simulation:
     sim = Simulation(task)
     sim.reset(0)
     return sim
+
+
+# --- the scene ---
+
+
+def place(sim: Simulation, scene: ModelFile, states: States) -> tuple[States, dict[str, Pose]]:
+    """Return states (T, D) of a model file's scene as states of a simulation's, and the poses of its fixtures.
+
+    Raises:
+        Unusable: the scene lacks a joint or a body, has one beyond the task, or is another one.
+    """
+    _check_joints(sim, scene)
+    if states.shape[1] != scene.state_dim:
+        raise Unusable(f"states have width {states.shape[1]}, expected {scene.state_dim} of the joints of model_file")
+    scene.body_of(BASE)
+    _check_base(sim, scene)
+    placed = np.zeros((len(states), sim.state_dim))
+    placed[:, 0] = states[:, 0]
+    for name, ours in joints_of(sim.model).items():
+        theirs = scene.joints[name]
+        placed[:, ours.position], placed[:, ours.velocity] = states[:, theirs.position], states[:, theirs.velocity]
+    return placed, {name: _fixture_pose(scene, name) for name in sim.fixture_poses()}
+
+
+def _check_joints(sim: Simulation, scene: ModelFile) -> None:
+    """Raise unless both scenes have the same joints, in whatever order."""
+    ours = joints_of(sim.model)
+    for name, joint in ours.items():
+        found = scene.joints.get(name)
+        if found is None:
+            raise Unusable(f"model_file has no joint {name!r}, which task {sim.task.name} has")
+        if found.kind != joint.kind:
+            raise Unusable(f"model_file's joint {name!r} is of type {found.kind!r}, expected {joint.kind!r}")
+    beyond = next((name for name in scene.joints if name not in ours), None)
+    if beyond is not None:
+        body = scene.joints[beyond].body
+        raise Unusable(
+            f"model_file moves the body {body!r} by the joint {beyond!r}, which task {sim.task.name} does not have"
+        )
+
+
+def _check_base(sim: Simulation, scene: ModelFile) -> None:
+    theirs, ours = (np.array(model.body(BASE).pos) for model in (scene.model, sim.model))
+    if np.abs(ours - theirs).max() > BASE_TOLERANCE:
+        raise Unusable(
+            f"model_file has the arm's base {BASE!r} at {theirs.round(3).tolist()}, expected {ours.round(3).tolist()}: "
+            "it is of another scene than the benchmark's"
+        )
+
+
+def _fixture_pose(scene: ModelFile, name: str) -> Pose:
+    pose = scene.rest_pose(name)
+    if abs(pose[2] - TABLE_TOP) > NEAR_TABLE:
+        raise Unusable(
+            f"model_file has {name!r} at {pose[:3].round(3).tolist()}, not on the table at {TABLE_TOP} m: it is the "
+            "scene before its fixtures were set up; store the scene of the simulation"
+        )
+    return pose
 
 
 # --- the task ---
@@ -258,7 +323,7 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
         if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
             task = known
     task = task.in_world(world_of(demo))
-    return task.variant(int(demo.extras.get("variant", 0))) if ours is not None else task
+    return task.variant(demo.extras.variant) if ours is not None else task
 
 
 def _bddl_text(file: PublishedFile, name: str) -> str:
@@ -332,5 +397,5 @@ def _load(name: str, memory_type: str, bddl_text: str, metadata: str) -> Task:
         try:
             return load_task(folder)
         except MemobenchError as error:
-            told = str(error).replace(str(folder / METADATA_FILE), "meta_data")
-            raise Unusable(told.replace(str(folder / BDDL_FILE), "bddl_file_content")) from None
+            message = str(error).replace(str(folder / METADATA_FILE), "meta_data")
+            raise Unusable(message.replace(str(folder / BDDL_FILE), "bddl_file_content")) from None

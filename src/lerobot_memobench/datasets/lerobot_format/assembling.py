@@ -17,28 +17,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.hdf5.reading import SUFFIX
-from lerobot_memobench.datasets.hdf5.writing import write_task_file
 from lerobot_memobench.datasets.lerobot_format.card import write_card
-from lerobot_memobench.datasets.lerobot_format.files import written_files
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
     EPISODE_INFO,
     EXECUTED_ACTION,
-    HDF5_FOLDER,
     LANGUAGE,
     MANIFEST_FILE,
+    STAGING,
     TOP_LEVEL,
-    EpisodeRecord,
+    Written,
     check_destination,
     dataset_features,
+    dataset_files,
     image_key,
     objects_column,
 )
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.staging import (
-    HDF5,
-    LEROBOT,
-    STAGING,
     TEMPORARY,
     StagedEpisode,
     clean_temporaries,
@@ -47,7 +43,7 @@ from lerobot_memobench.datasets.staging import (
 )
 from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_name, write_file
+from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.protocol import CAMERAS, CLOCK, CONTROL_HZ
 
@@ -59,7 +55,7 @@ ROBOT_TYPE = "panda"
 STATES_PATH = "states/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PER_STATES_FILE = 100
 BLOCK = 16
-"""Columns of which statistics are made at once: of all, a copy in float64 for thousands of episodes is gigabytes."""
+"""Columns per pass of statistics: a float64 copy of all columns of thousands of episodes takes gigabytes."""
 
 
 def write_dataset(
@@ -96,16 +92,15 @@ def assemble(
     episodes: Sequence[StagedEpisode],
     out: Path | str,
     *,
-    formats: Collection[str] = (LEROBOT,),
     repo_id: str = DEFAULT_REPO_ID,
     made_by: str = "",
     manifest: dict[str, Any] | None = None,
     left_out: Sequence[str] = (),
 ) -> Path:
-    """Build what ``formats`` says of the staged ``episodes`` in ``out``; failed ones are named, not written.
+    """Build the dataset of the staged ``episodes`` in ``out``; failed ones are named, not written.
 
-    Deterministic: the same episodes give the same files. ``manifest`` is added to manifest.json, ``left_out`` says
-    on the card what else is missing and why.
+    Deterministic: the same episodes give the same files. ``manifest`` is added to manifest.json, ``left_out``
+    to the card: what else is missing and why.
     """
     out = Path(out)
     written = [episode for episode in episodes if episode.failure is None]
@@ -118,14 +113,10 @@ def assemble(
 
     build = out / STAGING / f"{TEMPORARY}dataset"
     shutil.rmtree(build, ignore_errors=True)
-    build.mkdir(parents=True)
     versions = (manifest or {}).get("request", {}).get("versions")
-    features = _write_lerobot(written, build, repo_id, versions) if LEROBOT in formats else {}
-    if HDF5 in formats:
-        _write_hdf5(written, build / HDF5_FOLDER)
+    features = _write_lerobot(written, build, repo_id, versions)  # makes the folder
     _write_manifest(episodes, manifest or {}, build)
-    if LEROBOT in formats:
-        write_card(build, episodes, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
+    write_card(build, episodes, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
     _move(build, out)
     return out
 
@@ -137,13 +128,11 @@ def _write_lerobot(
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.io_utils import write_stats
 
-    part = build.with_name(f"{build.name}-lerobot")  # LeRobot wants a folder that is not there yet
-    shutil.rmtree(part, ignore_errors=True)
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=CONTROL_HZ,
         features=dataset_features(_image_size(written[0])),
-        root=part,
+        root=build,
         robot_type=ROBOT_TYPE,
         use_videos=written[0].has_images,
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
@@ -151,22 +140,7 @@ def _write_lerobot(
     meta.stats = _write_frames(meta, written, versions) | _image_statistics(written)
     write_stats(meta.stats, meta.root)
     meta.finalize()
-    for path in part.iterdir():
-        path.replace(build / path.name)
-    part.rmdir()
     return dict(meta.features)
-
-
-def _write_hdf5(written: Sequence[StagedEpisode], folder: Path) -> None:
-    """Write a file per task, in the order in which the tasks first appear."""
-    by_task: dict[str, list[StagedEpisode]] = {}
-    for episode in written:
-        by_task.setdefault(episode.info["task_name"], []).append(episode)
-    for name, chosen in by_task.items():
-        attributes = chosen[0].hdf5_attributes
-        assert attributes is not None
-        path = folder / f"{file_name(name, f'the task of {chosen[0].folder}')}{SUFFIX}"
-        write_task_file(path, attributes, [episode.hdf5 for episode in chosen])
 
 
 def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
@@ -189,8 +163,16 @@ def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], bu
         row |= {"episode_index": None if episode.failure else index, "failure": episode.failure}
         index += episode.failure is None
         rows.append(row)
-    content = extra | {"episodes": rows, "files": written_files(build)}
+    content = extra | {"episodes": rows, "files": _written_files(build)}
     write_file(build / MANIFEST_FILE, json.dumps(content, indent=1), durable=True)
+
+
+def _written_files(folder: Path) -> dict[str, Written]:
+    """Return size and hash of each of a dataset's files, for its manifest."""
+    return {
+        name: {"bytes": (folder / name).stat().st_size, "sha256": file_hash(folder / name)}
+        for name in dataset_files(folder)
+    }
 
 
 def _move(build: Path, out: Path) -> None:
@@ -333,7 +315,7 @@ def frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: 
         else:
             raise MemobenchError(
                 f"{episode.folder} was staged by an older version, without the column {field.name}; delete that folder "
-                "and generate again to make this episode anew"
+                "and generate again to make this episode again"
             )
     return pa.Table.from_arrays(arrays, schema=typed.arrow_schema)
 
@@ -357,7 +339,7 @@ def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
 
 
 def states_table(states: NDArray[np.float64], number: int) -> pa.Table:
-    """Return the simulator's states, which lie beside the dataset, for replay; their width differs between tasks."""
+    """Return the simulator's states, for replay; their width differs between tasks."""
     import pyarrow as pa
 
     length, width = states.shape
@@ -442,7 +424,7 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
 
 
 def _grouped(sizes: Sequence[int], limit: float) -> list[list[int]]:
-    """Consecutive positions whose sizes sum up to at most ``limit`` (a single larger one stands alone)."""
+    """Consecutive positions whose sizes sum up to at most ``limit`` (a single larger one is alone)."""
     groups: list[list[int]] = []
     total = 0
     for position, size in enumerate(sizes):

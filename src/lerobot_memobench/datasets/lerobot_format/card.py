@@ -1,48 +1,29 @@
-"""The dataset card: README.md beside the data, as the Hugging Face hub shows it."""
+"""The dataset card: README.md of a dataset, as the Hugging Face hub shows it."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from huggingface_hub import DatasetCardData
 
 from lerobot_memobench.datasets.lerobot_format.layout import read_info, undamaged
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
-from lerobot_memobench.datasets.lerobot_format.terms import terms
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.paper import raw_tables
+from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES
 
 CARD_FILE = "README.md"
-FRONT_MATTER = """\
----
-license: {licence}
-task_categories:
-- robotics
-tags:
-- LeRobot
-- memobench
-- memory
-- manipulation
-- simulation
-- mujoco
-language:
-- en
-size_categories:
-- {bucket}
-configs:
-- config_name: default
-  data_files: data/*/*.parquet
----"""
 MADE_BY = "## How it was made"
 """Heading of a card of ours; LeRobot's has none."""
 EDITED = (
-    "A tool that knows nothing of this benchmark, such as `lerobot-edit-dataset`, has edited this dataset: its card, "
-    "tables and hashes are made from its frames. Lost are which seeds had failed, and the simulator's states: "
+    "A tool without knowledge of this benchmark, such as `lerobot-edit-dataset`, has edited this dataset: its card, "
+    "tables and hashes are made from its frames. Lost are the failed seeds, and the simulator's states: "
     "`memobench validate` makes those again from seed and actions and compares their hash, but cannot where an episode "
     "has no seed."
 )
@@ -50,12 +31,23 @@ SCRIPTED = (
     "Scripted experts act in a MuJoCo simulation; nothing was collected from people or robots. Actions were recorded "
     "as applied (`executed_action`), so that replaying them from the seed gives the same states."
 )
+OWN_TERMS = "Apache-2.0: the demonstrations, and `lerobot_memobench`, which made them."
+LIBERO_TERMS = (
+    "The scenes are of LIBERO's assets (Liu et al., 2023). LIBERO has its code under MIT and its datasets under CC BY "
+    "4.0; the packages of its assets say MIT. Name LIBERO where you show the pictures. The additions of "
+    "`lerobot_memobench`, such as actions, labels and tables, is under Apache-2.0."
+)
+AUTHORS_TERMS = (
+    "{subject} of MEMOBench's authors are under CC BY-NC 4.0 by the licence of their repository, "
+    "Collab-Gen/MEMOBench; their paper announces CC BY 4.0 for the data. Unless they say otherwise, use this dataset "
+    "for research that is not commercial, and name them (Sun et al.)."
+)
 LIMITATIONS = """\
 - It is one simulated kitchen with one Panda arm and one scripted expert: each task is done in one way, by one
   instruction, and nothing is known of real pictures.
 - In tasks with a demonstration prompt the texts of subgoals, memory and language rows name what only the prompt shows:
   which carton, which bowl, which drawer, which order. A policy that reads them where it acts is not tested for memory.
-- Visible objects, states, seeds and checkpoint columns are the simulator's: no camera tells them.
+- Visible objects, states, seeds and checkpoint columns are the simulator's: no camera shows them.
 - Frames of demonstration prompts are demonstrations of what to remember, not of what to do."""
 COLUMNS = {
     "observation.images.image": "third-person camera",
@@ -128,8 +120,7 @@ def write_card(
     if left_out:
         made.append(f"**Left out ({len(left_out)}):**\n\n" + "\n".join(f"- {problem}" for problem in left_out))
     infos = [episode.info for episode in solved]
-    storage = _storage(folder, infos, [episode.video_bytes for episode in solved])
-    text = _card(infos, failed, features, storage, made, _loading(repo_id, "<this folder>"))
+    text = _card(infos, failed, features, _size(folder), made, _loading(repo_id, "<this folder>"))
     (folder / CARD_FILE).write_text(text, encoding="utf-8")
 
 
@@ -152,12 +143,11 @@ def card_from_frames(folder: Path, rows: Sequence[Mapping[str, Any]], repo_id: s
     """
     infos = [{**row, "frames": row["length"]} for row in rows]
     loading = _loading(repo_id or "local/demonstrations", None if repo_id else "<this folder>")
-    made = [f"{EDITED} Storage is shared out by frames."]
-    return _card(infos, [], read_info(folder)["features"], _storage(folder, infos), made, loading)
+    return _card(infos, [], read_info(folder)["features"], _size(folder), [EDITED], loading)
 
 
 def hub_card(folder: Path, repo_id: str) -> str:
-    """Return the card of a dataset as it is to stand at ``repo_id`` on the hub, by which its examples load it.
+    """Return the card of a dataset for ``repo_id`` on the hub; its examples load the dataset from there.
 
     Raises:
         MemobenchError: the dataset is damaged, or none of its episodes is one of this benchmark.
@@ -177,18 +167,31 @@ def _card(
     infos: Sequence[dict[str, Any]],
     failed: Sequence[StagedEpisode],
     features: Mapping[str, dict[str, Any]],
-    storage: dict[str, float],
+    size: int,
     made: Sequence[str],
     loading: str,
 ) -> str:
+    """Return the card.
+
+    Args:
+        infos: of the episodes, with their ``frames``. size: bytes of the dataset. made: paragraphs on its making.
+    """
     licence, section = terms(infos)
+    data = DatasetCardData(
+        license=licence,
+        task_categories=["robotics"],
+        tags=["LeRobot", "memobench", "memory", "manipulation", "simulation", "mujoco"],
+        language=["en"],
+        size_categories=["n<1K" if len(infos) < 1000 else "1K<n<10K"],
+        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    )
     parts = [
-        FRONT_MATTER.format(licence=licence, bucket="n<1K" if len(infos) < 1000 else "1K<n<10K"),
+        f"---\n{data.to_yaml()}\n---",
         "# MEMOBench demonstrations",
         *_introduction(infos, loading),
         MADE_BY,
         *made,
-        *_statistics(infos, failed, storage),
+        *_statistics(infos, failed, size),
         "## Columns",
         *_columns(features),
         "## Limitations",
@@ -217,7 +220,7 @@ def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]
     return [
         f"{len(infos)} demonstrations of {len(tasks)} robot manipulation tasks that need memory "
         f"({', '.join(ordered_types(infos))}), as a LeRobotDataset v3.0 at 20 frames per second. Each task names the "
-        "checkpoints a memory has to keep (Storage), revise (Update) or summarise (Compression); every frame says "
+        "checkpoints a memory has to keep (Storage), revise (Update) or summarise (Compression); every frame holds "
         "which of them are done, because the simulator wrote the labels. Benchmark and metrics: MEMOBench; generator, "
         "environment and policies: `lerobot_memobench`.",
         *_world(infos),
@@ -233,8 +236,8 @@ def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a paragraph on the world of the scenes; nothing where it is the package's own."""
     found = [info for info in infos if info.get("world") == LIBERO]
     missing = sorted({name for info in found for name in info.get("stand_ins") or ()})
-    told = f" Scans were missing, and boxes stand in for them: {', '.join(missing)}." if missing else ""
-    return [f"The scenes are the paper's, of LIBERO's assets (`world={LIBERO}`).{told}"] if found else []
+    stand_ins = f" Scans were missing, and boxes stand in for them: {', '.join(missing)}." if missing else ""
+    return [f"The scenes are the paper's, of LIBERO's assets (`world={LIBERO}`).{stand_ins}"] if found else []
 
 
 def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
@@ -266,18 +269,47 @@ def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
     return f"**{len(failed)} of {asked} seeds asked for have no demonstration here:**\n\n" + "\n".join(lines)
 
 
-# --- statistics, beside the paper's ---
+# --- the licence ---
 
 
-def _statistics(
-    written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode], storage: dict[str, float]
-) -> list[str]:
+def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
+    """Return a dataset's licence, as the hub names it, and the section of its card on it.
+
+    They follow from the world of the scenes and from who recorded the demonstrations.
+
+    Args:
+        infos: of its episodes (`staging.Info`).
+    """
+    infos = list(infos)
+    there = [info for info in infos if info.get("world") == LIBERO]
+    theirs = {
+        "The demonstrations": any(info["seed"] < 0 for info in infos),  # converted: `memobench generate` knows the seed
+        "The scanned objects": any(map(_shows_scans, there)),
+    }
+    parts = [AUTHORS_TERMS.format(subject=subject) for subject, shown in theirs.items() if shown]
+    if not there and not parts:
+        return "apache-2.0", OWN_TERMS
+    return "cc-by-nc-4.0" if parts else "other", "\n\n".join([*([LIBERO_TERMS] if there else []), *parts])
+
+
+def _shows_scans(info: Mapping[str, Any]) -> bool:
+    """Whether a scan of the authors' is in an episode's scene: every object of a spatial task is one, or a stand-in."""
+    name = info["task_name"]
+    if info["memory_type"] != "spatial" or suite_of(name) is None:
+        return False
+    return not set(get_task(name).objects.values()) <= set(info.get("stand_ins") or ())
+
+
+# --- statistics, and the paper's ---
+
+
+def _statistics(written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode], size: int) -> list[str]:
     return [
         "## Statistics",
         "Steps are frames: control steps of 50 ms, demonstration prompt included. The paper's rows are those of its "
-        "demonstrations (appendix, family level statistics), stored as HDF5; storage here is that of the "
-        "LeRobotDataset: videos as they are, everything else in proportion to the frames.",
-        _lengths_table(written, storage),
+        "demonstrations (appendix, family level statistics).",
+        _lengths_table(written),
+        f"{size / sum(info['frames'] for info in written):,.0f} bytes per frame.",
         _prompts(written),
         "How many episodes have which length, in steps (paper: appendix, distribution of lengths):",
         _buckets_table(written),
@@ -294,23 +326,10 @@ def _prompts(infos: Sequence[dict[str, Any]]) -> str:
     return f"Of these steps the demonstration prompt takes, on average, {' and '.join(parts)}." if parts else ""
 
 
-def _storage(folder: Path, infos: Sequence[Mapping[str, Any]], videos: Sequence[int] | None = None) -> dict[str, float]:
-    """Return bytes per memory type, and their ``total``; what belongs to no episode is shared out by frames.
-
-    The manifest is not counted: it says what was asked for, and the same episodes are of the same size.
-
-    Args:
-        videos: bytes of each episode's videos; None where nobody knows them.
-    """
-    videos = [0] * len(infos) if videos is None else videos
+def _size(folder: Path) -> int:
+    """Return the bytes of a dataset, without its card and manifest."""
     kept = [folder / part for part in ("data", "meta", "states", "videos")]
-    total = sum(path.stat().st_size for part in kept for path in part.rglob("*") if path.is_file())
-    frames = sum(info["frames"] for info in infos)
-    found = {"total": float(total)}
-    for info, own in zip(infos, videos, strict=True):
-        share = own + (total - sum(videos)) * info["frames"] / frames
-        found[info["memory_type"]] = found.get(info["memory_type"], 0.0) + share
-    return found
+    return sum(path.stat().st_size for part in kept for path in part.rglob("*") if path.is_file())
 
 
 def ordered_types(infos: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -319,17 +338,14 @@ def ordered_types(infos: Sequence[Mapping[str, Any]]) -> list[str]:
     return [name for name in FAMILIES if name in there] + sorted(there - set(FAMILIES))
 
 
-def _lengths_table(infos: Sequence[dict[str, Any]], storage: dict[str, float]) -> str:
-    """Return episodes, steps and storage per memory type, and the bytes per frame."""
+def _lengths_table(infos: Sequence[dict[str, Any]]) -> str:
+    """Return episodes and steps per memory type, and the paper's."""
     rows = []
     for name in [*ordered_types(infos), "total"]:
-        chosen = [info for info in infos if name in (info["memory_type"], "total")]
-        rows.append([name, "here", *_lengths(_figures(chosen)), _bytes(storage.get(name, 0.0))])
+        rows.append([name, "here", *_lengths(_figures([i for i in infos if name in (i["memory_type"], "total")]))])
         if name in FAMILIES:
-            rows.append(["", "paper", *_lengths(FAMILIES[name]), f"{FAMILIES[name]['gib']:.2f} GiB"])
-    header = ["memory type", "", "tasks", "episodes", "steps", "mean", "median", "P95", "max", "storage"]
-    frames = sum(info["frames"] for info in infos)
-    return markdown(header, rows) + f"\n\n{storage['total'] / frames:,.0f} bytes per frame."
+            rows.append(["", "paper", *_lengths(FAMILIES[name])])
+    return markdown(["memory type", "", "tasks", "episodes", "steps", "mean", "median", "P95", "max"], rows)
 
 
 def _figures(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -349,10 +365,6 @@ def _figures(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def _lengths(row: Mapping[str, Any]) -> list[str]:
     whole, parts = ("tasks", "episodes", "steps"), ("mean", "median", "p95")
     return [*(f"{row[key]:,}" for key in whole), *(f"{row[key]:,.2f}" for key in parts), f"{row['max']:,}"]
-
-
-def _bytes(size: float) -> str:
-    return f"{size / 1024**3:.2f} GiB" if size >= 0.1 * 1024**3 else f"{size / 1024**2:.2f} MiB"
 
 
 def _buckets_table(infos: Sequence[dict[str, Any]]) -> str:

@@ -4,45 +4,38 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import json
 import math
 import os
 import shlex
 import traceback
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
-import numpy as np
 from annotated_types import Ge, Le
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
-from lerobot_memobench.datasets.staging import STAGING
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
-    Malformed,
     Whole,
     cache_folder,
     check_fetched,
     count_of,
-    first_fault,
-    parsed,
     read_json,
     refusing,
 )
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
-from lerobot_memobench.tasks.task import World
 
+STAGING = ".staging"
+"""Folder of an unfinished run within its destination."""
 DEFAULT_REPO_ID = "memobench/memobench"
-HDF5_FOLDER = "hdf5"
 MANIFEST_FILE = "manifest.json"
 INFO_FILE = Path("meta") / "info.json"
 STATS_FILE = Path("meta") / "stats.json"
 TASKS_FILE = Path("meta") / "tasks.parquet"
-TOP_LEVEL = (HDF5_FOLDER, "videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
+TOP_LEVEL = ("videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
 """Moved into place in this order; with `meta` the folder becomes a dataset, without it the manifest is the last."""
 EPISODE_INFO = "episode_info"
 """The frames' column; empty but at an episode's first frame."""
@@ -61,7 +54,7 @@ ADVICE = "the dataset is damaged; generate it or take it from its source again"
 NO_MANIFEST = "it is no manifest that this package wrote; take the dataset from its source again"
 EARLIER_FORMATS = ("v1.6", "v2.0", "v2.1")
 MOST_NUMBERS = 50_000_000
-"""Of a feature in one frame: a picture of 4096 x 4096. LeRobot takes memory for as many as a dataset tells."""
+"""Limit of numbers of a feature in one frame: a picture of 4096 x 4096. LeRobot allocates memory for all of them."""
 
 
 def is_dataset(folder: Path) -> bool:
@@ -77,12 +70,19 @@ def check_destination(out: Path) -> None:
         raise MemobenchError(f"{out} holds a colon, which Arrow reads as an address; name it by its whole path")
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
-    # What an interrupted move left beside the staging folder will be replaced.
+    # Files that an interrupted move left next to the staging folder are replaced.
     strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
     if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
         raise MemobenchError(
             f"{out} holds {', '.join(sorted(strangers)[:3])}, no part of a dataset being made; name an empty folder"
         )
+
+
+def dataset_files(folder: Path) -> list[str]:
+    """Return the files of the dataset in ``folder`` by their paths in it, without card, manifest and caches."""
+    folders = [folder / name for name in TOP_LEVEL if not Path(name).suffix]
+    found = [path for part in folders for path in part.rglob("*") if path.is_file()]
+    return sorted(path.relative_to(folder).as_posix() for path in found)
 
 
 # --- columns ---
@@ -182,27 +182,27 @@ def read_info(folder: Path) -> dict[str, Any]:
         sizes = [size for size in shape if isinstance(size, int)] if isinstance(shape, list) else []
         if abs(math.prod(sizes)) > MOST_NUMBERS:
             raise MemobenchError(
-                f"{folder / INFO_FILE} tells of more than {MOST_NUMBERS:,} numbers of {name[:80]} a frame; {ADVICE}"
+                f"{folder / INFO_FILE} has more than {MOST_NUMBERS:,} numbers of {name[:80]} per frame; {ADVICE}"
             )
     return found
 
 
 def episode_count(folder: Path) -> int:
-    """Return how many episodes the dataset in ``folder`` has, as ``meta/info.json`` and ``meta/episodes`` both say.
+    """Return the number of episodes of the dataset in ``folder``, by ``meta/info.json`` and ``meta/episodes``.
 
     Raises:
         MemobenchError: they cannot be read, or disagree.
     """
-    told, rows = int(read_info(folder)["total_episodes"]), _row_count(folder / "meta" / "episodes")
-    if rows != told:
+    count, rows = int(read_info(folder)["total_episodes"]), _row_count(folder / "meta" / "episodes")
+    if rows != count:
         raise MemobenchError(
-            f"{folder / INFO_FILE} tells of {count_of(told, 'episode')}, {folder}/meta/episodes of {rows}; {ADVICE}"
+            f"{folder / INFO_FILE} has {count_of(count, 'episode')}, {folder}/meta/episodes {rows}; {ADVICE}"
         )
-    return told
+    return count
 
 
 def _row_count(folder: Path) -> int:
-    """Return how many rows the tables in a folder say that they have."""
+    """Return the number of rows of the tables in a folder, by their footers."""
     import pyarrow.parquet as pq
 
     rows = 0
@@ -210,86 +210,6 @@ def _row_count(folder: Path) -> int:
         with undamaged(path):
             rows += pq.read_metadata(path).num_rows
     return rows
-
-
-class EpisodeRecord(BaseModel):
-    """Fields of an episode as a whole: its task, seed, placement, hashes.
-
-    It stands twice. In ``meta/episodes``, where ``LeRobotDataset(…, episode_filter=…)`` looks; and as JSON in the
-    frames' column `EPISODE_INFO`, at each episode's first frame, because LeRobot's dataset tools
-    (``lerobot-edit-dataset``) keep the frames' columns and drop every column of ``meta/episodes`` and every file that
-    LeRobot does not know.
-
-    Attributes:
-        seed: of the scene; -1 where it is not known.
-        key_frames: one per checkpoint, -1 where it was not completed.
-        fixture_poses: fixture to position and quaternion wxyz.
-        digest: sha256 of states, actions and labels; None in datasets from before there was one.
-        world: of its scene; None in the package's own.
-        stand_ins: classes whose scans were missing, so that others stood in for them; None in the package's own world.
-        versions: of the packages on which the numbers depend, where they are known.
-    """
-
-    model_config = ConfigDict(frozen=True)
-
-    task_name: str
-    memory_type: str
-    family: str = ""
-    operations: str = ""
-    seed: int
-    referent: str = "fixed"
-    variant: int
-    success: bool | None = None
-    exec_start_index: int
-    key_frames: list[int]
-    scene_hash: str | None = None
-    fixture_poses: dict[str, list[float]] | None = None
-    digest: str | None = None
-    world: World | None = None
-    stand_ins: list[str] | None = None
-    versions: dict[str, str] | None = None
-
-    def in_frames(self) -> str:
-        """Return the text of the first frame's column."""
-        return self.model_dump_json(exclude_none=True)
-
-    def in_meta(self) -> dict[str, Any]:
-        """Return the columns of ``meta/episodes``."""
-        elsewhere = {} if self.world is None else {"world": self.world, "stand_ins": json.dumps(self.stand_ins or [])}
-        return self.model_dump(exclude={"versions", "world", "stand_ins"}) | {
-            "key_frames": np.array(self.key_frames, dtype=np.int64),
-            "fixture_poses": json.dumps(self.fixture_poses),
-            **elsewhere,
-        }
-
-
-def from_frames(text: str, where: str) -> EpisodeRecord:
-    """Return the record that a first frame holds; ``where`` begins the message.
-
-    Raises:
-        MemobenchError: the text is no record.
-    """
-    try:
-        value = parsed(text)
-        try:
-            return EpisodeRecord.model_validate(value)
-        except ValidationError as error:
-            raise Malformed(first_fault(error.errors(include_url=False), value)) from None
-    except Malformed as error:
-        raise MemobenchError(
-            f"{where}: its column {EPISODE_INFO} is none that this package writes ({error}); take the dataset from its "
-            "source again"
-        ) from None
-
-
-def from_meta(row: Mapping[str, Any]) -> EpisodeRecord | None:
-    """Return the record that a row of ``meta/episodes`` holds; None where it holds none, or a part of one."""
-    values = {key: row[key] for key in EpisodeRecord.model_fields if row.get(key) is not None}
-    try:
-        in_json = {key: json.loads(values.get(key, "null")) for key in ("fixture_poses", "stand_ins")}
-        return EpisodeRecord.model_validate(values | in_json)
-    except (ValidationError, ValueError, TypeError):
-        return None
 
 
 class Asked(TypedDict):
@@ -374,7 +294,7 @@ def undamaged(folder: Path) -> AbstractContextManager[None]:
 
 
 def check_whole(folder: Path) -> None:
-    """Raise unless the dataset in ``folder`` has all of its frames, as far as that can be told without reading them.
+    """Raise unless the dataset in ``folder`` has all of its frames, as far as that can be checked without reading them.
 
     Checked are the ends of tables and their numbers of rows, and the boxes of videos and their numbers of frames.
 
@@ -388,7 +308,7 @@ def check_whole(folder: Path) -> None:
     for part, expected in counts.items():
         rows = _row_count(folder / part)
         if expected is not None and rows != expected:
-            raise MemobenchError(f"{folder / part} holds {rows} rows, {INFO_FILE} tells of {expected}; {ADVICE}")
+            raise MemobenchError(f"{folder / part} holds {rows} rows, {INFO_FILE} names {expected}; {ADVICE}")
     cameras = [key for key, feature in info["features"].items() if feature.get("dtype") == "video"]
     for path, frames in _video_lengths(folder, info, cameras).items():
         with undamaged(path):
@@ -396,7 +316,7 @@ def check_whole(folder: Path) -> None:
 
 
 def _video_lengths(folder: Path, info: dict[str, Any], cameras: list[str]) -> dict[Path, int]:
-    """Return how many frames each video must have, as meta/episodes tells of its last one."""
+    """Return how many frames each video must have, from its last one in meta/episodes."""
     import pyarrow.parquet as pq
 
     found: dict[Path, int] = {}
@@ -412,7 +332,7 @@ def _video_lengths(folder: Path, info: dict[str, Any], cameras: list[str]) -> di
 
 
 def _check_video(path: Path, frames: int) -> None:
-    """Raise unless a video's boxes fill its file, and it tells of at least so many frames."""
+    """Raise unless a video's boxes fill its file, and its header has at least so many frames."""
     import av
 
     check_fetched(path)
@@ -429,7 +349,7 @@ def _check_video(path: Path, frames: int) -> None:
     with av.open(str(path)) as container:
         there = container.streams.video[0].frames
     if 0 < there < frames:
-        raise MemobenchError(f"{path} has {there} frames, meta/episodes tells of {frames}; {ADVICE}")
+        raise MemobenchError(f"{path} has {there} frames, meta/episodes names {frames}; {ADVICE}")
 
 
 def damaged_file(folder: Path) -> str | None:
@@ -474,7 +394,7 @@ def read_to_end(path: Path) -> None:
 
 @contextmanager
 def naming_damage(folder: Path | None) -> Iterator[None]:
-    """Name the damaged file of a dataset, where LeRobot reads it and its error does not; None: nothing is known of it.
+    """Name the damaged file of a dataset where LeRobot's own error does not; None: no dataset is known.
 
     Raises:
         MemobenchError: in the place of such an error.
@@ -488,8 +408,8 @@ def naming_damage(folder: Path | None) -> Iterator[None]:
         reading = any(name.startswith(("lerobot.datasets.", "datasets.", "torch.utils.data.")) for name in names)
         if folder is None or not reading or not (folder / INFO_FILE).is_file():
             raise
-        told = damaged_file(folder)
-        if told is None:
+        message = damaged_file(folder)
+        if message is None:
             check_whole(folder)
             raise
-        raise MemobenchError(told) from error
+        raise MemobenchError(message) from error

@@ -1,6 +1,6 @@
 """Read a dataset of this package back: the record of each episode, and an episode's frames.
 
-LeRobot's dataset tools may have edited it since; what they leave is read from the frames (`layout.EpisodeRecord`).
+LeRobot's dataset tools may have edited it since; what they leave is read from the frames (`record.EpisodeRecord`).
 """
 
 from __future__ import annotations
@@ -19,12 +19,10 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     LANGUAGE,
     OBJECTS,
     PRIVILEGED,
-    EpisodeRecord,
-    from_frames,
-    from_meta,
     is_dataset,
     undamaged,
 )
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord, from_frames, from_meta
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, World
@@ -34,10 +32,10 @@ if TYPE_CHECKING:
 
 Columns = dict[str, Any]
 STRANGER = (
-    "it tells neither task nor seed: another program made it, or LeRobot's tools edited a dataset that was written "
-    f"before its frames had the column {EPISODE_INFO}, and dropped what meta/episodes said; generate it again"
+    "it has neither task nor seed: another program made it, or LeRobot's tools edited a dataset that was written "
+    f"before its frames had the column {EPISODE_INFO}, and dropped the fields of meta/episodes; generate it again"
 )
-"""Of an episode without a record."""
+"""Message on an episode without a record."""
 WHOLE = {
     "memory_type",
     "family",
@@ -79,12 +77,12 @@ def list_episodes(folder: Path) -> list[EpisodePlace]:
     _check(folder)
     rows = _rows(folder)
     first = _read(folder / "data", ("episode_index", EPISODE_INFO), [("frame_index", "==", 0)]).to_pylist()
-    told = {int(row["episode_index"]): row.get(EPISODE_INFO) for row in first}
-    return [_place(folder, row, told.get(row["episode_index"])) for row in rows]
+    texts = {int(row["episode_index"]): row.get(EPISODE_INFO) for row in first}
+    return [_place(folder, row, texts.get(row["episode_index"])) for row in rows]
 
 
 def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
-    """Return the numbers of a dataset's episodes of which all that is ``wanted`` holds, for LeRobot's ``episodes``.
+    """Return the numbers of a dataset's episodes with all ``wanted`` fields, for LeRobot's ``episodes``.
 
     ``LeRobotDataset(…, episodes=episodes_where(folder, memory_type="spatial"))`` is what LeRobot's ``episode_filter``
     does, also after LeRobot's dataset tools have dropped the columns that such a filter needs.
@@ -98,8 +96,8 @@ def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
     records = {place.index: place.record for place in list_episodes(Path(folder)) if place.record is not None}
     found = [n for n, record in records.items() if all(getattr(record, k) == v for k, v in wanted.items())]
     if not found:
-        told = ", ".join(f"{key}={value!r}" for key, value in wanted.items())
-        raise MemobenchError(f"{folder} has no episode with {told}; see `memobench describe {folder}` for what it has")
+        asked = ", ".join(f"{key}={value!r}" for key, value in wanted.items())
+        raise MemobenchError(f"{folder} has no episode with {asked}; `memobench describe {folder}` lists them")
     return found
 
 
@@ -145,14 +143,14 @@ def check_idling(folder: Path, places: Iterable[EpisodePlace] | None = None) -> 
         if found not in begins:
             raise MemobenchError(
                 f"episode {place.index} of {folder} ({record.task_name}, seed {record.seed}) begins its execution at "
-                f"step {found} and not, as now, at {begins[0]}: strict demonstrations from before the robot idled tell "
-                "by the step what has been done; generate them again"
+                f"step {found} and not, as now, at {begins[0]}: strict demonstrations from before the robot idled show "
+                "by the step how much is done; generate them again"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedEpisode:
-    """An episode of a dataset on disk: ``columns`` per frame and what the dataset says of the whole.
+    """An episode of a dataset on disk: ``columns`` per frame and ``whole``, the fields of the episode.
 
     The instruction of each frame is the column ``task``; ``start`` is the first frame in the dataset's global index.
     """
@@ -186,8 +184,8 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
     if record is None:
         raise MemobenchError(STRANGER)
     _check_record(rows[0], record, texts, len(columns["frame_index"]))
-    told = record.model_dump(include=WHOLE)
-    whole = {key: value for key, value in told.items() if value not in (None, "")}
+    fields = record.model_dump(include=WHOLE)
+    whole = {key: value for key, value in fields.items() if value not in (None, "")}
     if LANGUAGE in columns:
         whole[LANGUAGE] = columns[LANGUAGE][0]
         changed = next((frame for frame, rows in enumerate(columns[LANGUAGE]) if rows != whole[LANGUAGE]), None)
@@ -208,17 +206,17 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
 
 
 def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | None], length: int) -> None:
-    """Raise where the two places that tell of an episode, or its frames, contradict each other."""
+    """Raise where the two records of an episode, or its frames, contradict each other."""
     in_meta = from_meta(row)
     for key in EpisodeRecord.model_fields if in_meta is not None else ():
         here, there = getattr(record, key), getattr(in_meta, key)
         if key != "versions" and here != there:
-            raise MemobenchError(f"meta/episodes says {key}={there!r}, the frames' column {EPISODE_INFO} {here!r}")
+            raise MemobenchError(f"meta/episodes has {key}={there!r}, the frames' column {EPISODE_INFO} {here!r}")
     again = next((frame for frame, text in enumerate(texts) if frame and text), None)
     if again is not None:
-        raise MemobenchError(f"{EPISODE_INFO} at frame {again} says {texts[again]!r}, expected nothing but at frame 0")
+        raise MemobenchError(f"{EPISODE_INFO} at frame {again} is {texts[again]!r}, expected nothing but at frame 0")
     if row["length"] != length:
-        raise MemobenchError(f"meta/episodes says length={row['length']}, but it has {length} frames")
+        raise MemobenchError(f"meta/episodes has length={row['length']}, but it has {length} frames")
 
 
 def _name_tasks(root: Path, columns: Columns) -> None:
@@ -243,9 +241,9 @@ def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]
     return _read(folder / "meta" / "episodes", own, chosen).sort_by("episode_index").to_pylist()
 
 
-def _place(folder: Path, row: dict[str, Any], told: str | None) -> EpisodePlace:
+def _place(folder: Path, row: dict[str, Any], text: str | None) -> EpisodePlace:
     number = int(row["episode_index"])
-    record = from_frames(told, f"{folder}, episode {number}") if told else from_meta(row)
+    record = from_frames(text, f"{folder}, episode {number}") if text else from_meta(row)
     instructions = tuple(row.get("tasks") or ())
     return EpisodePlace(number, int(row["dataset_from_index"]), int(row["length"]), record, instructions)
 

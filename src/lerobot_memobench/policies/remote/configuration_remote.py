@@ -13,8 +13,8 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 
 IMAGE, WRIST_IMAGE, STATE, TASK = "image", "wrist_image", "state", "task"
-"""Names of what can be sent: both cameras (256, 256, 3) uint8, proprioception (8,) float32, the instruction. Any other
-observation of the environment goes by its own name (``phase``, ``step``)."""
+"""Names of observations that can be sent: both cameras (256, 256, 3) uint8, proprioception (8,) float32, the
+instruction. Any other observation of the environment goes by its own name (``phase``, ``step``)."""
 
 OPENPI_KEYS = {
     "observation/image": IMAGE,
@@ -24,7 +24,7 @@ OPENPI_KEYS = {
 }
 
 VLA_EVAL_KEYS = {"images.agentview": IMAGE, "images.wrist": WRIST_IMAGE, "states": STATE, "task_description": TASK}
-"""What vla-evaluation-harness's model servers read; a point goes a level down."""
+"""Keys of vla-evaluation-harness's model servers; a point leads a level down."""
 
 LIBERO, RLDS = "libero", "rlds"
 GRIPPERS = (LIBERO, RLDS)
@@ -32,8 +32,7 @@ GRIPPERS = (LIBERO, RLDS)
 whatever lies between into the nearer of both."""
 
 
-WEBSOCKETS = ("websocket", "vla_eval")
-"""Transports that are reached by ``ws://``."""
+OPENPI, VLA_EVAL = "openpi", "vla_eval"
 
 
 @dataclass(frozen=True)
@@ -41,24 +40,21 @@ class Dialect:
     """One kind of server.
 
     Attributes:
-        transport: ``websocket`` (openpi's), ``act`` (OpenVLA's REST), ``process_frame`` (MemoryVLA's REST) or
-            ``vla_eval`` (vla-evaluation-harness's websocket).
-        port: where the server listens unless told otherwise.
+        protocol: ``openpi`` or ``vla_eval`` (vla-evaluation-harness), both over a websocket.
+        port: where the server listens by default.
         keys: the server's name of each thing that is sent -> our name of it.
         image_size: side of the images that are sent, pixels; None for as rendered, where the server resizes itself.
-        gripper: meaning of the last number of an action.
-        n_action_steps: actions executed of each answer unless told otherwise.
+        n_action_steps: actions executed of each answer by default.
         memory: the server remembers what it was sent, so that it has to see the episode again when it was restarted.
         shared: it has one memory for all its connections, so it serves one environment at a time.
         buffers: it is sent every frame, in a message of its own before each question (``add_buffer``).
         history: it is sent the demonstration prompt at once, with the first question of the execution.
     """
 
-    transport: str = "websocket"
+    protocol: str = OPENPI
     port: int = 8000
     keys: Mapping[str, str] = field(default_factory=lambda: dict(OPENPI_KEYS))
     image_size: int | None = None
-    gripper: str = LIBERO
     n_action_steps: int = 5
     memory: bool = False
     shared: bool = False
@@ -71,25 +67,9 @@ DIALECTS: dict[str, Dialect] = {
     "openpi": Dialect(image_size=224),
     # RoboMME/robomme_policy_learning: examples/robomme/{eval,utils}.py, serving/websocket_policy_server.py
     "robomme": Dialect(port=8011, memory=True, shared=True, buffers=True),
-    # openvla-oft: vla-scripts/deploy.py, experiments/robot/{openvla_utils,robot_utils}.py
-    "openvla_oft": Dialect(
-        transport="act",
-        port=8777,
-        keys={"full_image": IMAGE, "wrist_image": WRIST_IMAGE, "state": STATE, "instruction": TASK},
-        gripper=RLDS,
-    ),
-    # shihao1895/MemoryVLA: deploy.py, evaluation/libero/{vla_policy,eval_libero}.py; RoboMME/MemoryVLA: deploy.py
-    "memoryvla": Dialect(
-        transport="process_frame",
-        port=2345,
-        keys={"image": IMAGE, "text": TASK},
-        gripper=RLDS,
-        memory=True,
-        shared=True,
-    ),
     # vla-eval 0.8: protocol/{messages,numpy_codec,image_codec}.py, connection.py, model_servers/{serve,predict}.py. Its
     # servers answer one action, and keep the rest of a chunk themselves.
-    "vla_eval": Dialect(transport="vla_eval", keys=VLA_EVAL_KEYS, n_action_steps=1, memory=True, history=True),
+    "vla_eval": Dialect(protocol=VLA_EVAL, keys=VLA_EVAL_KEYS, n_action_steps=1, memory=True, history=True),
 }
 
 BY_DIALECT: Any = None
@@ -99,19 +79,19 @@ BY_DIALECT: Any = None
 @PreTrainedConfig.register_subclass("memobench_remote")
 @dataclass
 class RemoteConfig(UntrainedConfig):
-    """Where the server is, what it speaks, and what is done when it goes away.
+    """Address and dialect of the server, and patience when it goes away.
 
     Args:
         host: name or address of the server's machine; ``ws://`` or ``wss://`` before it is understood.
         port: its port; the dialect's usual one when left out.
         servers: several servers, ``host:port,host:port``; environment i of a batch asks server i modulo their number.
-        dialect: what the server speaks, one of `DIALECTS`.
+        dialect: protocol of the server, one of `DIALECTS`.
         n_action_steps: actions executed of each answer (``replan=``); 5, of ``vla_eval`` 1, when left out.
         keys: names of what is sent, ``theirs=ours,…`` with ours one of image, wrist_image, state, task or another
             observation of the environment; replaces the dialect's.
         image_size: side of the images that are sent, padded to a square, pixels; 0 for as rendered.
         mirror: send images mirrored left to right, for checkpoints trained on LIBERO's images as openpi turns them.
-        gripper: meaning of the last number of an action, one of `GRIPPERS`; the dialect's when left out.
+        gripper: meaning of the last number of an action, one of `GRIPPERS`.
         memory: whether the server remembers what it was sent; the dialect's when left out.
         send_prompt: whether it sees the demonstration prompt. Switch it off for a policy without memory, to save time.
         history_every: steps between the frames of the prompt that it sees; ``n_action_steps`` when left out, of
@@ -119,7 +99,7 @@ class RemoteConfig(UntrainedConfig):
         connect_timeout: how long the first connection is waited for, s.
         timeout: how long an answer is waited for, s; the first one may include compilation.
         retry: how long a server that went away is waited for, s.
-        label: what is served, in your words; it goes onto the result card, since a server does not tell it.
+        label: name of the checkpoint for the result card; servers do not send one.
     """
 
     reads_prompt: ClassVar[bool] = True
@@ -132,7 +112,7 @@ class RemoteConfig(UntrainedConfig):
     keys: str | None = None
     image_size: int | None = None
     mirror: bool = False
-    gripper: str | None = None
+    gripper: str = LIBERO
     memory: bool | None = None
     send_prompt: bool = True
     history_every: int | None = None
@@ -145,7 +125,7 @@ class RemoteConfig(UntrainedConfig):
         super().__post_init__()
         if self.dialect not in DIALECTS:
             raise MemobenchError(f"policy.dialect is {self.dialect!r}, {nearest(self.dialect, DIALECTS)}")
-        if self.gripper is not None and self.gripper not in GRIPPERS:
+        if self.gripper not in GRIPPERS:
             raise MemobenchError(f"policy.gripper is {self.gripper!r}, {nearest(self.gripper, GRIPPERS)}")
         if self.n_action_steps is BY_DIALECT:
             self.n_action_steps = self.spoken.n_action_steps
@@ -163,15 +143,15 @@ class RemoteConfig(UntrainedConfig):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """What its server is sent, in the words of `envs.observations`."""
+        """Inputs of its server, in the terms of `envs.observations`."""
         sent = set(self.sent().values())
-        told = {"environment_state": PRIVILEGED, "expert_action": SIMULATOR, "blind_action": SIMULATOR}
+        special = {"environment_state": PRIVILEGED, "expert_action": SIMULATOR, "blind_action": SIMULATOR}
         pixels = (PIXEL_INPUT,) * bool(sent & {IMAGE, WRIST_IMAGE})
-        return pixels + tuple(dict.fromkeys(words for name, words in told.items() if name in sent))
+        return pixels + tuple(dict.fromkeys(words for name, words in special.items() if name in sent))
 
     @property
     def spoken(self) -> Dialect:
-        """What the server expects."""
+        """The protocol of the server."""
         return DIALECTS[self.dialect]
 
     @property
@@ -210,19 +190,15 @@ class RemoteConfig(UntrainedConfig):
 
     def _address(self, text: str) -> str:
         scheme, rest = text.split("://", 1) if "://" in text else ("", text)
-        known = ("ws", "wss") if self.spoken.transport in WEBSOCKETS else ("http", "https")
         host, _, port = rest.rpartition(":")
         if not host or not port.isdigit() or not 0 < int(port) < 65536 or set(host) & set("/ @?#"):
             raise MemobenchError(
                 f"found {text!r} as the policy server's address; expected a host and a port, as in host=10.0.0.5 "
                 "port=8000 or policy.servers=gpu1:8000,gpu2:8000"
             )
-        if scheme and scheme not in known:
-            raise MemobenchError(
-                f"found the address {text!r}; servers that speak {self.dialect} are reached by {known[0]}:// or "
-                f"{known[1]}://"
-            )
-        return f"{scheme or known[0]}://{host}:{port}"
+        if scheme not in ("", "ws", "wss"):
+            raise MemobenchError(f"found the address {text!r}; policy servers are reached by ws:// or wss://")
+        return f"{scheme or 'ws'}://{host}:{port}"
 
     def sent(self) -> dict[str, str]:
         """Return the server's name -> our name of everything that is sent.

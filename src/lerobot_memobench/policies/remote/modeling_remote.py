@@ -43,10 +43,10 @@ class Actor:
 
     def act(self, row: Row) -> Action:
         """Return the action (7,) for the present observation; the server may be asked."""
-        told, phase = row.scalar("step"), row.scalar("phase")
-        last, self._clock = self._clock, self._now(told, phase)
+        step, phase = row.scalar("step"), row.scalar("phase")
+        last, self._clock = self._clock, self._now(step, phase)
         begins = begins_episode(last, self._clock)
-        self._rests = (not begins and is_frozen(last, self._clock)) or (told is not None and row.blank)
+        self._rests = (not begins and is_frozen(last, self._clock)) or (step is not None and row.blank)
         if self._rests:
             return np.zeros(ACTION_DIM, np.float32)  # the episode has ended, or was never run
         if begins:
@@ -65,11 +65,11 @@ class Actor:
             self._queue.extend(self.session.ask(row)[: self.config.n_action_steps])
         return self._queue.popleft()
 
-    def _now(self, told: int | None, phase: int | None) -> tuple[int, int]:
+    def _now(self, step: int | None, phase: int | None) -> tuple[int, int]:
         """Return the phase and the control step since it began."""
-        if told is None:
+        if step is None:
             return EXECUTION, 0 if self._clock is None else self._clock[1] + 1
-        return EXECUTION if phase is None else phase, told
+        return EXECUTION if phase is None else phase, step
 
     def needs_observation(self) -> bool:
         """Whether the server is sent the pictures of the next observation; the first of an execution it always is."""
@@ -107,7 +107,7 @@ class RemotePolicy(UntrainedPolicy):
         self._threads = 0
 
     def reset(self) -> None:
-        """A rollout begins. Connections stay; a server that is not there is told before anything is simulated."""
+        """Begin a rollout. Connections stay; a missing server is an error before anything is simulated."""
         if not self._actors:
             self._add_actor()
         self._actors[0].session.connect()

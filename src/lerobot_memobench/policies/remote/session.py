@@ -23,28 +23,20 @@ from lerobot_memobench.policies.remote.configuration_remote import (
     RLDS,
     STATE,
     TASK,
+    VLA_EVAL,
     WRIST_IMAGE,
     RemoteConfig,
 )
-from lerobot_memobench.policies.remote.transports import Act, ProcessFrame, Rest, ServerAway, Websocket
+from lerobot_memobench.policies.remote.transports import ServerAway, Websocket
 from lerobot_memobench.policies.remote.vla_eval import VlaEval, episode_start, observation, png_map
 from lerobot_memobench.protocol import ACTION_DIM
 
 logger = logging.getLogger(__name__)
 
-Transport = Websocket | Rest
-TRANSPORTS: dict[str, type[Transport]] = {
-    "websocket": Websocket,
-    "vla_eval": VlaEval,
-    "act": Act,
-    "process_frame": ProcessFrame,
-}
-
 MOST_ACTIONS = 4096
-"""Of an answer: more than three episodes of the paper's horizon."""
+"""Limit of an answer: more than three episodes of the paper's horizon."""
 PAUSE = 0.5
 """Between two attempts to reach a server, s."""
-FIRST_FRAME = "episode_first_frame"
 RESET = {"reset": True}
 HISTORY = {IMAGE: "video_history", WRIST_IMAGE: "wrist_video_history", STATE: "state_history"}
 """Our name of what is observed -> that of the demonstration prompt's part of it, with vla-evaluation-harness."""
@@ -52,7 +44,7 @@ HISTORY = {IMAGE: "video_history", WRIST_IMAGE: "wrist_video_history", STATE: "s
 
 @dataclass(frozen=True)
 class Question:
-    """What is sent to a server, and whether its memory then holds it."""
+    """A message to a server, and whether its memory then holds it."""
 
     content: dict[str, Any]
     remembered: bool
@@ -69,17 +61,17 @@ class Session:
     def __init__(self, config: RemoteConfig, address: str) -> None:
         self.config, self.address = config, address
         self._dialect, self._keys = config.spoken, config.sent()
-        self._transport: Transport = TRANSPORTS[self._dialect.transport](address, config.timeout)
+        self._speaks_vla_eval = self._dialect.protocol == VLA_EVAL
+        self._transport = (VlaEval if self._speaks_vla_eval else Websocket)(address, config.timeout)
         self._connected = False  # ever
         self._fresh = False  # the connection has served no episode yet
         self._begin_memory()
 
     def _begin_memory(self) -> None:
-        self._told: list[Question] = []  # what a restarted server has to hear again
+        self._sent: list[Question] = []  # messages that a restarted server gets again
         self._frames: list[dict[str, Any]] = []  # by our names, not sent yet
-        self._opening: dict[str, Any] | None = None  # what tells the server that the episode begins
+        self._opening: dict[str, Any] | None = None  # the message that begins an episode
         self._seen, self._execution_starts = 0, 0
-        self._first = True
 
     # --- what the policy calls ---
 
@@ -101,7 +93,7 @@ class Session:
             on_wait=lambda reason: logger.warning("waiting for the policy server at %s (%s)", self.address, reason),
         )
         self._connected = self._fresh = True
-        logger.info("connected with the policy server at %s, which says: %s", self.address, short(metadata))
+        logger.info("connected with the policy server at %s: %s", self.address, short(metadata))
 
     def begin(self, row: Row) -> None:
         """Start an episode: a memory in the server, of the connection or of its own, forgets the last one."""
@@ -109,7 +101,7 @@ class Session:
         self._begin_memory()
         if self._dialect.buffers:
             self._opening = dict(RESET)
-        elif self._dialect.transport == "vla_eval":
+        elif self._speaks_vla_eval:
             self._opening = episode_start(row.get(TASK))
         if not self._fresh:
             self._again(time.monotonic() + self.config.retry)
@@ -148,10 +140,7 @@ class Session:
 
     def _observation(self, row: Row) -> dict[str, Any]:
         found = {theirs: self._value(row, ours) for theirs, ours in self._keys.items()}
-        if self._dialect.transport == "process_frame":
-            found[FIRST_FRAME] = str(self._first)  # 'True' and 'False', as MemoryVLA reads them
-            self._first = False
-        if self._dialect.transport == "vla_eval":
+        if self._speaks_vla_eval:
             if (step := row.scalar("step")) is not None:
                 found["step"] = np.array([step], np.float32)
             return observation(found, self._history())
@@ -166,7 +155,7 @@ class Session:
         value = row.get(name)
         if isinstance(value, np.ndarray) and value.ndim == 3:
             image = fit(value, self.config.side, self.config.mirror)
-            return png_map(image) if self._dialect.transport == "vla_eval" else image
+            return png_map(image) if self._speaks_vla_eval else image
         return value
 
     def _buffer(self) -> Question:
@@ -183,7 +172,7 @@ class Session:
     # --- delivery ---
 
     def _deliver(self, question: Question) -> dict[str, Any]:
-        """Send a question until it is answered; a server that went away is waited for and told the episode again."""
+        """Send a question until it is answered; after a reconnection the episode is sent again."""
         deadline = 0.0
         while True:
             try:
@@ -197,18 +186,18 @@ class Session:
                 self._again(deadline, str(error))
         self._fresh = False
         if question.remembered:
-            self._told.append(question)
+            self._sent.append(question)
         return answer
 
     def _again(self, deadline: float, reason: str = "") -> None:
-        """Connect anew and bring the server to where the episode is.
+        """Connect again and bring the server to the present state of the episode.
 
         Raises:
             MemobenchError: it stays away until the deadline.
         """
         self._until(
             deadline,
-            self._tell_again,
+            self._send_again,
             lambda reason: (
                 f"the policy server at {self.address} went away and did not come back within "
                 f"{self.config.retry:g} s ({reason}); the episode that was running is not counted: start "
@@ -217,13 +206,13 @@ class Session:
             reason=reason,
         )
 
-    def _tell_again(self, patience: float) -> None:
+    def _send_again(self, patience: float) -> None:
         self._transport.open(patience)
         if self._opening is not None:
             self._transport.ask(self._opening)
-        for question in self._told:
+        for question in self._sent:
             self._transport.ask(question.content)
-        self._fresh = not self._told
+        self._fresh = not self._sent
 
     def _until[Result](
         self,
@@ -237,7 +226,7 @@ class Session:
         """Return what ``attempt`` gives, called with the seconds left, as soon as the server is there for it.
 
         Args:
-            failed: words for the last reason, when the deadline has passed. on_wait: told the first reason.
+            failed: words for the last reason, when the deadline has passed. on_wait: called with the first reason.
         """
         while True:
             left = deadline - time.monotonic()
@@ -267,7 +256,7 @@ def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) 
             f"the policy server at {address} answers {len(actions)} actions at a time, fewer than the "
             f"{config.n_action_steps} to be executed; choose replan={len(actions)} or less"
         )
-    if (config.gripper or config.spoken.gripper) == RLDS:
+    if config.gripper == RLDS:
         gripper = actions[:, -1]
         actions[:, -1] = np.where(np.isfinite(gripper), -np.sign(2 * gripper - 1), gripper)
     return actions
@@ -300,7 +289,7 @@ class Row:
     number: int
 
     def scalar(self, name: str) -> int | None:
-        """Return an observation that is one whole number, None where the environment does not tell it."""
+        """Return an observation that is one whole number, None where the environment has none."""
         value = self.batch.get(f"{OBS_STR}.{name}")
         return None if value is None else round(float(value[self.number].reshape(-1)[0]))
 

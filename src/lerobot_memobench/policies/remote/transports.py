@@ -1,41 +1,31 @@
-"""Transports to policy servers: openpi's websocket, and the REST interfaces of OpenVLA and MemoryVLA.
+"""openpi's websocket protocol, which its package openpi-client cannot speak here: it needs NumPy 1, LeRobot NumPy 2.
 
-openpi's websocket is written anew, since the package openpi-client needs NumPy 1 and LeRobot NumPy 2. A server first
-sends its metadata. Then each binary frame is a question and gets a binary frame, or a text frame with a traceback where
-the server failed. Arrays go as msgpack to openpi's servers and as JSON to OpenVLA's; neither can carry code.
+A server first sends its metadata. Then each binary frame is a question and gets a binary frame, or a text frame with a
+traceback where the server failed. Arrays are msgpack, which cannot carry code.
 """
 
 from __future__ import annotations
 
-import base64
-import json
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from socket import SHUT_RDWR
 from typing import Any
 
-import httpx
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import LONGEST_REASON, Malformed, cut, in_words, refusing
+from lerobot_memobench.io import LONGEST_REASON, Malformed, cut, refusing
 
-JPEG_QUALITY = 95
-AWAY = (502, 503, 504)
-"""HTTP states by which a proxy or a starting server says that it will be there later."""
-TURNS: dict[str, threading.Lock] = {}
-"""Address -> whose turn it is: web frameworks answer in threads, models do not."""
 REFUSED = "VOc"
 """Kinds of arrays that openpi's format leaves out: structures, Python objects and complex numbers."""
 LARGEST_ANSWER = 8 << 20
-"""Bytes of an answer, on the wire. A thousand actions take 200 kB as JSON."""
+"""Bytes of an answer, on the wire."""
 LONGEST_LIST = 1 << 16
 """Entries of a list or map in msgpack: the unpacker reserves memory for the number that a header names."""
 
@@ -65,9 +55,9 @@ def within[Result](seconds: float, call: Callable[[], Result]) -> Result:
 
 
 def last_line(text: str) -> str:
-    """Return the line of a traceback that says what was wrong, printable and short."""
+    """Return the last line of a traceback, printable and short."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return reason(lines[-1]) if lines else "it does not say why"
+    return reason(lines[-1]) if lines else "without a reason"
 
 
 def too_slow(address: str, timeout: float) -> MemobenchError:
@@ -98,10 +88,10 @@ class Websocket:
         self._connection: ClientConnection | None = None
 
     def open(self, patience: float) -> dict[str, Any]:
-        """Connect anew within ``patience`` seconds, and return the metadata that the server sends first.
+        """Connect within ``patience`` seconds, and return the metadata that the server sends first.
 
         Raises:
-            ServerAway: nobody is there.
+            ServerAway: no server answers.
             MemobenchError: it is no server of this kind.
         """
         self.close()
@@ -144,14 +134,14 @@ class Websocket:
         return self.greet(patience)
 
     def greet(self, patience: float) -> dict[str, Any]:
-        """Return what the server says of itself, within ``patience`` seconds."""
+        """Return the server's metadata, within ``patience`` seconds."""
         metadata = self.receive(patience)
         return metadata if isinstance(metadata, dict) else {}
 
     def foreign(self, what: str) -> MemobenchError:
-        """Return the error of what does not speak this protocol."""
+        """Return the error of a server that does not speak this protocol."""
         return MemobenchError(
-            f"what listens at {self.address} is no policy server with {self.protocol} ({what}); check "
+            f"the server at {self.address} is no policy server with {self.protocol} ({what}); check "
             "host= and port=, or choose another dialect="
         )
 
@@ -205,150 +195,6 @@ class Websocket:
         self._stack.close()
 
 
-class Rest:
-    """A server that is asked by HTTP POST, as `Websocket` is; a subclass knows the path and both formats."""
-
-    path = ""
-
-    def __init__(self, address: str, timeout: float) -> None:
-        self.address, self.timeout = address, timeout
-        self._turn = TURNS.setdefault(address, threading.Lock())
-        self._client: httpx.Client | None = None
-
-    def open(self, patience: float) -> dict[str, Any]:
-        """Find out whether somebody is there."""
-        self.close()
-        self._client = httpx.Client(
-            base_url=self.address,
-            timeout=httpx.Timeout(self.timeout, connect=max(patience, 1.0)),
-            headers={"Accept-Encoding": "identity"},
-            trust_env=False,
-        )
-        try:
-            request = self._client.build_request("GET", "/")
-            # Any answer, 404 mostly, shows that a server listens; it is left unread.
-            within(max(patience, 1.0), partial(self._client.send, request, stream=True)).close()
-        except (httpx.TransportError, TimeoutError) as error:
-            raise ServerAway(reason(error)) from error
-        return {}
-
-    def ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Post a question and return the actions of its answer."""
-        state, body = self._post(question)
-        if state in AWAY:
-            raise ServerAway(f"HTTP state {state}")
-        text = body.decode(errors="replace")
-        if state != httpx.codes.OK:
-            raise MemobenchError(
-                f"the policy server at {self.address} answered {self.path} with HTTP state {state}: {last_line(text)}"
-            )
-        try:
-            return {"actions": self.decode(text)}
-        except ValueError as error:
-            raise self._no_actions(repr(cut(last_line(text))) if text.strip() else "an empty body") from error
-
-    def _post(self, question: dict[str, Any]) -> tuple[int, bytes]:
-        if self._client is None:
-            raise ServerAway("not connected")
-        request = self._client.build_request("POST", self.path, **self.encode(question))
-        try:
-            with self._turn:
-                return within(self.timeout, partial(self._answer, self._client, request))
-        except (TimeoutError, httpx.ReadTimeout, httpx.WriteTimeout) as error:
-            raise too_slow(self.address, self.timeout) from error
-        except httpx.TransportError as error:
-            raise ServerAway(reason(error)) from error
-
-    def _answer(self, client: httpx.Client, request: httpx.Request) -> tuple[int, bytes]:
-        """Return state and body of an answer, read as it is sent: a small compressed one may become a large text."""
-        with closing(client.send(request, stream=True)) as response:
-            if (encoding := response.headers.get("Content-Encoding", "identity")) != "identity":
-                raise self._no_actions(f"a body compressed by {reason(encoding)}, which was not asked for")
-            body = bytearray()
-            for part in response.iter_raw():
-                body += part
-                if len(body) > LARGEST_ANSWER:
-                    raise self._no_actions(f"more than {in_words(LARGEST_ANSWER)}")
-            return response.status_code, bytes(body)
-
-    def _no_actions(self, found: str) -> MemobenchError:
-        return MemobenchError(
-            f"the policy server at {self.address} answered {found}, which is no list of actions; its own log tells why"
-        )
-
-    def encode(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Return httpx's arguments for the question."""
-        raise NotImplementedError
-
-    def decode(self, text: str) -> NDArray[np.floating]:
-        """Return the actions in an answer; `ValueError` where there are none."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Let go of the connections."""
-        if self._client is not None:
-            self._client.close()
-            self._client = None
-
-
-class Act(Rest):
-    """OpenVLA-OFT's ``/act``: JSON with arrays in, a list of actions out, or the word "error"."""
-
-    path = "/act"
-
-    def encode(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Return JSON with arrays."""
-        return {"content": to_json(question), "headers": {"Content-Type": "application/json"}}
-
-    def decode(self, text: str) -> NDArray[np.floating]:
-        """Return the actions in a list, or in a string that holds one."""
-        answer = from_json(text)
-        if isinstance(answer, str):  # where json-numpy was patched in late, its JSON arrives as a string
-            answer = from_json(answer)
-        return numbers(answer)
-
-
-class ProcessFrame(Rest):
-    """MemoryVLA's ``/process_frame``: a form with JPEG images in, nested lists or rows of text out."""
-
-    path = "/process_frame"
-
-    def encode(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Return a form, with JPEG images as files."""
-        texts = {key: str(value) for key, value in question.items() if not isinstance(value, np.ndarray)}
-        arrays = {key: value for key, value in question.items() if isinstance(value, np.ndarray)}
-        files = {key: (key, jpeg(value) if value.ndim == 3 else value.tobytes()) for key, value in arrays.items()}
-        return {"data": texts, "files": files}
-
-    def decode(self, text: str) -> NDArray[np.floating]:
-        """Return the actions in nested lists, or in rows of text."""
-        answer = from_json(text)
-        actions = answer.get("response") if isinstance(answer, dict) else None
-        if isinstance(actions, str):
-            actions = [[float(number) for number in row.split()] for row in actions.split(";")]
-        return numbers(actions)
-
-
-def jpeg(image: NDArray[np.uint8]) -> bytes:
-    """Return an RGB image as JPEG, by the encoder and at the quality that MemoryVLA's clients use."""
-    import cv2
-
-    done, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    assert done
-    return data.tobytes()
-
-
-def numbers(found: Any) -> NDArray[np.floating]:
-    """Return nested lists, or a list of arrays, as an array of floats; `ValueError` where they are none."""
-    try:
-        array = np.asarray(found, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError("no numbers") from error
-    if array.ndim == 0:
-        raise ValueError("no numbers")
-    return array
-
-
 def _pack(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in REFUSED:
         raise ValueError(f"arrays of type {value.dtype} cannot be sent")
@@ -394,31 +240,3 @@ def unpack(data: bytes) -> Any:
     """
     with refusing(lambda why: Malformed(f"it is not msgpack with arrays ({why})")):
         return msgpack.unpackb(data, object_hook=_unpack, max_array_len=LONGEST_LIST, max_map_len=LONGEST_LIST)
-
-
-def _encode(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        data = base64.b64encode(value.tobytes()).decode()
-        return {"__numpy__": data, "dtype": value.dtype.str, "shape": value.shape}
-    raise TypeError(f"a {type(value).__name__} cannot be sent")
-
-
-def _decode(found: dict[str, Any]) -> Any:
-    if "__numpy__" in found:
-        return _array(base64.b64decode(found["__numpy__"]), found["dtype"], found["shape"])
-    return found
-
-
-def to_json(message: Any) -> str:
-    """Return a message as the package json-numpy writes it, which OpenVLA's servers use."""
-    return json.dumps(message, default=_encode)
-
-
-def from_json(text: str) -> Any:
-    """Return the message in a JSON text.
-
-    Raises:
-        ValueError: it is none.
-    """
-    with refusing(lambda why: Malformed(f"it is not JSON with arrays ({why})")):
-        return json.loads(text, object_hook=_decode)

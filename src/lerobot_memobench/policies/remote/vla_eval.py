@@ -1,6 +1,6 @@
-"""The protocol of vla-evaluation-harness (vla-eval), which is not needed to speak it: its model servers as policies.
+"""The protocol of vla-evaluation-harness (vla-eval), so that its model servers act as policies without the package.
 
-A frame is a map of ``type``, ``payload``, ``seq`` and ``timestamp``. Both sides say ``hello``. An ``episode_start`` is
+A frame is a map of ``type``, ``payload``, ``seq`` and ``timestamp``. Both sides send ``hello``. An ``episode_start`` is
 not answered; an ``observation`` is, by an ``action`` or an ``error``. The demonstration prompt goes with the first
 observation of an episode.
 """
@@ -36,7 +36,7 @@ FORMATS = {
     "gripper": "binary_close_positive",
     "state": "eef_pos3_axisangle3_gripper2",
 }
-"""vla-eval's names of this environment's conventions, of which a server may name others in its hello."""
+"""vla-eval's names of this environment's conventions, from which a server's hello may differ."""
 ANY_FORMAT = "raw"
 
 
@@ -50,9 +50,9 @@ class VlaEval(Websocket):
         self._number, self._in_episode, self._warned = 0, False, False
 
     def greet(self, patience: float) -> dict[str, Any]:
-        """Say hello, and return which server says it back."""
-        said = {"harness_version": VERSION, "protocol_version": PROTOCOL, "benchmark": "MEMOBench"}
-        self._say(HELLO, said)
+        """Send hello, and return the server's name and version from its answer."""
+        hello = {"harness_version": VERSION, "protocol_version": PROTOCOL, "benchmark": "MEMOBench"}
+        self._say(HELLO, hello)
         kind, found = self._hear(patience)
         if kind != HELLO:
             raise self.foreign(f"it answered a hello with {short(kind)}")
@@ -89,12 +89,12 @@ class VlaEval(Websocket):
         if not isinstance(kind, str) or not isinstance(payload, dict):
             raise self.foreign("its frames have no type and payload")
         if kind == ERROR:
-            told = str(payload.get("error") or payload)
-            raise MemobenchError(f"the policy server at {self.address} failed: {last_line(told)}")
+            message = str(payload.get("error") or payload)
+            raise MemobenchError(f"the policy server at {self.address} failed: {last_line(message)}")
         return kind, payload
 
     def close(self) -> None:
-        """Tell the server that the episode is over, and hang up."""
+        """Send the end of the episode, and hang up."""
         if self._in_episode:
             self._in_episode = False
             with suppress(ServerAway, ConnectionClosed, OSError):
@@ -111,8 +111,8 @@ def observation(named: Mapping[str, Any], history: Mapping[str, Any]) -> dict[st
     """Return the message of an observation.
 
     Args:
-        named: by the server's names, of which ``images.wrist`` is ``wrist`` within ``images``.
-        history: the demonstration prompt as lists of pictures; {} where there is none to be told now.
+        named: by the server's names; ``images.wrist`` is ``wrist`` within ``images``.
+        history: the demonstration prompt as lists of pictures; {} where there is none to send now.
     """
     payload: dict[str, Any] = {}
     for name, value in named.items():

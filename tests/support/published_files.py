@@ -1,4 +1,4 @@
-"""Write demonstrations in the published layout, and their scenes as MJCF for its attribute ``model_file``."""
+"""Files in the published HDF5 layout, with the attributes that earlier versions of this package added."""
 
 from __future__ import annotations
 
@@ -8,74 +8,66 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.hdf5.reading import IMAGE_NAMES, Image, truth_to_intervals
+from lerobot_memobench.datasets.hdf5.reading import IMAGE_NAMES
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.formula import to_lists
-from lerobot_memobench.tasks.task import BDDL_FILE, Task
+from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, Task
 
-if TYPE_CHECKING:
-    import h5py
-
-Pose = NDArray[np.float64]
-"""Position and quaternion wxyz, (7,)."""
+Pose = np.ndarray
 
 
-# --- a demonstration ---
-
-
-class EpisodeFile:
-    """A demonstration being written frame by frame: what its ``demo_k`` will hold, at the root of its own file."""
-
-    def __init__(self, path: Path) -> None:
-        import h5py
-
-        self._file: h5py.File = h5py.File(path, "w")
-        self._images: dict[str, h5py.Dataset] = {}
-        self._frames = 0
-
-    def add_images(self, images: Mapping[str, Image]) -> None:
-        """Append both cameras' next frame, (H, W, 3) uint8 each."""
-        if not self._images:
-            obs = self._file.create_group("obs")
+def write_published(path: Path, demos: Sequence[Demonstration], scene: str | None = None) -> Path:
+    """Write demonstrations of one task, images included; ``scene``: their MJCF in place of the real one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs.update(data_attributes(demos[0].task))
+        data.attrs.update(num_demos=len(demos), total=sum(map(len, demos)))
+        for number, demo in enumerate(demos):
+            assert demo.images is not None
+            group = data.create_group(f"demo_{number}")
+            group["states"], group["actions"] = demo.states, demo.actions
             for camera, name in IMAGE_NAMES.items():
-                shape = images[camera].shape
-                self._images[camera] = obs.create_dataset(
-                    name,
-                    (0, *shape),
-                    np.uint8,
-                    maxshape=(None, *shape),
-                    chunks=(1, *shape),
+                group.create_dataset(
+                    f"obs/{name}",
+                    data=demo.images[camera],
+                    chunks=(1, *demo.images[camera].shape[1:]),
                     compression="gzip",
                     compression_opts=1,
                 )
-        self._frames += 1
-        for camera, dataset in self._images.items():
-            dataset.resize(self._frames, axis=0)
-            dataset[-1] = images[camera]
+            group.attrs.update(demo_attributes(demo))
+            group.attrs["model_file"] = model_file(demo.task, demo.fixture_poses) if scene is None else scene
+    return path
 
-    def finish(self, demo: Demonstration) -> None:
-        """Add arrays and attributes and close the file."""
-        self._file.create_dataset("states", data=demo.states)
-        self._file.create_dataset("actions", data=demo.actions)
-        self._file.attrs.update(demo_attributes(demo))
-        self._file.close()
 
-    def abandon(self) -> None:
-        """Close the file as it is; it is about to be deleted. After ``finish`` this does nothing."""
-        self._file.close()
+def write_foreign(path: Path, demo: Demonstration, **metadata: Any) -> Path:
+    """Write a demonstration as others do: with nothing beyond the layout, and ``metadata`` in its ``meta_data``."""
+    write_published(path, [demo])
+    given = json.loads((demo.task.folder / METADATA_FILE).read_text())
+    given = {key: value for key, value in given.items() if key not in ("memory_type", "family", "variants", "prompt")}
+    with h5py.File(path, "a") as file:
+        for group, kept in (
+            (file["data"], ("bddl_file_name", "bddl_file_content", "env_info", "problem_info")),
+            (file["data/demo_0"], ("num_samples", "model_file", "meta_data")),
+        ):
+            for key in set(group.attrs) - set(kept):
+                del group.attrs[key]
+        file["data/demo_0"].attrs["meta_data"] = json.dumps(given | metadata)
+        del file["data/demo_0/actions"]
+        file["data/demo_0/actions"] = demo.actions.astype(np.float64)
+    return path
 
 
 def demo_attributes(demo: Demonstration) -> dict[str, Any]:
     """Return the attributes of a demonstration's group."""
     return {
         "num_samples": len(demo),
-        "model_file": demo.model_xml,
         "meta_data": json.dumps(demo_metadata(demo)),
         "seed": int(demo.seed),
         "referent": demo.referent,
@@ -106,9 +98,6 @@ def demo_metadata(demo: Demonstration) -> dict[str, Any]:
         if task.prompt is not None:
             metadata["prompt"] = {"kind": task.prompt.kind, "target": task.prompt.target}
     return metadata
-
-
-# --- a task's file ---
 
 
 def data_attributes(task: Task) -> dict[str, Any]:
@@ -142,26 +131,10 @@ def data_attributes(task: Task) -> dict[str, Any]:
     }
 
 
-def write_task_file(path: Path, attributes: Mapping[str, Any], episodes: Sequence[Path]) -> None:
-    """Join demonstrations, each a file of an :class:`EpisodeFile`, to a task's file; chunks are copied as they are."""
-    import h5py
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with h5py.File(path, "w") as target:
-        data = target.create_group("data")
-        data.attrs.update(attributes)
-        total = 0
-        for number, episode in enumerate(episodes):
-            with h5py.File(episode) as source:
-                group = data.create_group(f"demo_{number}")
-                for name in source:
-                    source.copy(name, group)
-                group.attrs.update(source.attrs)
-                total += int(source.attrs["num_samples"])
-        data.attrs["num_demos"], data.attrs["total"] = len(episodes), total
-
-
-# --- the scene ---
+def truth_to_intervals(satisfied: np.ndarray) -> list[list[list[int]]]:
+    """Return where each column of a (T, K) truth is true, as [start, stop) pairs."""
+    edges = np.diff(satisfied.astype(np.int8), axis=0, prepend=0, append=0)
+    return [np.flatnonzero(column).reshape(-1, 2).tolist() for column in edges.T]
 
 
 def model_file(task: Task, fixture_poses: Mapping[str, Pose]) -> str:

@@ -1,0 +1,61 @@
+"""Run many independent jobs, such as the making of one episode, in processes here or on Slurm.
+
+The result is the same, because a job depends on itself alone. From the disk it knows whether it is finished, so the
+same jobs given again continue a killed run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from lerobot_memobench.jobs.processes import Advance, Job, ProgressCallback, run_in_processes
+from lerobot_memobench.jobs.slurm import Slurm
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    *,
+    workers: int = 1,
+    progress: ProgressCallback | None = None,
+    slurm: Slurm | None = None,
+    finish: Callable[[], Any] | None = None,
+) -> bool:
+    """Run the jobs that are not finished yet.
+
+    Args:
+        jobs: the work.
+        workers: how many run at a time.
+        progress: called after each job; first for those that were finished before.
+        slurm: submit the jobs; None: run them here.
+        finish: called on Slurm, in a job of its own, when all jobs have ended. It is pickled.
+
+    Returns:
+        Whether all jobs are finished; False when they have been submitted.
+
+    Raises:
+        MemobenchError: a worker was killed, or Slurm refuses the jobs.
+    """
+    over = [job.finished() for job in jobs]
+    finished = [job for job, is_over in zip(jobs, over, strict=True) if is_over]
+    waiting = [job for job, is_over in zip(jobs, over, strict=True) if not is_over]
+    done = 0
+
+    def count(job: Job) -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(Advance(done, len(jobs), job.task_name, job.seed, job.failure(), len(finished)))
+
+    for job in finished:
+        count(job)
+    if waiting and slurm is not None:
+        slurm.submit(waiting, workers, finish)
+        return False
+    if workers > 1 and len(waiting) > 1:
+        run_in_processes(waiting, workers, count)
+    else:
+        for job in waiting:
+            job.run()
+            count(job)
+    return True
