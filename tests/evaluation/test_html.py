@@ -413,10 +413,10 @@ def test_runs_of_like_names_keep_their_videos_apart(run: Path, tmp_path: Path) -
 
 
 def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["html", f"my name={run}", "--out", str(tmp_path / "out")]) == 0
+    assert main(["report", f"my name={run}", "--html", str(tmp_path / "out")]) == 0
     assert content((tmp_path / "out" / "index.html").read_text())["runs"][0]["name"] == "my name"
     assert "2 episodes, 1 with a video" in capsys.readouterr().out
-    assert main(["html", str(tmp_path), "--out", str(tmp_path / "other")]) == 2
+    assert main(["report", str(tmp_path), "--html", str(tmp_path / "other")]) == 2
     assert "holds no episode log" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
 

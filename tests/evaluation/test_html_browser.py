@@ -21,7 +21,7 @@ import pytest
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.evaluation.html.write import write_html
-from lerobot_memobench.evaluation.memory_reads import reads_file, write_reads
+from lerobot_memobench.policies.memory_reads import reads_file, write_reads
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium
 from tests.support.logs import record

@@ -33,7 +33,7 @@ from lerobot_memobench.envs.episode_log import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreements
-from lerobot_memobench.evaluation.evidence_controls import FoundEvidence, evidence_of, ran_evidence
+from lerobot_memobench.evaluation.evidence import FoundEvidence, evidence_of, ran_evidence
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, is_there, read_json
 

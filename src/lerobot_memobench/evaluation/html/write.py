@@ -24,11 +24,11 @@ from typing import Any
 from lerobot_memobench.envs.video import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_source
-from lerobot_memobench.evaluation.memory_reads import Chunk, find_reads
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.evaluation.records import Run, read_runs
 from lerobot_memobench.io import draft_of, file_name, parsed, read_json, short, write_file
 from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.policies.memory_reads import Chunk, find_reads
 from lerobot_memobench.tasks.catalogue import task_names
 
 PAGE = "index.html"
@@ -55,7 +55,7 @@ SCRIPTS = (
 MARK = "memobench html"
 """What the page's ``generator`` says; by it a folder is known as a report."""
 UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" content="{MARK}"><title>Unfinished</title>
-<p>This report was not finished; run <code>memobench html</code> again.'''
+<p>This report was not finished; run <code>memobench report --html</code> again.'''
 
 
 @dataclass(frozen=True)
