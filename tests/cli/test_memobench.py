@@ -88,7 +88,6 @@ def test_report_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["cache", "nowhere"], "nowhere"),
         (["cache", ".", "--size", "huge"], "tiny"),
         (["frobnicate"], "No such command"),
-        (["demo", "--out", "file"], "is a file"),
     ],
 )
 def test_mistakes_are_one_sentence(
@@ -112,7 +111,7 @@ def test_mistakes_are_one_sentence(
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     out = capsys.readouterr().out
-    for command in ("tasks", "generate", "cache", "report", "doctor", "demo"):
+    for command in ("tasks", "generate", "cache", "report", "doctor"):
         assert command in out
 
 

@@ -19,10 +19,10 @@ from lerobot_memobench.cli import data
 from lerobot_memobench.cli.conformance import conformance
 from lerobot_memobench.cli.console import run_app
 from lerobot_memobench.cli.data import cache, generate
-from lerobot_memobench.cli.demo import demo, doctor
+from lerobot_memobench.cli.doctor import doctor
 from lerobot_memobench.cli.report import compare, merge, report, rerun
 from lerobot_memobench.cli.sealed import test_sealed
-from lerobot_memobench.cli.tasks import gallery, objects, recipe, tasks
+from lerobot_memobench.cli.tasks import objects, recipe, tasks
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import as_path
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
@@ -56,7 +56,7 @@ app = typer.Typer(
 )
 
 COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
-    "Look around": (tasks, objects, gallery, doctor, demo),
+    "Look around": (tasks, objects, doctor),
     "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
     "Train": (recipe, conformance),
     "Results": (test_sealed, report, compare, merge, rerun),
@@ -64,7 +64,7 @@ COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
 """Group -> its commands, as ``memobench --help`` lists them."""
 
 GO_ON = ("generate", "cache", "convert", "push")
-"""Commands that go on when they are given again; any other begins anew."""
+"""Commands that continue when given again; any other starts over."""
 LEARN = ("cache",)
 """Commands whose own process trains or encodes; every other simulates, or computes next to nothing."""
 
@@ -80,6 +80,8 @@ ELSEWHERE = {
     "html": "memobench report FOLDER --html OUT",
     "figures": "memobench report FOLDER --figures OUT; the paper's: python examples/paper_figures.py",
     "controls": "memobench compare A B; of evidence and granularity: memobench report A B",
+    "demo": "make demo",
+    "gallery": "python scripts/gallery.py --out FOLDER",
 }
 """Commands of LeRobot's and of earlier releases -> the command to give instead."""
 

@@ -101,9 +101,9 @@ def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
 
 
 def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str]:
-    """Return what makes an episode and differs in pairs: the name that allows it -> it in words.
+    """Return the first part of an episode's identity that differs in pairs: the name that allows it -> a sentence.
 
-    A side that does not tell it does not differ. Other seeds have other scenes, which need no name of their own.
+    A side without the field does not differ. Other seeds have other scenes, which need no name of their own.
     """
     for field, name, what in (
         ("seed", "seed_base", "seeds"),

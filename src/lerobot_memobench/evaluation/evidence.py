@@ -47,7 +47,7 @@ class Evidence:
 
     Attributes:
         scenes, variants: how many; of several tasks the sum of scenes, and no number of variants.
-        chance: of following without the past; None where the instruction tells.
+        chance: of following without the past; None where the instruction names the answer.
         rates: of `RATES`, `RIGHT` and `RELIABLE`, with intervals; no `RIGHT` where nothing was decided.
         p: one-sided, of as many right answers when they are permuted within scenes.
         effective: number of scenes of equal weight with the same variance.

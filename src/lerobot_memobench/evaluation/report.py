@@ -68,7 +68,7 @@ TABLES = "tables"
 """Folder of the tables as CSV."""
 
 
-# --- beside the log ---
+# --- in the folder of the log ---
 
 
 def write_report(directory: str | Path, episodes: int | None = None) -> Run:
@@ -135,10 +135,10 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     """Return the report of one or several evaluations.
 
     Args:
-        paper: stand the published figures beside.
+        paper: add the published figures.
 
     Raises:
-        MemobenchError: the published figures are wanted beside those of other tasks.
+        MemobenchError: the published figures are of other tasks.
     """
     check_beside(runs, paper)
     found, controls = [], list(controls_among(runs))
@@ -207,11 +207,11 @@ def write_documents(runs: Sequence[Run], out: Path, wanted: Sequence[str], paper
 
 
 OF_EACH_EVALUATION = ("memory-types", "tasks", "prefix", "failures")
-"""Keys of the tables that stand in the section of every evaluation."""
+"""Keys of the tables in the section of every evaluation."""
 
 
 def _unique_keys(found: Report) -> Report:
-    """Number the labels of tables that stand in several sections."""
+    """Number the labels of tables that several sections have."""
     if len(found.sections) < 2:
         return found
     sections = []
@@ -247,7 +247,7 @@ def report_data(runs: Sequence[Run], controls: Sequence[Comparison], paper: bool
 
 
 def run_data(run: Run) -> dict[str, Any]:
-    """Return the figures of one evaluation: the keys of ``report.json``, and more beside them."""
+    """Return the figures of one evaluation: the keys of ``report.json`` and more."""
     summary = run.summary
     policy = run.protocol[POLICY]
     return {
@@ -310,7 +310,7 @@ def _published_data(row: PublishedRow) -> dict[str, Any]:
 # --- CSV: one figure a row ---
 
 HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "inputs")
-"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent beside the paper's."""
+"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent."""
 
 CsvRow = tuple[object, ...]
 
@@ -333,7 +333,7 @@ def _run_rows(run: Run) -> Iterator[CsvRow]:
 
 
 def _extent(run: Run) -> Iterator[CsvRow]:
-    """Yield how much was run: beside rows of 30 tasks and 1,500 rollouts."""
+    """Yield how much was run; the paper's rows are of 30 tasks and 1,500 rollouts."""
     for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
         yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.inputs)
 

@@ -1,4 +1,4 @@
-"""Write the report: find each rollout's video, fill the template beside this module, make the folder.
+"""Write the report: find each rollout's video, fill the template, make the folder.
 
 Everything but the videos is inside ``index.html``, because a browser lets a page from disk read no other file. Its
 content security policy allows this style, this script and videos from its own place, and nothing else: the page cannot
@@ -34,7 +34,7 @@ from lerobot_memobench.tasks.catalogue import task_names
 PAGE = "index.html"
 VIDEOS, VIDEO = "videos", ".mp4"
 PLACED = "placed.json"
-"""Addresses of the videos that a report has placed, beside its page: a later report removes these, and no others."""
+"""Addresses of the videos that a report has placed, in its folder: a later report removes these, and no others."""
 LEROBOT_INFO = "eval_info.json"
 SCRIPTS = (
     "dom",
@@ -53,14 +53,14 @@ SCRIPTS = (
 )
 """Parts of the one script, in ``script/``; a later part uses earlier ones."""
 MARK = "memobench html"
-"""What the page's ``generator`` says; by it a folder is known as a report."""
+"""Value of the page's ``generator``, by which a folder is recognised as a report."""
 UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" content="{MARK}"><title>Unfinished</title>
 <p>This report was not finished; run <code>memobench report --html</code> again.'''
 
 
 @dataclass(frozen=True)
 class Written:
-    """What a report holds: the page, its rollouts, how many of them have a video, and notes on the logs."""
+    """A written report: the page, its rollouts, how many of them have a video, and notes on the logs."""
 
     page: Path
     rollouts: int
@@ -77,7 +77,7 @@ def write_html(
         folders: what evaluations have written, or ``NAME=FOLDER``.
         link: let videos be symbolic links to where they are, which saves space on another file system but ties the
             report to this machine.
-        task_dir: task folders in the published format whose texts are to be shown, beside the catalogue.
+        task_dir: task folders in the published format whose texts are shown, in addition to the catalogue.
 
     Raises:
         MemobenchError: a folder holds no log, or ``out`` holds something that is no report.
@@ -207,7 +207,7 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
         other = others.get(k)
         if other is not None and _fits(frame_count(other), record, held=0):
             found[k] = other
-    # A video's name does not tell the referent: where both settings are in one log, it could be of either.
+    # A video's name does not hold the referent: where both settings are in one log, it could be of either.
     claims = Counter(found.values())
     misfits += [video.name for video, count in claims.items() if count > 1]
     found = {k: video for k, video in found.items() if claims[video] == 1}
@@ -235,7 +235,7 @@ def _fits(frames: int | None, record: Record, held: int) -> bool:
 
 
 def frame_count(path: Path) -> int | None:
-    """Return the number of frames that a video's header tells; None when it is no whole video."""
+    """Return the number of frames in a video's header; None when it is no whole video."""
     import av
 
     try:
@@ -326,7 +326,7 @@ def page(data: Mapping[str, Any], title: str) -> str:
 
 
 def inline_json(value: Any) -> str:
-    """Return JSON that may stand inside ``<script type="application/json">``.
+    """Return JSON for the inside of ``<script type="application/json">``.
 
     Nothing in it can end the element or open a comment: ``<``, ``>`` and ``&`` are written as escapes.
     """

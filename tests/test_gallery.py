@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFont
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim import gallery
+from tests.support.scripts import load_script
+
+gallery = load_script("gallery")
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
@@ -20,8 +21,6 @@ def test_grid_has_room_for_every_picture() -> None:
     sheet = np.asarray(gallery.grid(cells, 2))
     for k in range(5):
         assert (sheet == 10 * k).all(axis=2).sum() >= 40 * 60
-    with pytest.raises(MemobenchError, match="nothing to draw"):
-        gallery.grid([], 2)
 
 
 def test_long_labels_are_wrapped_and_not_cut() -> None:
@@ -49,12 +48,6 @@ def test_figures_are_shrunk_until_they_are_small(tmp_path: Path, monkeypatch: py
     assert Image.open(path).width < 120
     plain = gallery.save(Image.new("RGB", (300, 300)), tmp_path / "plain.png")
     assert Image.open(plain).size == (300, 300)
-
-
-def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(MemobenchError, match="cannot be written"):
-        gallery.save(Image.new("RGB", (4, 4)), tmp_path / "file" / "figure.png")
 
 
 def test_sheets() -> None:
