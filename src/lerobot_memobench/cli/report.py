@@ -66,9 +66,6 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help="Draw outcomes and replan intervals as PDF and PNG into this folder.")
     ] = None,
-    link: Annotated[
-        bool, typer.Option("--link", help="With --html: link to videos instead of copying; the page cannot be moved.")
-    ] = False,
     task_dir: Annotated[
         Path | None, typer.Option(help="With --html: folder of your own tasks, for their texts.")
     ] = None,
@@ -104,7 +101,7 @@ def report(
     if html is not None:
         from lerobot_memobench.evaluation.html.write import write_html
 
-        written = write_html(folders, html, link=link, task_dir=task_dir)
+        written = write_html(folders, html, task_dir)
         for note in written.notes:
             say(f"note: {note}")
         say(f"{count_of(written.rollouts, 'episode')}, {written.videos} with a video")

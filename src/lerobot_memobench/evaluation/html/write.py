@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from importlib import resources
@@ -26,15 +26,13 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_source
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.evaluation.records import Run, read_runs
-from lerobot_memobench.io import draft_of, file_name, parsed, read_json, short, write_file
+from lerobot_memobench.io import draft_of, file_name, parsed, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.memory_reads import Chunk, find_reads
 from lerobot_memobench.tasks.catalogue import task_names
 
 PAGE = "index.html"
 VIDEOS, VIDEO = "videos", ".mp4"
-PLACED = "placed.json"
-"""Addresses of the videos that a report has placed, in its folder: a later report removes these, and no others."""
 LEROBOT_INFO = "eval_info.json"
 SCRIPTS = (
     "dom",
@@ -68,15 +66,11 @@ class Written:
     notes: list[str]
 
 
-def write_html(
-    folders: Sequence[str | Path], out: str | Path, *, link: bool = False, task_dir: str | Path | None = None
-) -> Written:
+def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | Path | None = None) -> Written:
     """Write the report of one or several evaluations into ``out``; an earlier report there is replaced.
 
     Args:
-        folders: what evaluations have written, or ``NAME=FOLDER``.
-        link: let videos be symbolic links to where they are, which saves space on another file system but ties the
-            report to this machine.
+        folders: of evaluations, or ``NAME=FOLDER``.
         task_dir: task folders in the published format whose texts are shown, in addition to the catalogue.
 
     Raises:
@@ -102,12 +96,9 @@ def write_html(
     with locked(out, out):
         if not (out / PAGE).exists():
             write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on
-        placed, earlier = {name for each in addresses for name in each.values()}, _placed(out)
-        _note_placed(out, earlier | placed)
-        place_videos(chosen, link)
+        place_videos(chosen)
         write_file(out / PAGE, text)
-        _remove_videos(out, earlier - placed)
-        _note_placed(out, placed)
+        _remove_other_videos(out, chosen)
     return Written(
         page=out / PAGE,
         rollouts=sum(len(run.records) for run in runs),
@@ -149,39 +140,14 @@ def _check_target(out: Path) -> None:
         raise MemobenchError(f"--out {out} holds files that are no earlier report; name a new or an empty folder")
 
 
-def _placed(out: Path) -> set[str]:
-    """Return the addresses of videos that an earlier report placed; none of a report that did not list them.
-
-    Raises:
-        MemobenchError: the list leads elsewhere.
-    """
-    advice = f"remove {out / PLACED}"
-    try:
-        names: list[str] = read_json(out / PLACED, list[str], advice)
-    except FileNotFoundError:
-        return set()
-    for name in names:
-        folder, *parts = name.split("/")
-        if folder != VIDEOS or len(parts) != 2 or not all(map(_names_a_file, parts)) or not name.endswith(VIDEO):
-            raise MemobenchError(f"{out / PLACED} lists {short(name)}, which is no video of a report; {advice}")
-    return set(names)
-
-
-def _note_placed(out: Path, names: Iterable[str]) -> None:
-    if found := sorted(names):
-        write_file(out / PLACED, json.dumps(found, indent=0) + "\n")
-    else:
-        (out / PLACED).unlink(missing_ok=True)
-
-
-def _remove_videos(out: Path, names: Iterable[str]) -> None:
+def _remove_other_videos(out: Path, placed: Collection[Path]) -> None:
     """Remove videos of an earlier report, and folders that this leaves empty."""
-    for path in (out / name for name in names):
-        if path.is_file() or path.is_symlink():
+    for path in (out / VIDEOS).glob(f"*/*{VIDEO}"):
+        if path not in placed:
             path.unlink()
-        for folder in (path.parent, out / VIDEOS):
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
+    for folder in (*(out / VIDEOS).glob("*/"), out / VIDEOS):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 # --- videos ---
@@ -277,31 +243,24 @@ def _lerobot_videos(folder: Path, records: Sequence[Record]) -> dict[int, Path]:
     return found
 
 
-def place_videos(chosen: Mapping[Path, Path], link: bool) -> None:
-    """Bring videos into the report, target -> source: as hard links or copies, so that it can be moved, or as links.
+def place_videos(chosen: Mapping[Path, Path]) -> None:
+    """Bring videos into the report, target -> source: as hard links, or copies on another file system.
 
     A target that is there and unchanged is left alone; each appears under its name only when it is whole.
     """
     for target, source in chosen.items():
-        if _is_same(source, target, link):
+        if _is_same(source, target):
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
         with draft_of(target) as draft:
-            _bring(source.resolve(), draft, link)
+            try:
+                os.link(source.resolve(), draft)
+            except OSError:  # another file system, or one without hard links
+                shutil.copy2(source, draft)
 
 
-def _bring(source: Path, target: Path, link: bool) -> None:
-    if link:
-        target.symlink_to(source)
-        return
-    try:
-        os.link(source, target)
-    except OSError:  # another file system, or one without hard links
-        shutil.copy2(source, target)
-
-
-def _is_same(source: Path, target: Path, link: bool) -> bool:
-    if not target.exists() or target.is_symlink() != link:
+def _is_same(source: Path, target: Path) -> bool:
+    if not target.exists():
         return False
     here, there = source.stat(), target.stat()
     return os.path.samestat(here, there) or (here.st_size, here.st_mtime_ns) == (there.st_size, there.st_mtime_ns)
