@@ -11,7 +11,7 @@ import pytest
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.controls import gap_closed, relabelled
+from lerobot_memobench.evaluation.controls import gap_closed, with_labels_of
 from tests.support.logs import SETTINGS, rollout
 
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
@@ -170,9 +170,10 @@ def test_granularity_counts_each_level_by_its_own_labels(tmp_path: Path) -> None
 
 
 def test_labels_of_another_version_of_a_task_are_refused() -> None:
-    records = [rollout(DRAWERS, "spatial", "SUC", [True, True, False], False, 0)]
-    (changed,) = relabelled(records, {DRAWERS: "SUU"})
-    assert [c["operation"] for c in changed["checkpoints"]] == ["S", "U", "U"]
-    assert relabelled(records, {}) == records
+    three, two = (rollout(DRAWERS, "temporal", "SUC"[:n], [True] * n, False, 0) for n in (3, 2))
+    own = rollout("a_task_of_mine", "temporal", "SC", [True, True], True, 0)
+    changed, kept = with_labels_of("fine", [three, own])
+    assert [checkpoint["operation"] for checkpoint in changed["checkpoints"]] == ["S", "U", "U"]
+    assert kept == own
     with pytest.raises(MemobenchError, match="another version of the task"):
-        relabelled(records, {DRAWERS: "SU"})
+        with_labels_of("fine", [two])

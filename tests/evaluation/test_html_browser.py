@@ -207,15 +207,6 @@ def test_a_click_on_the_timeline_seeks_the_video(browser: Any, report: Path) -> 
         assert_shown(browser, frame)
 
 
-def test_the_playhead_follows_a_drag(browser: Any, report: Path) -> None:
-    show(browser, report, f"view=episodes&ep={STOVE}.0")
-    ready(browser)
-    browser.drag(".lane.checkpoint .track", place(30), place(12))
-    settle(browser)
-    assert playhead(browser) == 12
-    assert browser.js("document.querySelector('video').currentTime") == pytest.approx(12.5 / FPS)
-
-
 def test_the_playhead_moves_with_the_video(browser: Any, report: Path) -> None:
     show(browser, report, f"view=episodes&ep={STOVE}.0")
     ready(browser)
@@ -281,17 +272,6 @@ def test_prompt_and_failure_are_on_the_timeline(browser: Any, report: Path) -> N
     assert "never held: reference drift" in browser.js(
         "document.querySelector('.cause.is-reference_drift').dataset.tip"
     )
-
-
-def test_hover_and_focus_tell_the_texts_of_all_levels(browser: Any, report: Path) -> None:
-    show(browser, report, f"view=episodes&ep={STOVE}.0")
-    box = browser.box(".span.active")
-    browser.mouse("mouseMoved", box["x"] + box["width"] / 3, box["y"] + box["height"] / 2)
-    browser.wait("!document.querySelector('#tip').hidden")
-    (tip,) = browser.texts("#tip")
-    assert all(text in tip for text in get_task(STOVE).checkpoints[0].language)
-    browser.js("document.querySelector('.cause, .ending').focus()")
-    assert "Success at step 40" in browser.texts("#tip")[0]
 
 
 def test_what_a_chunk_read_is_under_the_timeline_with_its_frames(browser: Any, report: Path) -> None:
@@ -405,16 +385,6 @@ def test_keys_go_through_the_episodes(browser: Any, report: Path) -> None:
     assert browser.js("document.querySelector('dialog').open")
     browser.key("Escape")
     browser.wait("!document.querySelector('dialog').open")
-
-
-def test_another_run_keeps_the_episode(browser: Any, report: Path) -> None:
-    show(browser, report, f"view=episodes&ep={STOVE}.0")
-    browser.click(".others a")
-    browser.wait("document.querySelector('#detail .facts b').innerText === 'Storage failure'")
-    assert browser.js("location.hash.includes('run=other')")
-    assert browser.texts("#count") == ["2 of 2 episodes, 1 succeeded"]
-    browser.choose("#run", "mine")
-    browser.wait("document.querySelector('#detail .facts b').innerText === 'Success'")
 
 
 def test_1500_episodes_are_added_to_the_list_as_they_are_needed(browser: Any, tmp_path: Path) -> None:
@@ -589,17 +559,6 @@ def test_a_telephone_needs_no_sideways_scrolling(browser: Any, report: Path, add
     browser.resize(360, 740)
     show(browser, report, address)
     assert browser.js("document.documentElement.scrollWidth") <= 360
-
-
-def test_filters_are_folded_on_a_telephone(browser: Any, report: Path) -> None:
-    show(browser, report, "view=episodes")
-    assert browser.js("document.querySelector('#type').checkVisibility()")
-    browser.resize(390, 800)
-    browser.wait("!document.querySelector('#type').checkVisibility()")
-    browser.click("#more summary")
-    browser.choose("#type", "object")
-    browser.wait("document.querySelector('#more summary').innerText === 'Filters (1)'")
-    assert browser.texts("#count") == ["2 of 7 episodes, 1 succeeded"]
 
 
 def test_the_page_may_not_reach_the_network(chrome: Any, report: Path) -> None:

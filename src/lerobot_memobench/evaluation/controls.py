@@ -7,7 +7,7 @@ subgoals that each was taught with.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ from lerobot_memobench.evaluation.report_tables import AVERAGE
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Section, Table, figure
 from lerobot_memobench.paper import raw_tables, shuffled_control
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, OPERATIONS
+from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES
 
 LEAST_GAP = 0.01
 """Smallest gap to 100 % of which a share is given: below it, one rollout would turn the share around."""
@@ -186,7 +186,7 @@ def granularity(runs: Iterable[Run]) -> dict[str, tuple[str, Summary]]:
     known = [(run, level) for run, level in levels if level in LEVELS]
     if len({level for _, level in known}) < 2:
         return {}
-    return {run.name: (level, summarise(_with_labels_of(level, run.records))) for run, level in known}
+    return {run.name: (level, summarise(with_labels_of(level, run.records))) for run, level in known}
 
 
 def granularity_section(runs: Sequence[Run], paper: bool = False) -> list[Section]:
@@ -226,38 +226,24 @@ def granularity_data(runs: Sequence[Run]) -> dict[str, Any]:
     }
 
 
-def _with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
-    """Return rollouts of the catalogue's tasks with the operation labels of a level, others unchanged."""
-    index = LEVELS.index(level)
-    there = {record["task"] for record in records} & set(task_names(suite=None))
-    return relabelled(
-        records, {name: [each.operations_by_level[index] for each in get_task(name).checkpoints] for name in there}
-    )
-
-
-def relabelled(records: Sequence[Record], labels: Mapping[str, Sequence[str]]) -> list[Record]:
-    """Return rollouts with other operation labels; tasks without labels keep theirs.
-
-    Args:
-        labels: task → operation per checkpoint ("S", "U" or "C").
+def with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
+    """Return rollouts with the operation labels of a subgoal level; tasks that the catalogue lacks keep theirs.
 
     Raises:
-        MemobenchError: a rollout has another number of checkpoints than labels.
+        MemobenchError: a rollout has another number of checkpoints than its task.
     """
+    index, known = LEVELS.index(level), task_names(suite=None)
     result: list[Record] = []
     for record in records:
-        wanted = labels.get(record["task"])
-        if wanted is None:
+        if record["task"] not in known:
             result.append(record)
             continue
-        if len(wanted) != len(record["checkpoints"]) or not set(wanted) <= set(OPERATIONS):
+        labels = [checkpoint.operations_by_level[index] for checkpoint in get_task(record["task"]).checkpoints]
+        if len(labels) != len(record["checkpoints"]):
             raise MemobenchError(
-                f"a rollout of {record['task']!r} has {len(record['checkpoints'])} checkpoints, its labels are "
-                f"{', '.join(wanted)}; the log was written by another version of the task"
+                f"a rollout of {record['task']!r} has {len(record['checkpoints'])} checkpoints, its task has "
+                f"{len(labels)}; the log was written by another version of the task"
             )
-        checkpoints = [
-            {**checkpoint, "operation": operation}
-            for checkpoint, operation in zip(record["checkpoints"], wanted, strict=True)
-        ]
-        result.append({**record, "checkpoints": checkpoints})
+        marks = zip(record["checkpoints"], labels, strict=True)
+        result.append({**record, "checkpoints": [{**mark, "operation": label} for mark, label in marks]})
     return result
