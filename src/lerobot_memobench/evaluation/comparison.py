@@ -189,6 +189,12 @@ class Comparison:
     headline: str
     control: Control | None = None
 
+    @property
+    def title(self) -> str:
+        """The control, where it is one, and the names of both."""
+        names = f"{self.b} against {self.a}"
+        return f"{self.control.title}: {names}" if self.control else names
+
 
 def compare(
     a: Run,
@@ -444,7 +450,7 @@ def comparison_report(found: Comparison, paper: bool = False) -> Report:
     Raises:
         MemobenchError: they are asked for, and the paper has none of this comparison.
     """
-    tables = [_table(found, *each) for each in TABLES if any(row.kind in each[2] for row in found.differences)]
+    section = comparison_section(found)
     if paper:
         published = published_table(found.control) if found.control else None
         if published is None:
@@ -452,49 +458,46 @@ def comparison_report(found: Comparison, paper: bool = False) -> Report:
                 "the paper has no figures of this comparison, only of oracle and of shuffled memory; leave out "
                 "--with paper"
             )
-        tables.append(published)
+        section = replace(section, tables=(*section.tables, published))
+    title = f"{found.title}: {found.headline}"
+    return Report(title, (replace(section, title=""),), comparison_data(found))
+
+
+def comparison_section(found: Comparison, overall: bool = False) -> Section:
+    """Return the tables of a comparison, with a title.
+
+    Args:
+        overall: the average and memory types alone.
+    """
+    kinds = {row.kind for row in found.differences}
+    tables = [_table(found, *each) for each in TABLES[: 1 if overall else None] if kinds & {*each[2]}]
     sentence = f"{count_of(found.pairs, 'episode')} in both, paired by task, episode and referent."
-    sentences = (sentence, *([found.control.meaning] if found.control else []), NOTE)
-    title = f"{found.b} against {found.a}: {found.headline}"
-    return Report(
-        f"{found.control.title}: {title}" if found.control else title,
-        (Section("", tuple(tables), sentences, found.notes),),
-        {
-            "a": found.a,
-            "b": found.b,
-            **({"control": found.control.setting} if found.control else {}),
-            "inputs": {found.a: found.inputs[0], found.b: found.inputs[1]},
-            "pairs": found.pairs,
-            "differences": [_entry(row) for row in found.differences],
-            "notes": list(found.notes),
-        },
-    )
+    meaning = [found.control.meaning] if found.control else []
+    return Section(found.title, tuple(tables), (sentence, *meaning, NOTE), found.notes)
 
 
-def control_section(found: Comparison) -> Section:
-    """Return the section of a control in the report of several evaluations: the average and memory types."""
-    title = f"{found.control.title if found.control else 'Comparison'}: {found.b} against {found.a}"
-    key, _, kinds = TABLES[0]
-    sentences = (*([found.control.meaning] if found.control else []), NOTE)
-    return Section(title, (_table(found, f"{key}-control", "", kinds),), sentences, found.notes)
+def comparison_data(found: Comparison, overall: bool = False) -> dict[str, Any]:
+    """Return a comparison as JSON values.
 
-
-def control_data(found: Comparison) -> dict[str, Any]:
-    """Return the average and memory types of a control as JSON values."""
-    rows = [_entry(row) for row in found.differences if row.kind in TABLES[0][2]]
+    Args:
+        overall: the average and memory types alone.
+    """
+    kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
     return {
-        "control": found.control.setting if found.control else None,
         "a": found.a,
         "b": found.b,
-        "differences": rows,
+        "control": found.control.setting if found.control else None,
+        "inputs": {found.a: found.inputs[0], found.b: found.inputs[1]},
+        "pairs": found.pairs,
+        "differences": [_entry(row) for row in found.differences if row.kind in kinds],
+        "notes": list(found.notes),
     }
 
 
-def control_phrase(found: Comparison) -> str:
+def comparison_phrase(found: Comparison) -> str:
     """Return the change of the average success in words, for one line."""
-    title = found.control.title if found.control else "Difference"
     success = found.differences[0]
-    return f"{title}: SR {_points(success.value, True)} {_interval(success)} against {found.a}"
+    return f"{found.title}: SR {_points(success.value, True)} {_interval(success)}"
 
 
 def comparison_csv(found: Comparison) -> str:

@@ -18,7 +18,7 @@ from rich.console import RenderableType
 
 from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, not_run, read_log, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.evaluation.comparison import Comparison, control_data, control_section, controls_among
+from lerobot_memobench.evaluation.comparison import Comparison, comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.controls import granularity_data, granularity_section
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
@@ -145,7 +145,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     if len(runs) > 1:
         found.append(Section("Evaluations", (overview(runs),), notes=tuple(unlike(runs))))
     found += [sweep(method, group) for method, group in sweeps(runs).items()]
-    found += [control_section(each) for each in controls]
+    found += [comparison_section(each, overall=True) for each in controls]
     found += granularity_section(runs, paper)
     for run in runs:
         section = _section(run)
@@ -235,7 +235,7 @@ def report_data(runs: Sequence[Run], controls: Sequence[Comparison], paper: bool
     else:
         found = {"evaluations": {run.name: run_data(run) for run in runs}, "notes": unlike(runs)}
         if controls:
-            found["controls"] = [control_data(each) for each in controls]
+            found["controls"] = [comparison_data(each, overall=True) for each in controls]
         if levels := granularity_data(runs):
             found["granularity"] = levels
     if swept := sweeps(runs):

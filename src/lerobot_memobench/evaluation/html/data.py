@@ -12,7 +12,7 @@ from typing import Any
 
 from lerobot_memobench import __version__
 from lerobot_memobench.envs.video import OPERATION_COLOURS
-from lerobot_memobench.evaluation.comparison import control_phrase, controls_among
+from lerobot_memobench.evaluation.comparison import comparison_phrase, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_phrase
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
@@ -61,7 +61,7 @@ def page_data(
     """
     controls: dict[str, list[str]] = {run.name: [] for run in runs}
     for each in controls_among(runs):
-        controls[each.b].append(control_phrase(each))
+        controls[each.b].append(comparison_phrase(each))
     return {
         "version": __version__,
         "notices": unlike(runs),
