@@ -131,7 +131,7 @@ def table(outcomes: Mapping[str, Episodes]) -> str:
         f"{sum(record.get('failure') == 'reference_drift' for record in episodes)} |"
         for name, episodes in outcomes.items()
     ]
-    return "\n".join([head, "|---|---|---|", *rows]) + "\n"
+    return "\n".join([head, "|---|---|---|", *rows, "", "Inputs: privileged object state and the prompt."]) + "\n"
 
 
 # --- pictures ---
