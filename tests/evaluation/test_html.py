@@ -23,7 +23,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import page_data, task_source
 from lerobot_memobench.evaluation.html.write import find_videos, frame_count, inline_json, page, write_html
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.tasks.catalogue import get_task, task_index
+from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import logs
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -175,47 +175,6 @@ def test_a_film_belongs_to_the_rollout_that_is_as_long(tmp_path: Path) -> None:
     assert len(notes) == 1
     assert f"{STOVE}.1.mp4" in notes[0]
     assert find_videos(tmp_path, [record(), record(referent="random")])[0] == {}, "it could be of either"
-
-
-def test_lerobots_own_videos_serve_where_nothing_was_filmed(tmp_path: Path) -> None:
-    group = tmp_path / "videos" / f"temporal_{task_index(STOVE)}"
-    records = [record(episode=k, success=k == 1) for k in range(2)]
-    successes = [False, True]
-    for k, frames in enumerate((20, 12)):  # LeRobot leaves the last frame out
-        write_frames(group / f"eval_episode_{k}.mp4", frames)
-
-    def info(successes: list[bool]) -> None:
-        entry = {"task_group": "temporal", "task_id": task_index(STOVE), "metrics": {"successes": successes}}
-        (tmp_path / "eval_info.json").write_text(json.dumps({"per_task": [entry]}))
-
-    info(successes)
-    found, notes = find_videos(tmp_path, records)
-    assert found == {k: group / f"eval_episode_{k}.mp4" for k in range(2)}
-    assert not notes
-    info(successes[1:])  # a resumed run: LeRobot's first video is not of the first rollout
-    assert find_videos(tmp_path, records)[0] == {}
-
-
-def test_a_memory_type_that_is_a_path_leads_nowhere(tmp_path: Path) -> None:
-    """LeRobot's record of a run and our log agree on a group that is a path to somebody else's video."""
-    (tmp_path / "run" / "videos").mkdir(parents=True)
-    group = "../../outside/temporal"
-    write_frames(tmp_path / "outside" / f"temporal_{task_index(STOVE)}" / "eval_episode_0.mp4", 12)
-    entry = {"task_group": group, "task_id": task_index(STOVE), "metrics": {"successes": [True]}}
-    (tmp_path / "run" / "eval_info.json").write_text(json.dumps({"per_task": [entry]}))
-    assert find_videos(tmp_path / "run", [record(memory_type=group)]) == ({}, [])
-
-
-def write_frames(path: Path, count: int) -> None:
-    import av
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=20)
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
-        for _ in range(count):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((32, 48, 3), np.uint8), "rgb24")))
-        container.mux(stream.encode())
 
 
 @pytest.mark.parametrize(

@@ -26,14 +26,12 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_source
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.evaluation.records import Run, read_runs
-from lerobot_memobench.io import draft_of, file_name, parsed, write_file
+from lerobot_memobench.io import draft_of, file_name, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.memory_reads import Chunk, find_reads
-from lerobot_memobench.tasks.catalogue import task_names
 
 PAGE = "index.html"
 VIDEOS, VIDEO = "videos", ".mp4"
-LEROBOT_INFO = "eval_info.json"
 SCRIPTS = (
     "dom",
     "address",
@@ -158,7 +156,6 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
 
     A video counts only when it is as long as its rollout: a timeline under another rollout's video would mislead.
     """
-    others = _lerobot_videos(folder, records)
     found: dict[int, Path] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
@@ -166,13 +163,10 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
             continue
         video = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
         if video.is_file():
-            if _fits(frame_count(video), record, held=LAST_FRAMES + 1):
+            if _fits(frame_count(video), record):
                 found[k] = video
-                continue
-            misfits.append(video.name)
-        other = others.get(k)
-        if other is not None and _fits(frame_count(other), record, held=0):
-            found[k] = other
+            else:
+                misfits.append(video.name)
     # A video's name does not hold the referent: where both settings are in one log, it could be of either.
     claims = Counter(found.values())
     misfits += [video.name for video, count in claims.items() if count > 1]
@@ -191,13 +185,15 @@ def _names_a_file(name: str) -> bool:
         return False
 
 
-def _fits(frames: int | None, record: Record, held: int) -> bool:
-    """Whether a video has a frame per control step and ``held`` more; logs without lengths take any."""
+def _fits(frames: int | None, record: Record) -> bool:
+    """Whether a video has a frame of the start, one per control step, and its last one held; logs without lengths take
+    any.
+    """
     if frames is None:
         return False
     if record.get("steps") is None:
         return True
-    return frames == int(record.get("prompt_steps") or 0) + int(record["steps"]) + held
+    return frames == int(record.get("prompt_steps") or 0) + int(record["steps"]) + LAST_FRAMES + 1
 
 
 def frame_count(path: Path) -> int | None:
@@ -209,38 +205,6 @@ def frame_count(path: Path) -> int | None:
             return int(container.streams.video[0].frames)
     except (av.FFmpegError, IndexError, OSError):
         return None
-
-
-def _lerobot_videos(folder: Path, records: Sequence[Record]) -> dict[int, Path]:
-    """Return position -> LeRobot's video of it.
-
-    LeRobot numbers its videos by the order of its run and does not write the seeds down. They are believed only where
-    its list of successes is that of the task's logged rollouts, which it is not after a resumed or a sharded run.
-    """
-    try:
-        info: Any = parsed((folder / LEROBOT_INFO).read_bytes())
-        entries = [(e["task_group"], e["task_id"], e["metrics"]["successes"]) for e in info["per_task"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    by_task: dict[str, list[int]] = {}
-    for k in sorted(range(len(records)), key=lambda k: int(records[k]["episode"])):
-        by_task.setdefault(records[k]["task"], []).append(k)
-    names = task_names(suite=None)  # LeRobot runs a task of the catalogue under its number
-    found: dict[int, Path] = {}
-    for group, task_id, successes in entries:
-        if not _names_a_file(f"{group}_{task_id}"):
-            continue
-        for task, positions in by_task.items():
-            rollouts = [records[k] for k in positions]
-            if rollouts[0]["memory_type"] != group or [r["success"] for r in rollouts] != successes:
-                continue
-            if task not in names or names.index(task) != task_id:
-                continue
-            for number, k in enumerate(positions):
-                video = folder / VIDEOS / f"{group}_{task_id}" / f"eval_episode_{number}.mp4"
-                if video.is_file():
-                    found[k] = video
-    return found
 
 
 def place_videos(chosen: Mapping[Path, Path]) -> None:
