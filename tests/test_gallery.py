@@ -56,17 +56,3 @@ def test_sheets() -> None:
     closed_and_open = np.asarray(gallery.draw_fixtures(["microwave"], size=64)).astype(int)
     left, right = closed_and_open[6:70, 6:70], closed_and_open[6:70, 140:204]
     assert np.abs(left - right).mean() > 5
-
-
-def test_all_classes_of_the_catalogue_are_drawn() -> None:
-    assert len(gallery.catalogue_classes("objects")) == 29
-    assert set(gallery.catalogue_classes("fixtures")) == set(gallery.FRONTS)
-
-
-def test_what_is_small_and_bright_keeps_its_colour(tmp_path: Path) -> None:
-    """A tomato is some hundred pixels among a million of table."""
-    table = np.random.default_rng(0).normal((205, 185, 160), 12, (600, 600, 3)).clip(0, 255).astype(np.uint8)
-    table[300:312, 300:312] = tomato = (200, 30, 25)
-    with Image.open(gallery.save(Image.fromarray(table), tmp_path / "table.png")) as kept:
-        seen = np.asarray(kept.convert("RGB").resize((600, 600), Image.Resampling.NEAREST))[306, 306]
-    assert np.abs(seen.astype(int) - tomato).max() < 25

@@ -107,6 +107,7 @@ def test_equal_outcomes_are_no_certainty(tmp_path: Path) -> None:
     assert low < 0.4
 
 
+@pytest.mark.slow
 def test_the_interval_covers_the_truth_about_as_often_as_it_says(tmp_path: Path) -> None:
     rng, covered = np.random.default_rng(11), 0
     for number in range(60):

@@ -74,18 +74,6 @@ def test_what_was_asked_for_comes_from_the_card(tmp_path: Path) -> None:
     assert read_protocol(tmp_path) == {**card["protocol"], "policy": {"type": "act"}}
 
 
-@pytest.mark.parametrize("text", ["{", "[1]"])
-def test_files_that_are_none_of_ours_are_named(tmp_path: Path, text: str) -> None:
-    write_episodes(tmp_path, [record()])
-    (tmp_path / PROTOCOL_FILE).write_text(text)
-    with pytest.raises(MemobenchError, match=PROTOCOL_FILE):
-        read_protocol(tmp_path)
-    (tmp_path / PROTOCOL_FILE).unlink()
-    (tmp_path / CARD_FILE).write_text(text)
-    with pytest.raises(MemobenchError, match=CARD_FILE):
-        read_protocol(tmp_path)
-
-
 def test_differences_are_named_with_both_values() -> None:
     other = {**SETTINGS, "horizon": 600, "replan_steps": 5, "seed_base": 1000}
     assert differences(SETTINGS, other) == [

@@ -157,21 +157,6 @@ def test_what_was_read_is_found_on_the_timeline(tmp_path: Path) -> None:
     assert found_of(tmp_path, paused_steps=20) == (None, [])  # its timeline leaves the pauses out
 
 
-def test_episodes_of_one_scene_have_files_of_their_own(tmp_path: Path) -> None:
-    rollouts = [ROLLOUT | {"episode": k, "seed": 7 + k // 3, "variant": k % 3, "variants": 3} for k in range(6)]
-    for k in range(6):
-        reads: EpisodeReads = {"seed": 7 + k, "referent": "random", "chunks": CHUNKS[: k % 2 + 1]}
-        write_reads(reads_file(tmp_path, "a_task", k), reads)
-    found, notes = find_reads(tmp_path, rollouts, {})
-    assert [len(found[k]) for k in range(6)] == [1, 2, 1, 2, 1, 2]
-    assert notes == []
-    another: EpisodeReads = {**READS, "seed": 8}
-    write_reads(reads_file(tmp_path, "a_task", 4), another)  # the scene's, but of episode 1
-    found, (note,) = find_reads(tmp_path, rollouts, {})
-    assert 4 not in found
-    assert "not of the rollout" in note
-
-
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
