@@ -15,6 +15,7 @@ from lerobot_memobench.evaluation.comparison import Comparison, Difference, comp
 from lerobot_memobench.evaluation.metrics import METRICS, value_of
 from lerobot_memobench.evaluation.records import read_runs, unlike
 from lerobot_memobench.evaluation.report_tables import AVERAGE
+from lerobot_memobench.evaluation.statistics import detectable
 from lerobot_memobench.evaluation.tables import markdown
 from tests.support import logs
 
@@ -83,6 +84,22 @@ def test_rates_are_those_of_the_report(tmp_path: Path) -> None:
                 rates = getattr(run.summary, rows)
                 assert value == (rates[metric] if scope == AVERAGE else rates[scope][metric]).value
     assert find(found, "stove_transition", "SR").a == find(found, STOVE, "SR").a, "the family has one task here"
+
+
+def test_pairs_of_equal_tasks_weigh_the_same(tmp_path: Path) -> None:
+    """Two tasks of one memory type and 8 episodes each: 16 pairs, of which 6 differ, all one way."""
+    for name, good in (("a", 2), ("b", 5)):
+        records = [
+            logs.rollout(task, "temporal", "S", [k < good], k < good, k) for task in ("one", "two") for k in range(8)
+        ]
+        write_episodes(tmp_path / name, records)
+    found = compared(tmp_path / "a", tmp_path / "b")
+    differences = np.array([0, 0, 1, 1, 1, 0, 0, 0] * 2)
+    for scope in ("temporal", AVERAGE):
+        assert find(found, scope, "SR").detectable == detectable(differences, np.full(16, 1 / 16))
+        assert find(found, scope, "MSR").p == 2 / 64
+        low, high = find(found, scope, "SR").interval
+        assert 0 < low < 6 / 16 < high < 0.7
 
 
 def test_a_rollouts_share_of_an_operation() -> None:
