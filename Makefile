@@ -13,7 +13,7 @@ setup: ## install uv, .venv and system libraries (quick when there is nothing to
 
 demo: ## expert on four tasks, two policies on one; videos and report in outputs/demo (4 minutes)
 	@scripts/setup
-	@.venv/bin/memobench demo $(ARGS)
+	@$(PYTHON) examples/demo.py $(ARGS)
 
 test: ## run the tests; ARGS are passed to pytest (ARGS="-m slow")
 	@scripts/setup --tests

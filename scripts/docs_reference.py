@@ -12,8 +12,10 @@ import html
 import inspect
 import io
 import re
+import runpy
 import sys
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, NotRequired, get_args, get_origin, get_type_hints, is_typeddict
 
@@ -26,7 +28,7 @@ NECESSITY = {
 }
 """Notes whose tables say what a policy without a memory reaches."""
 SHEET = DOCS / "figures" / "tasks.png"
-"""Initial scenes of the published tasks, as `memobench gallery` draws them."""
+"""Initial scenes of the published tasks, drawn by `scripts/gallery.py`."""
 SHEET_SIDE = 256
 
 COPIES = {
@@ -513,11 +515,17 @@ def slug(name: str) -> str:
     return name.replace(",", "")
 
 
+@cache
+def task_places() -> dict[str, tuple[int, int]]:
+    """Return where each task's picture is in the sheet of all, name -> (left, top), pixels."""
+    found: dict[str, tuple[int, int]] = runpy.run_path(str(ROOT / "scripts" / "gallery.py"))["task_places"]()
+    return found
+
+
 def scene(number: int) -> bytes:
     """Return the picture of a published task's initial scene, cut out of the sheet of all."""
     from PIL import Image
 
-    from lerobot_memobench.sim.gallery import task_places
     from lerobot_memobench.tasks.catalogue import task_names
 
     left, top = task_places()[task_names()[number - 1]]

@@ -24,6 +24,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.observations import OBJECTS
 from lerobot_memobench.envs.video import OPERATION_COLOURS
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.io import draft_of
@@ -31,8 +32,14 @@ from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
 
-EPISODES = 6
-"""Evaluation seeds that are looked through."""
+POLICIES = {
+    "expert": (),
+    "with memory": ("policy=memobench_small",),
+    "without memory": ("policy=memobench_small_memoryless",),
+}
+"""Name in the picture -> arguments of `lerobot eval` that choose who acts."""
+EPISODES, HORIZON = 6, 400
+"""Evaluation seeds that are tried; steps of an episode."""
 STRIDE, SPEED = 4, 2.0
 """Control steps from picture to picture, and how much faster than real they are shown."""
 SIDE, GAP = 272, 6
@@ -89,12 +96,13 @@ Rollout = tuple[dict[str, Any], list[NDArray[np.float32]]]
 
 
 def evaluate(name: str, folder: Path) -> dict[int, Rollout]:
-    """Evaluate one of the demo's policies in this process; return line of the log and actions by seed."""
-    from lerobot_memobench.run.demo import memory_plan
+    """Evaluate one of `POLICIES` in this process; return line of the log and actions by seed."""
+    from lerobot_memobench.run.plan import plan_line
     from lerobot_memobench.run.run import run_evaluation
 
-    here = ("batch_size=1", "eval.use_async_envs=false")
-    plan = memory_plan(name, folder, *here, episodes=EPISODES, videos=0)
+    words = ["env=memobench", *POLICIES[name], f"tasks={BOWL}", "referent=random", f"horizon={HORIZON}"]
+    words += [f"obs_type={OBJECTS}", f"episodes={EPISODES}", "videos=0", f"output_dir={folder}"]
+    plan = plan_line([*words, "batch_size=1", "eval.use_async_envs=false"])
     with recorded_actions() as taken:
         run_evaluation(plan, print, print)
     return {record["seed"]: (record, taken[record["seed"]]) for record in read_episodes(folder)}
@@ -111,8 +119,6 @@ def first_difference(found: dict[str, dict[int, Rollout]]) -> int:
 
 def play(seed: int, record: dict[str, Any], actions: Sequence[NDArray[np.float32]]) -> list[Shot]:
     """Go through a recorded episode again and draw it; it must end as the evaluation's did."""
-    from lerobot_memobench.run.demo import HORIZON
-
     episode = Episode(
         get_task(BOWL), referent="random", horizon=HORIZON, render=RenderSettings(2 * SIDE, 2 * SIDE, "high")
     )
@@ -196,8 +202,6 @@ def write(film: Sequence[Image.Image], path: Path) -> None:
 
 def main() -> None:
     """Evaluate, choose, draw."""
-    from lerobot_memobench.run.demo import POLICIES
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/figures/memory.webp"))
     out = parser.parse_args().out

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.evidence_controls import AVERAGE, Evidence
+from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, mean_row, percent
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.evaluation.report import keep_log
@@ -79,7 +79,7 @@ def figures_of_tasks(tasks: Mapping[str, Row]) -> Figures:
 def of_log(folder: Path) -> Figures:
     """Return the figures of a kept log, by the report's own sums."""
     (run,) = read_runs([folder])
-    summary, found = run.summary, run.evidence.rates[AVERAGE].get(AVERAGE) if run.evidence else None
+    summary, found = run.summary, run.evidence.average if run.evidence else None
     return {
         **(of_evidence(found) if found else {}),
         **{metric: in_words(summary.average[metric]) for metric in METRICS},

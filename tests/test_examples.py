@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
@@ -23,6 +24,7 @@ from lerobot_memobench.run.arguments import read_arguments, split_arguments
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.sim.object_layout import STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, in_slots
+from tests.support import logs
 from tests.support.libero import needs_assets, simulate
 from tests.support.remote_case import batch
 
@@ -68,6 +70,27 @@ def test_ten_minutes(tmp_path: Path) -> None:
     trained = (tmp_path / "memory" / "checkpoints" / "last").stat().st_mtime
     assert subprocess.run(words, capture_output=True, timeout=500).returncode == 0
     assert (tmp_path / "memory" / "checkpoints" / "last").stat().st_mtime == trained
+
+
+# --- paper_figures.py ---
+
+
+def test_the_papers_figures_show_what_its_text_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Appendix "Radar Summaries": who is highest on each axis; and Pearson's r of its main table."""
+    words = [logs.evaluation(tmp_path / "a", 1), "--with", "paper", "--format", "json", "--out", tmp_path / "report"]
+    assert memobench(["report", *map(str, words)]) == 0
+    monkeypatch.setattr(sys, "argv", ["x", str(tmp_path / "report" / "report.json"), "--out", str(tmp_path)])
+    drawn = runpy.run_path(str(EXAMPLES / "paper_figures.py"), run_name="__main__")
+    assert all((tmp_path / f"{name}.pdf").is_file() for name in ("radar", "correlations", "prefix"))
+    report = json.loads((tmp_path / "report" / "report.json").read_text())
+    rows = [row for row in drawn["rows_of"](report, "main") if row.published]
+    best = drawn["best_over_replan"](rows)
+    highest = [max(best, key=lambda whose, k=k: best[whose][k] or 0.0)[0] for k in range(4)]
+    assert highest == ["π0.5 + memory module", "π0.5 + memory module", "MemoryVLA", "HiF-VLA"]
+    counts = {metric: len(drawn["points"](rows, metric)) for metric in ("MSR", "MUR", "MCR")}
+    assert counts == {"MSR": 24 * 4, "MUR": 24 * 3, "MCR": 24 * 2}
+    assert drawn["pearson"](drawn["points"](rows, "MSR")) == pytest.approx(0.587, abs=0.01)
+    assert drawn["pearson"]([(1.0, 0.0, "object")] * 3) is None
 
 
 # --- recurrent_ppo.py ---

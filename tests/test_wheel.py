@@ -58,6 +58,12 @@ def test_the_wheel_holds_the_product_alone(wheel: Path) -> None:
         file.split("/")[0],
     }
     assert not [name for name in names if re.search(r"(^|/)(test_|conftest|research)", name)]
+    page = ROOT / "src" / "lerobot_memobench" / "evaluation" / "html"
+    files = {
+        path.relative_to(ROOT / "src").as_posix() for path in page.rglob("*") if path.suffix in (".js", ".css", ".html")
+    }
+    assert len(files) > 10
+    assert files <= set(names)
     # What pip could not install without a compiler, or would install over another's files.
     assert not {"robosuite", "opencv-python", "pynput"} & {requirement.name for requirement in requirements}
 

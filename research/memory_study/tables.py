@@ -12,7 +12,7 @@ from typing import Any
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import read_rollouts, read_runs
-from lerobot_memobench.evaluation.report import control_data
+from lerobot_memobench.evaluation.report import evidence_values
 from lerobot_memobench.evaluation.statistics import Estimate
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
@@ -163,7 +163,7 @@ def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
         {name: _percentages(row) for name, row in rows.items()} for rows in (summary.memory_types, summary.tasks)
     )
     counted = {"tasks": tasks, "memory_types": types, "average": _percentages(summary.average)}
-    return {**counted, "failures": dict(summary.failures), **control_data(run)}
+    return {**counted, "failures": dict(summary.failures), **evidence_values(run)}
 
 
 def _percentages(row: Mapping[str, Rate]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.cli.memobench import COMMANDS, main
+from lerobot_memobench.cli.memobench import COMMANDS, ELSEWHERE, main
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.tasks.catalogue import task_names
 
@@ -88,7 +88,6 @@ def test_report_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[
         (["cache", "nowhere"], "nowhere"),
         (["cache", ".", "--size", "huge"], "tiny"),
         (["frobnicate"], "No such command"),
-        (["demo", "--out", "file"], "is a file"),
     ],
 )
 def test_mistakes_are_one_sentence(
@@ -112,7 +111,7 @@ def test_mistakes_are_one_sentence(
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     out = capsys.readouterr().out
-    for command in ("tasks", "generate", "cache", "report", "doctor", "demo"):
+    for command in ("tasks", "generate", "cache", "report", "doctor"):
         assert command in out
 
 
@@ -137,7 +136,7 @@ def test_help_cuts_no_description(capsys: pytest.CaptureFixture[str], monkeypatc
 
 
 def _names() -> list[object]:
-    return [one[0] if isinstance(one, tuple) else one for group in COMMANDS.values() for one in group]
+    return [one for group in COMMANDS.values() for one in group]
 
 
 def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,14 +144,15 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.fullmatch(r"memobench \d+\.\d+\S* \(LeRobot \d+\.\d+\S*\)\n", capsys.readouterr().out)
 
 
-@pytest.mark.parametrize("words", [[], ["env=memobench", "tasks=object", "--seed=3"], ["--help"]])
-@pytest.mark.parametrize("command", ["eval", "train"])
-def test_lerobots_commands_are_pointed_to(command: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("words", [[], ["env=memobench", "--seed=3"], ["--help"]])
+@pytest.mark.parametrize("command", ELSEWHERE)
+def test_moved_commands_name_the_command_to_give(
+    command: str, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([command, *words]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"memobench: `memobench` has no command '{command}'")
-    assert f"lerobot {' '.join([command, *words])}" in told
-    assert told.count("\n") == 1
+    message = capsys.readouterr().err
+    assert f"{command!r}; give: {ELSEWHERE[command]}" in " ".join(message.split())
+    assert message.count("\n") == 1
 
 
 def test_commands_without_lerobot_do_not_import_it() -> None:

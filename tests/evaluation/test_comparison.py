@@ -1,4 +1,4 @@
-"""Comparison of two evaluations: pairing, refusal, and figures counted by hand."""
+"""Comparison of two evaluations: pairing, refusal, figures counted by hand, intervals."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import Comparison, Difference, compare, comparison_report
-from lerobot_memobench.evaluation.metrics import value_of
+from lerobot_memobench.evaluation.metrics import METRICS, value_of
 from lerobot_memobench.evaluation.records import read_runs, unlike
 from lerobot_memobench.evaluation.report_tables import AVERAGE
+from lerobot_memobench.evaluation.statistics import detectable
 from lerobot_memobench.evaluation.tables import markdown
 from tests.support import logs
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
 
 
 def compared(a: Path, b: Path, **options: Any) -> Comparison:
@@ -28,33 +32,116 @@ def find(found: Comparison, scope: str, metric: str) -> Difference:
     return row
 
 
+def folder(path: Path, reached: list[int], task: str = STOVE, operations: str = "SUU") -> Path:
+    """A log with one rollout per number: that many of its checkpoints were satisfied, from the first."""
+    records = [
+        logs.rollout(task, "temporal", operations, [j < n for j in range(len(operations))], n == len(operations), k)
+        for k, n in enumerate(reached)
+    ]
+    write_episodes(path, records)
+    return path
+
+
 def test_counted_by_hand(tmp_path: Path) -> None:
     """Of 8 episodes of each of two tasks, A solves the first 2 and B the first 5."""
-    a, b = logs.evaluation(tmp_path / "a", 2, 8), logs.evaluation(tmp_path / "b", 5, 8)
-    found = compared(a, b)
-    assert found.pairs == 16
-    assert found.notes == ()
+    found = compared(logs.evaluation(tmp_path / "a", 2, 8), logs.evaluation(tmp_path / "b", 5, 8))
+    assert (found.pairs, found.notes, found.control) == (16, (), None)
     average = find(found, AVERAGE, "SR")
     assert (average.a, average.b, average.only_a, average.only_b) == (0.25, 0.625, 0, 6)
-    assert average.p == 2 / 64
-    assert average.value == 0.375
+    assert (average.p, average.value) == (2 / 64, 0.375)
     task = find(found, "one", "SR")
     assert (task.only_b, task.p, task.adjusted) == (3, 0.25, 0.5)  # two tasks: Holm doubles the smaller p
     assert find(found, "spatial", "MCR").value == 0.375
     assert find(found, "spatial", "MUR").p == 1.0  # both have all of them
     assert find(found, "one", "MUR").p == 2 / 8  # three differ, all one way
     assert not [row for row in found.differences if (row.scope, row.metric) == ("one", "MCR")]
+    report = comparison_report(found)
+    assert f"| {AVERAGE} | SR | 16 | 25.0 | 62.5 | +37.5 | " in markdown(report)
+    assert "| 0 / 6 | 0.031 |" in markdown(report)
+    first = json.loads(json.dumps(report.data))["differences"][0]
+    assert (first["test"], first["difference"]) == ("mcnemar_exact", 37.5)
+
+
+def test_rates_are_those_of_the_report(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    for name in ("a", "b"):
+        records = []
+        for task, memory_type, operations in (
+            ("x", "temporal", "SU"),
+            (STOVE, "temporal", "SSC"),
+            ("y", "spatial", "SUC"),
+        ):
+            for k in range(10):
+                done = [bool(value) for value in rng.random(len(operations)) < 0.6]
+                records.append(logs.rollout(task, memory_type, operations, done, all(done), k))
+        write_episodes(tmp_path / name, records)
+    a, b = read_runs([tmp_path / "a", tmp_path / "b"])
+    found = compare(a, b)
+    for metric in METRICS:
+        for scope, rows in ((AVERAGE, "average"), ("temporal", "memory_types")):
+            row = find(found, scope, metric)
+            for run, value in ((a, row.a), (b, row.b)):
+                rates = getattr(run.summary, rows)
+                assert value == (rates[metric] if scope == AVERAGE else rates[scope][metric]).value
+    assert find(found, "stove_transition", "SR").a == find(found, STOVE, "SR").a, "the family has one task here"
+
+
+def test_pairs_of_equal_tasks_weigh_the_same(tmp_path: Path) -> None:
+    """Two tasks of one memory type and 8 episodes each: 16 pairs, of which 6 differ, all one way."""
+    for name, good in (("a", 2), ("b", 5)):
+        records = [
+            logs.rollout(task, "temporal", "S", [k < good], k < good, k) for task in ("one", "two") for k in range(8)
+        ]
+        write_episodes(tmp_path / name, records)
+    found = compared(tmp_path / "a", tmp_path / "b")
+    differences = np.array([0, 0, 1, 1, 1, 0, 0, 0] * 2)
+    for scope in ("temporal", AVERAGE):
+        assert find(found, scope, "SR").detectable == detectable(differences, np.full(16, 1 / 16))
+        assert find(found, scope, "MSR").p == 2 / 64
+        low, high = find(found, scope, "SR").interval
+        assert 0 < low < 6 / 16 < high < 0.7
 
 
 def test_a_rollouts_share_of_an_operation() -> None:
     record = logs.rollout("t", "temporal", "SSU", [True, False, False], False, 0)
-    assert [value_of(record, metric) for metric in ("SR", "MSR", "MUR", "MCR")] == [0.0, 0.5, 0.0, None]
+    assert [value_of(record, metric) for metric in METRICS] == [0.0, 0.5, 0.0, None]
+
+
+# --- intervals ---
+
+
+def test_pairs_narrow_the_interval(tmp_path: Path) -> None:
+    """B solves one episode more than A: drawn together, the difference hardly varies."""
+    a, b = folder(tmp_path / "a", [3, 0] * 25), folder(tmp_path / "b", [3, 0] * 24 + [3, 3])
+    low, high = find(compared(a, b), "temporal", "SR").interval
+    assert low <= 0.02 <= high
+    # Wilson's interval of one pair in 50 that differs reaches 0.105; a bootstrap alone would end at 0.06.
+    assert 0.1 < high - low < 0.12, "independent samples of 50 would give about 0.4"
+
+
+def test_equal_outcomes_are_no_certainty(tmp_path: Path) -> None:
+    low, _ = find(compared(folder(tmp_path / "a", [0, 0]), folder(tmp_path / "b", [3, 3])), STOVE, "SR").interval
+    assert low < 0.4
+
+
+@pytest.mark.slow
+def test_the_interval_covers_the_truth_about_as_often_as_it_says(tmp_path: Path) -> None:
+    rng, covered = np.random.default_rng(11), 0
+    for number in range(60):
+        luck = rng.random((60, 2))
+        a = folder(tmp_path / f"a{number}", [3 * int(x < 0.2) for x in luck[:, 0]])
+        b = folder(tmp_path / f"b{number}", [3 * int(x < 0.6) for x in luck[:, 1]])
+        low, high = find(compared(a, b, permutations=100), STOVE, "SR").interval
+        covered += low <= 0.4 <= high
+    assert 52 <= covered <= 60
+
+
+# --- which evaluations compare ---
 
 
 def test_only_common_episodes_are_compared(tmp_path: Path) -> None:
     found = compared(logs.evaluation(tmp_path / "a", 2, 4), logs.evaluation(tmp_path / "b", 2, 6))
-    assert found.pairs == 8
-    assert found.notes == ("4 episodes only in b left out",)
+    assert (found.pairs, found.notes) == (8, ("4 episodes only in b left out",))
 
 
 @pytest.mark.parametrize(
@@ -63,59 +150,58 @@ def test_only_common_episodes_are_compared(tmp_path: Path) -> None:
         ({"replan_steps": 20}, "replan_steps: 5 and 20"),
         ({"referent": "random"}, "referent: fixed and random"),
         ({"scene_hash": "another"}, "initial scenes"),
+        ({"seed": 99}, "seed"),
     ],
 )
-def test_what_differs_is_refused_by_name_and_may_be_allowed(
+def test_differences_of_logs_are_refused_by_name_and_may_be_allowed(
     tmp_path: Path, changes: dict[str, Any], named: str
 ) -> None:
     a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b", **changes)
     with pytest.raises(MemobenchError, match=named):
         compared(a, b)
     (name,) = changes
-    found = compared(a, b, allow=[name])
-    assert found.pairs == 8
-    if name != "scene_hash":
-        assert found.notes[0] == f"compared although {named}"
-
-
-def test_another_variant_of_a_scene_is_another_episode(tmp_path: Path) -> None:
-    a, b = (logs.evaluation(tmp_path / str(k), referent="random", variant=k) for k in (0, 1))
-    with pytest.raises(MemobenchError, match=r"do not have the same variants, the first is .*--allow referent"):
-        compared(a, b)
-    assert compared(a, b, allow=["referent"]).pairs == 8
+    assert compared(a, b, allow=["seed_base" if name == "seed" else name]).pairs == 8
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"), [("horizon", 600), ("render", "fast"), ("seed_base", 1007), ("demonstration_prompt", False)]
+    ("setting", "value"),
+    [
+        ("horizon", 600),
+        ("render", "fast"),
+        ("seed_base", 1007),
+        ("demonstration_prompt", False),
+        ("prompt_in", "reset"),
+    ],
 )
 def test_settings_beside_the_log_count(tmp_path: Path, setting: str, value: Any) -> None:
-    settings = {"seed_base": 7, "referent": "fixed", "demonstration_prompt": True, "horizon": 1200, "render": "default"}
+    settings = {**logs.SETTINGS, "prompt_in": "steps", "replan_steps": 5}
     a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b")
     (a / "protocol.json").write_text(json.dumps(settings))
     (b / "protocol.json").write_text(json.dumps({**settings, setting: value}))
+    if setting == "prompt_in":  # the policy's: it may differ, with a note
+        assert compared(a, b).notes[0] == "compared although prompt_in: steps and reset"
+        return
     with pytest.raises(MemobenchError, match=f"{setting}: .* and {value}.*--allow {setting}"):
         compared(a, b)
 
 
-def test_who_sees_the_prompt_is_the_policys_and_told(tmp_path: Path) -> None:
-    settings = {"seed_base": 7, "referent": "fixed", "prompt_in": "steps"}
-    a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b")
-    (a / "protocol.json").write_text(json.dumps(settings))
-    (b / "protocol.json").write_text(json.dumps({**settings, "prompt_in": "reset"}))
-    assert compared(a, b).notes[0] == "compared although prompt_in: steps and reset"
+def test_another_variant_of_a_scene_is_another_episode(tmp_path: Path) -> None:
+    a, b = (logs.evaluation(tmp_path / str(k), referent="random", variant=k) for k in (0, 1))
+    with pytest.raises(MemobenchError, match=r"same variants, .*--allow referent"):
+        compared(a, b)
+    assert compared(a, b, allow=["referent"]).pairs == 8
 
 
-def test_another_mujoco_is_told(tmp_path: Path) -> None:
+def test_another_mujoco_is_named(tmp_path: Path) -> None:
     """By the cards: of the refused, why their scenes differ, and as a note of what was allowed."""
     a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b", scene_hash="another")
-    for folder, version in ((a, "3.9.0"), (b, "4.0.0")):
+    for each, version in ((a, "3.9.0"), (b, "4.0.0")):
         card = {"protocol": {}, "runs": [{"versions": {"mujoco": version, "python": "3.12.1"}}]}
-        (folder / "card.json").write_text(json.dumps(card))
-    sentence = "a ran under MuJoCo 3.9.0 and b under 4.0.0: scenes start and move slightly otherwise"
-    with pytest.raises(MemobenchError, match=sentence):
+        (each / "card.json").write_text(json.dumps(card))
+    with pytest.raises(MemobenchError, match=r"a ran under MuJoCo 3.9.0 and b under 4.0.0"):
         compared(a, b)
+    (sentence,) = unlike(read_runs([a, b]))
     assert sentence in compared(a, b, allow=["scene_hash"]).notes
-    assert unlike(read_runs([a, b])) == [sentence]
     (b / "card.json").write_text((a / "card.json").read_text())
     assert sentence not in compared(a, b, allow=["scene_hash"]).notes
 
@@ -128,40 +214,19 @@ def test_all_that_must_be_allowed_is_named_at_once(tmp_path: Path) -> None:
     (b / "protocol.json").write_text(json.dumps({**settings, "horizon": 600, "render": "fast", "referent": "random"}))
     with pytest.raises(MemobenchError) as caught:
         compared(a, b, allow=["render"])
-    told = str(caught.value)
-    assert told.count("--allow") == 4
-    assert "initial scenes" in told
-    names = told.replace("--allow ", "").rsplit(": ", 1)[1].split()
+    names = str(caught.value).replace("--allow ", "").rsplit(": ", 1)[1].split()
     assert sorted(names) == ["horizon", "referent", "replan_steps", "scene_hash"]
     assert compared(a, b, allow=["render", *names]).pairs == 8
 
 
-def test_other_seeds_are_other_episodes(tmp_path: Path) -> None:
-    a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b", seed=99)
-    with pytest.raises(MemobenchError, match="seed"):
-        compared(a, b)
-    assert compared(a, b, allow=["seed_base"]).pairs == 8
-
-
-def test_nothing_in_common_and_unknown_names(tmp_path: Path) -> None:
+def test_what_cannot_be_paired_is_refused(tmp_path: Path) -> None:
     a = logs.evaluation(tmp_path / "a")
     write_episodes(tmp_path / "b", [logs.rollout("other", "object", "S", [True], True, 0)])
     with pytest.raises(MemobenchError, match="no episode in common"):
         compared(a, tmp_path / "b")
     with pytest.raises(MemobenchError, match="replan_steps"):
         compared(a, tmp_path / "b", allow=["replan_step"])
-
-
-def test_versions_of_a_task_do_not_pair(tmp_path: Path) -> None:
-    for name, operations in (("a", "SU"), ("b", "SC")):
+    for name, operations in (("c", "SU"), ("d", "SC")):
         write_episodes(tmp_path / name, [logs.rollout("t", "temporal", operations, [True, True], True, 0)])
     with pytest.raises(MemobenchError, match="other checkpoints"):
-        compared(tmp_path / "a", tmp_path / "b")
-
-
-def test_written_as_a_table_and_as_json(tmp_path: Path) -> None:
-    found = comparison_report(compared(logs.evaluation(tmp_path / "a", 2, 8), logs.evaluation(tmp_path / "b", 5, 8)))
-    assert f"| {AVERAGE} | SR | 16 | 25.0 | 62.5 | +37.5 | 0 / 6 | 0.031 |" in markdown(found)
-    data = json.loads(json.dumps(found.data))
-    assert data["differences"][0]["test"] == "mcnemar_exact"
-    assert data["differences"][0]["difference"] == 37.5
+        compared(tmp_path / "c", tmp_path / "d")

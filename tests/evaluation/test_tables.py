@@ -24,9 +24,7 @@ from lerobot_memobench.evaluation.tables import (
     Table,
     best_in_columns,
     csv_text,
-    latex_text,
     markdown,
-    markdown_table,
 )
 from tests.support import logs
 
@@ -62,11 +60,6 @@ def test_the_sweep_names_the_best_interval(sweep: list[Run]) -> None:
     assert swept["best"] == {"SR": [20], "MSR": [5, 20, 35], "MUR": [20], "MCR": [20]}
     assert "Best replan interval by average: SR 75.0 at 20, MSR 100.0 at 5 and 20 and 35" in rendered(sweep, "markdown")
     assert best_interval(sweep, "SR")[0] == [20]
-
-
-def test_one_interval_is_no_sweep(tmp_path: Path) -> None:
-    runs = read_runs([logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b")])
-    assert "replan_sweep" not in json.loads(rendered(runs, "json"))
 
 
 def test_csv_names_are_no_formulas() -> None:
@@ -114,17 +107,6 @@ def test_latex_is_balanced_and_escaped(sweep: list[Run]) -> None:
 
 
 BLOCKS = ("heading", "paragraph", "blockquote", "table", "thead", "tbody", "tr", "th", "td")
-
-
-def test_every_character_that_latex_takes_as_a_command_is_escaped() -> None:
-    assert latex_text(r"a_b & 5% $x$ #1 {y} \z ~ ^") == (
-        r"a\_b \& 5\% \$x\$ \#1 \{y\} \textbackslash{}z \textasciitilde{} \textasciicircum{}"
-    )
-
-
-def test_markdown_escapes_what_would_break_a_table() -> None:
-    table = Table("t", "", ("a", "b"), (("x|y*", Name("p_q")),))
-    assert markdown_table(table)[2] == r"| x\|y\* | `p_q` |"
 
 
 EVIL = "a|b\n\n# x\n```\n<script>alert(1)</script> ``[y](javascript:z) ![](w) &lt; \x1b[2J\u202e ~~s~~ *b*"
@@ -185,7 +167,3 @@ def test_documents_are_written_whole(sweep: list[Run], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(MemobenchError, match="is a file"):
         write_documents(sweep, tmp_path / "file", ["json"])
-
-
-def test_an_empty_report_is_still_text() -> None:
-    assert markdown(Report("Title", (Section("", sentences=("a_b _c_",)),))) == "# Title\n\na_b \\_c\\_\n"

@@ -15,7 +15,7 @@ from lerobot_memobench.policies.memobench_mem.layers import attend, rms_norm
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.reads import chunk_reads
+from lerobot_memobench.policies.memory_reads import chunk_reads
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import made_for_training, small_config
 
@@ -76,14 +76,14 @@ def test_reads_are_of_the_sampled_frames_and_change_no_action(root: Path, fusion
     assert torch.equal(rolled(policy, batches), plain)
     ahead, behind = policy.memory_reads()
     # Chunks of 6 actions from the execution's first frame on; of frames 0, 2, ... four are sampled.
-    assert [(read.step, read.entries) for read in ahead] == [(8, (0, 2, 4, 8)), (14, (0, 4, 8, 14))]
+    assert [(read["step"], read["entries"]) for read in ahead] == [(8, [0, 2, 4, 8]), (14, [0, 4, 8, 14])]
     # Frozen until frame 6, then six frames behind.
-    assert [(read.step, read.entries) for read in behind] == [(8, (0, 2, 4, 8))]
+    assert [(read["step"], read["entries"]) for read in behind] == [(8, [0, 2, 4, 8])]
     for read in (*ahead, *behind):
-        assert min(read.weights) > 0
-        whole = sum(read.weights)
+        assert min(read["weights"]) > 0
+        whole = sum(read["weights"])
         assert whole == pytest.approx(1, abs=1e-4) if fusion == "modulation" else 0.01 < whole < 0.99
-    assert behind[0].weights == pytest.approx(ahead[0].weights, abs=1e-5)
+    assert behind[0]["weights"] == pytest.approx(ahead[0]["weights"], abs=1e-5)
     policy.watch_memory(False)
     rolled(policy, batches)
     assert policy.memory_reads() == [[], []]
@@ -108,26 +108,26 @@ def test_what_actions_attend_to_in_context_is_what_was_summed(root: Path, monkey
     (read,), _ = policy.memory_reads()
     tokens, actions = 4 * policy.config.tokens_per_frame, policy.config.chunk_size
     columns = torch.stack(weights).mean(dim=(0, 1, 2))[:-actions][-tokens:]
-    assert read.weights == pytest.approx(columns.unflatten(0, (4, -1)).sum(dim=1).tolist(), abs=1e-6)
+    assert read["weights"] == pytest.approx(columns.unflatten(0, (4, -1)).sum(dim=1).tolist(), abs=1e-6)
 
 
 def test_entries_without_a_frame_are_numbered_and_those_of_a_frame_added() -> None:
     tokens, mask = torch.zeros(2, 4, 8), torch.tensor([[1, 1, 1, 1], [1, 1, 0, 0]], dtype=torch.bool)
     layers = [torch.tensor([[0.1, 0.2, 0.3, 0.4], [0.7, 0.3, 0.0, 0.0]])] * 2
     slots = chunk_reads([5, 9], MemoryTokens(tokens, mask), layers)
-    assert [(read.step, read.entries) for read in slots] == [(5, (-4, -3, -2, -1)), (9, (-2, -1))]
-    assert slots[1].weights == pytest.approx((0.3, 0.7))
+    assert [(read["step"], read["entries"]) for read in slots] == [(5, [-4, -3, -2, -1]), (9, [-2, -1])]
+    assert slots[1]["weights"] == pytest.approx([0.3, 0.7])
     steps = torch.tensor([[0, 0, 8, 8], [0, -1, 0, 0]])
     frames = chunk_reads([5, 9], MemoryTokens(tokens, mask, steps=steps), layers)
-    assert [read.entries for read in frames] == [(0, 8), (-2, 0)]
-    assert frames[0].weights == pytest.approx((0.3, 0.7))
+    assert [read["entries"] for read in frames] == [[0, 8], [-2, 0]]
+    assert frames[0]["weights"] == pytest.approx([0.3, 0.7])
     # Three entries of which the tokens are made, the third one none.
     shares = torch.tensor([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]).expand(2, -1, -1)
     sources = shares, torch.tensor([[0.0, 12.4, -1.0]] * 2)
     looked_up = chunk_reads([20, 30], MemoryTokens(tokens, mask, sources=sources), layers)
-    assert [read.entries for read in looked_up] == [(0, 12)] * 2
-    assert looked_up[0].weights == pytest.approx((0.2, 0.8))
-    assert looked_up[1].weights == pytest.approx((0.85, 0.15))
+    assert [read["entries"] for read in looked_up] == [[0, 12]] * 2
+    assert looked_up[0]["weights"] == pytest.approx([0.2, 0.8])
+    assert looked_up[1]["weights"] == pytest.approx([0.85, 0.15])
 
 
 @pytest.mark.parametrize("name", OURS)
@@ -142,13 +142,13 @@ def test_every_memory_tells_what_was_read_or_is_refused(root: Path, name: str) -
     policy.watch_memory()
     rolled(policy, batches)
     for row in policy.memory_reads():
-        assert [read.step for read in row] == [8, 14][: len(row)]
+        assert [read["step"] for read in row] == [8, 14][: len(row)]
         for read in row:
-            assert read.entries
-            assert max(read.entries) <= read.step
-            assert min(read.weights) >= 0
-            assert sum(read.weights) <= 1 + 1e-4
-            assert max(read.weights) > 0
+            assert read["entries"]
+            assert max(read["entries"]) <= read["step"]
+            assert min(read["weights"]) >= 0
+            assert sum(read["weights"]) <= 1 + 1e-4
+            assert max(read["weights"]) > 0
 
 
 def test_without_a_memory_nothing_is_watched() -> None:

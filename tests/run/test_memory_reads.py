@@ -1,7 +1,8 @@
-"""``memory_reads=true``: which policies it is asked of, its files as episodes end, parts."""
+"""Memory reads: which policies give them, files as episodes end, parts, the report's timeline, damaged files."""
 
 from __future__ import annotations
 
+import gzip
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import OBJECTS, RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import page_data
-from lerobot_memobench.evaluation.memory_reads import find_reads, reads_file
+from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.policies.memobench_mem.reads import ChunkReads
-from lerobot_memobench.run.memory_reads import ReadLog
+from lerobot_memobench.policies.memory_reads import Chunk, EpisodeReads, ReadLog, find_reads, reads_file, write_reads
 from lerobot_memobench.run.merging import merge
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.shards import plan_shards
@@ -31,7 +32,7 @@ LINE = ["env=memobench", f"tasks={TASK}", "episodes=2", "batch_size=1", "memory_
 class Policy:
     """A policy that tells what it is made to."""
 
-    def __init__(self, *rows: list[ChunkReads]) -> None:
+    def __init__(self, *rows: list[Chunk]) -> None:
         self.rows, self.watched = [*rows], False
 
     def check_memory_reads(self) -> None:
@@ -40,7 +41,7 @@ class Policy:
     def watch_memory(self, watched: bool = True) -> None:
         self.watched = watched
 
-    def memory_reads(self) -> list[list[ChunkReads]]:
+    def memory_reads(self) -> list[list[Chunk]]:
         assert self.watched
         return self.rows
 
@@ -52,7 +53,7 @@ def steps_of(folder: Path, episode: int) -> list[int] | None:
 
 
 def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
-    chunks = [ChunkReads(step, (0,), (1.0,)) for step in range(3)]
+    chunks: list[Chunk] = [{"step": step, "entries": [0], "weights": [1.0]} for step in range(3)]
     policy: Any = Policy(chunks[:2], [], chunks[:1])
     log = ReadLog(tmp_path, 20, "fixed")
     with log.noting("a_task", policy, [20, 21, 22]) as ended:
@@ -69,7 +70,7 @@ def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
 
 
 def test_a_rollout_that_breaks_off_leaves_only_whole_episodes(tmp_path: Path) -> None:
-    policy: Any = Policy([ChunkReads(0, (0,), (1.0,))])
+    policy: Any = Policy([{"step": 0, "entries": [0], "weights": [1.0]}])
     with pytest.raises(ZeroDivisionError), ReadLog(tmp_path, 7, "fixed").noting("a_task", policy, [7]):
         raise ZeroDivisionError
     assert not policy.watched
@@ -80,7 +81,7 @@ def test_reads_of_evidence_stand_at_their_own_episode(tmp_path: Path) -> None:
     """Four episodes of two scenes, in two parts, of which the second goes on after its first episode."""
     for part, number in (("a", 0), ("a", 1), ("b", 2), ("b", 3)):
         env = gym.vector.SyncVectorEnv([partial(evidence, tmp_path / part)])
-        policy: Any = Policy([ChunkReads(0, (0,), (number / 10,))])
+        policy: Any = Policy([{"step": 0, "entries": [0], "weights": [number / 10]}])
         with ReadLog(tmp_path / part, 20_000, "drawn").noting(MILK, policy, [20_000 + number]) as ended:
             env.reset(seed=[20_000 + number])
             ended(env.step(np.zeros((1, 7), np.float32))[3])
@@ -113,9 +114,8 @@ def evidence(folder: Path) -> MemobenchEnv:
 
 
 def test_it_is_asked_of_a_policy_with_a_memory() -> None:
-    plan = plan_line(LINE)
-    assert ReadLog.of(plan) == ReadLog(plan.log, 7, "fixed")
-    assert ReadLog.of(plan_line([word for word in LINE if "reads" not in word])) is None
+    assert plan_line(LINE).options.memory_reads
+    assert not plan_line([word for word in LINE if "reads" not in word]).options.memory_reads
     for policy, told in (("memobench_small_memoryless", "memory=none"), ("memobench_random", "memobench_random")):
         with pytest.raises(MemobenchError, match=f"memory_reads=true asks .* {told} does not tell"):
             plan_line([*LINE[:-1], f"policy={policy}"])
@@ -127,3 +127,65 @@ def test_parts_are_asked_for_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     jobs = plan_shards(plan_line([*LINE, "shards=2", "output_dir=out"]), ("program",), print)
     assert ["memory_reads=true" in job.arguments for job in jobs] == [True, True]
+
+
+# --- files on the report's timeline ---
+
+CHUNKS: list[Any] = [
+    {"step": 5, "entries": [-1, 0, 4], "weights": [0.25, 0.123456, 0.5]},
+    {"step": 9, "entries": [0, 8], "weights": [0.0, 1.0]},
+]
+READS: EpisodeReads = {"seed": 7, "referent": "random", "chunks": CHUNKS}
+ROLLOUT = record(referent="random", prompt_steps=3, steps=10, suite="published")
+
+
+def found_of(folder: Path, protocol: dict[str, Any] | None = None, **changes: Any) -> tuple[Any, list[str]]:
+    chunks, notes = find_reads(folder, [record(episode=1), ROLLOUT | changes], protocol or {})
+    return chunks.get(1), notes
+
+
+def test_what_was_read_is_found_on_the_timeline(tmp_path: Path) -> None:
+    write_reads(reads_file(tmp_path, "a_task", 0), READS)
+    found, notes = found_of(tmp_path)
+    rounded = {"step": 5, "entries": [-1, 0, 4], "weights": [0.25, 0.1235, 0.5]}
+    assert (found, notes) == ([rounded, CHUNKS[1]], [])
+    # The policy began to count behind the prompt that it did not see; a strict task's clock counts it all the same.
+    found, _ = found_of(tmp_path, {"prompt_in": "reset"})
+    assert [chunk["step"] for chunk in found] == [8, 12]
+    assert found[0]["entries"] == [-1, 3, 7]
+    assert found_of(tmp_path, {"prompt_in": "reset"}, suite="strict")[0][0]["step"] == 5
+    assert found_of(tmp_path, paused_steps=20) == (None, [])  # its timeline leaves the pauses out
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"seed": 8}, "not of the rollout"),
+        ({"referent": "fixed"}, "not of the rollout"),
+        ({"chunks": [{"step": 13, "entries": [0], "weights": [1.0]}]}, "not of the rollout"),
+        ({"chunks": [{"step": 5, "entries": [6], "weights": [1.0]}]}, "not of the rollout"),
+        ({"chunks": [{"step": 5, "entries": [0, 1], "weights": [1.0]}]}, "not of the rollout"),
+        ({"chunks": [{"step": "5", "entries": [], "weights": []}]}, "expected an integer"),
+    ],
+)
+def test_another_rollouts_file_is_left_out_and_told(tmp_path: Path, changes: dict[str, Any], told: str) -> None:
+    write_reads(reads_file(tmp_path, "a_task", 0), READS | changes)
+    found, (note,) = found_of(tmp_path)
+    assert found is None
+    assert note.startswith("1 file of memory_reads left out, the first because ")
+    assert told in note
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"no gzip", gzip.compress(b"{}")[:-4], gzip.compress(b"[1]")],
+    ids=["empty", "plain", "cut off", "a list"],
+)
+def test_a_damaged_file_is_left_out_and_told(tmp_path: Path, content: bytes) -> None:
+    path = reads_file(tmp_path, "a_task", 0)
+    path.parent.mkdir()
+    path.write_bytes(content)
+    write_episodes(tmp_path, [ROLLOUT])
+    written = write_html([tmp_path], tmp_path / "html")
+    assert len(written.notes) == 1
+    assert str(path) in written.notes[0]

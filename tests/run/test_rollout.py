@@ -20,8 +20,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.memory_reads import find_reads
-from lerobot_memobench.run.memory_reads import ReadLog
+from lerobot_memobench.policies.memory_reads import ReadLog, find_reads
 from lerobot_memobench.run.rollout import Actor, roll
 from lerobot_memobench.sim.object_layout import SIZE
 

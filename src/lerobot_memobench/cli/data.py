@@ -274,7 +274,7 @@ def describe(
     out: Annotated[Path | None, typer.Option(help="Where to; DATASET/description when left out.")] = None,
     suite: OfSuite = None,
 ) -> int:
-    """Keep of a dataset what fits into a repository. Figures, the card's tables, the hash of every episode."""
+    """Summarise a dataset. The card's tables and the hash of every episode, small enough to commit."""
     from lerobot_memobench.datasets.describe import describe as run
     from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
 

@@ -15,14 +15,14 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from lerobot_memobench.cli import data, figures
+from lerobot_memobench.cli import data
 from lerobot_memobench.cli.conformance import conformance
 from lerobot_memobench.cli.console import run_app
 from lerobot_memobench.cli.data import cache, generate
-from lerobot_memobench.cli.demo import demo, doctor
-from lerobot_memobench.cli.report import compare, controls, html, merge, report, rerun
+from lerobot_memobench.cli.doctor import doctor
+from lerobot_memobench.cli.report import compare, merge, report, rerun
 from lerobot_memobench.cli.sealed import test_sealed
-from lerobot_memobench.cli.tasks import gallery, objects, recipe, tasks
+from lerobot_memobench.cli.tasks import objects, recipe, tasks
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import as_path
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
@@ -55,40 +55,48 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-COMMANDS: dict[str, tuple[Callable[..., int | None] | tuple[str, typer.Typer], ...]] = {
-    "Look around": (tasks, objects, gallery, doctor, demo),
+COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
+    "Look around": (tasks, objects, doctor),
     "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
     "Train": (recipe, conformance),
-    "Results": (test_sealed, report, compare, html, merge, rerun, ("figures", figures.app), ("controls", controls)),
+    "Results": (test_sealed, report, compare, merge, rerun),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 
 GO_ON = ("generate", "cache", "convert", "push")
-"""Commands that go on when they are given again; any other begins anew."""
+"""Commands that continue when given again; any other starts over."""
 LEARN = ("cache",)
 """Commands whose own process trains or encodes; every other simulates, or computes next to nothing."""
 
 for group, commands in COMMANDS.items():
     for command in commands:
-        if isinstance(command, tuple):
-            app.add_typer(command[1], name=command[0], rich_help_panel=group)
-        else:
-            flags = {"ignore_unknown_options": command is test_sealed}  # which hands them to LeRobot
-            app.command(rich_help_panel=group, context_settings=flags)(command)
+        flags = {"ignore_unknown_options": command is test_sealed}  # which hands them to LeRobot
+        app.command(rich_help_panel=group, context_settings=flags)(command)
 
 
-def _elsewhere(name: str, example: str) -> None:
-    """Point from ``memobench <name>`` to LeRobot's command."""
+ELSEWHERE = {
+    "eval": "lerobot eval env=memobench policy=CHECKPOINT tasks=object",
+    "train": "lerobot train policy=memobench_mem dataset=FOLDER",
+    "html": "memobench report FOLDER --html OUT",
+    "figures": "memobench report FOLDER --figures OUT; the paper's: python examples/paper_figures.py",
+    "controls": "memobench compare A B; of evidence and granularity: memobench report A B",
+    "demo": "make demo",
+    "gallery": "python scripts/gallery.py --out FOLDER",
+}
+"""Commands of LeRobot's and of earlier releases -> the command to give instead."""
+
+
+def _refuse(name: str) -> None:
+    """Make ``memobench <name>`` an error that names the command to give instead."""
 
     def refuse(words: Annotated[list[str] | None, typer.Argument()] = None) -> None:
-        asked = f"here: lerobot {name} {' '.join(words)}" if words else f"such as: {example}"
-        raise MemobenchError(f"`memobench` has no command {name!r}, it is LeRobot's; {asked} (`lerobot {name} --help`)")
+        raise MemobenchError(f"`memobench` has no command {name!r}; give: {ELSEWHERE[name]}")
 
     app.command(name, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})(refuse)
 
 
-_elsewhere("eval", "lerobot eval env=memobench policy=<checkpoint> tasks=object")
-_elsewhere("train", "lerobot train policy=memobench_mem dataset=<folder>")
+for name in ELSEWHERE:
+    _refuse(name)
 
 
 def _say_version(wanted: bool) -> None:

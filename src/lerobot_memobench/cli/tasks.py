@@ -1,4 +1,4 @@
-"""``memobench tasks``, ``objects``, ``gallery`` and ``recipe``: what there is, to be looked at."""
+"""``memobench tasks``, ``objects`` and ``recipe``: lists of what the package holds."""
 
 from __future__ import annotations
 
@@ -91,27 +91,14 @@ def objects(
     from lerobot_memobench.sim.object_layout import SLOTS
     from lerobot_memobench.sim.object_slots import layout
 
-    told = layout()
+    found = layout()
     if as_json:
-        print(json.dumps(told, indent=1))
+        print(json.dumps(found, indent=1))
         return
     say(f"{SLOTS} slots, one after another; of each:")
-    for field in told["fields"]:
+    for field in found["fields"]:
         say(f"  {field['start']:>2}  {field['name']} ({field['size']})")
-    say("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(told["classes"])))
-
-
-def gallery(
-    out: Annotated[Path, typer.Option(help="Folder of the pictures; those of the same name are replaced.")] = Path(
-        "outputs/gallery"
-    ),
-    suite: WhichSuite = Suite.PUBLISHED,
-) -> None:
-    """Draw every task's initial scene, every object and fixture. Objects from all sides, fixtures open and closed."""
-    from lerobot_memobench.sim.gallery import write_gallery
-
-    for picture in write_gallery(out, suite):
-        say(picture)
+    say("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(found["classes"])))
 
 
 def recipe(

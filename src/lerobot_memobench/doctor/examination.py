@@ -1,4 +1,4 @@
-"""Is the right software installed, and what does this machine draw with, decode videos with and run policies on?"""
+"""Checks of a machine: installed versions, pictures, video decoding, the device of policies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Literal
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from lerobot_memobench.doctor.probe import TOLERANCE, run_probe
+from lerobot_memobench.doctor.golden import TOLERANCE, difference, read_golden, render_golden
 from lerobot_memobench.errors import MemobenchError, unsupported_system
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
@@ -25,7 +25,7 @@ from lerobot_memobench.tasks.task import LIBERO
 DISTRIBUTION = "lerobot_policy_memobench"
 PLUGIN = "LeRobot plugin"
 
-#: What the versions of are shown and held against the requirements of this project and of LeRobot.
+#: Packages whose versions are checked against the requirements of this project and of LeRobot.
 SHOWN = ("lerobot", "torch", "transformers", "mujoco", "robosuite", "numpy", "gymnasium", "torchcodec", "av")
 
 EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av-dep")
@@ -37,11 +37,11 @@ Status = Literal["ok", "warning", "failed"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at.
+    """The result of one check.
 
     Attributes:
         status: ``failed`` keeps the benchmark from running, ``warning`` costs speed or a part of it.
-        fix: what to do about it; empty when there is nothing to do.
+        fix: how to repair it; empty where nothing is to be done.
     """
 
     what: str
@@ -51,7 +51,7 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Look at everything; this takes some tens of seconds, most of it LeRobot's import."""
+    """Run all checks; this takes some tens of seconds, most of it LeRobot's import."""
     return [
         system(),
         python_version(),
@@ -68,7 +68,7 @@ def examine() -> list[Finding]:
 
 
 def exit_status(findings: Sequence[Finding]) -> int:
-    """Return 1 when something that is needed failed."""
+    """Return 1 when a needed check failed."""
     return int(any(finding.status == "failed" for finding in findings))
 
 
@@ -149,7 +149,7 @@ def opencv() -> Finding:
 
 
 def plugin() -> Finding:
-    """Do what LeRobot does to find plugins; it logs an import error and goes on, this reports it."""
+    """Find the plugin as LeRobot does, which only logs an import error."""
     if DISTRIBUTION not in [distribution.metadata.get("Name") for distribution in metadata.distributions()]:
         return Finding(
             PLUGIN,
@@ -161,7 +161,7 @@ def plugin() -> Finding:
         missing = not_registered()
     except Exception as error:
         reason = f"importing it fails: {type(error).__name__}: {error}"
-        return Finding(PLUGIN, "failed", reason, "mend the import error; LeRobot only logs it")
+        return Finding(PLUGIN, "failed", reason, "fix the import error; LeRobot only logs it")
     if missing:
         fix = "install it again: `pip install --force-reinstall --no-deps .` in its folder"
         return Finding(PLUGIN, "failed", f"imported, but not registered: {', '.join(missing)}", fix)
@@ -190,10 +190,10 @@ def _installed(name: str) -> str | None:
 
 def golden_frame() -> Finding:
     """Compare a frame of the benchmark with the one that ships."""
-    answer = run_probe("golden")
-    if "error" in answer:
-        return Finding("golden frame", "failed", answer["error"], "mend what failed above first")
-    off = answer["difference"]
+    try:
+        off = difference(render_golden(), read_golden())
+    except Exception as error:
+        return Finding("golden frame", "failed", _in_one_line(error), "fix what failed above first")
     detail = f"drawn on the CPU, mean difference {off:.2f} of 255 (tolerance {TOLERANCE:g})"
     if off > TOLERANCE:
         fix = "the pictures here are not the benchmark's; remove numba's cache folders and install the package again"
@@ -202,7 +202,7 @@ def golden_frame() -> Finding:
 
 
 def paper_world() -> Finding:
-    """Look for what scenes of ``world=libero`` are built of; the package's own world needs none of it."""
+    """Look for the assets of ``world=libero``; the package's own world needs none of them."""
     what = f"world {LIBERO}"
     try:
         folder = check_assets()
@@ -222,20 +222,25 @@ def ffmpeg() -> Finding:
 
 
 def torchcodec() -> Finding:
-    """Try the decoder that LeRobot prefers."""
-    answer = run_probe("torchcodec")
-    if "error" in answer:
+    """Load the decoder that LeRobot prefers."""
+    try:
+        import torchcodec.decoders  # noqa: F401 - it loads FFmpeg's libraries
+    except Exception as error:
         return Finding(
             "video decoding",
             "warning",
-            f"torchcodec does not load ({answer['error']}); LeRobot falls back to PyAV, which is slower",
+            f"torchcodec does not load ({_in_one_line(error)}); LeRobot falls back to PyAV, which is slower",
             "apt-get install ffmpeg (its libraries are what torchcodec needs)",
         )
     return Finding("video decoding", "ok", "torchcodec loads FFmpeg's libraries")
 
 
+def _in_one_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
+
+
 def device() -> Finding:
-    """Say what policies run on here."""
+    """Return the device of policies."""
     import torch
 
     if torch.cuda.is_available():

@@ -1,323 +1,249 @@
-"""What the paper's controls share: evaluations of the same episodes side by side, and annotation granularity.
+"""Controls: was it memory? A control is a comparison of two evaluations that differ in one setting on purpose.
 
-Rollouts are paired by episode within each replan interval.
+`CONTROLS` lists these settings; `comparison.compare` pairs, tests and reports a control like any two evaluations.
+Evidence needs one evaluation alone (`evidence`). Granularity compares several policies by the language level of the
+subgoals that each was taught with.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations
-from pathlib import Path
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, differences, read_log
+from lerobot_memobench.envs.episode_log import POLICY
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import (
-    METRICS,
-    PROCESS_METRICS,
-    Rate,
-    Record,
-    Summary,
-    operations,
-    percent,
-    policy_inputs,
-    summarise,
-)
-from lerobot_memobench.evaluation.records import asked_for, read_protocol
-from lerobot_memobench.evaluation.report_tables import inputs_phrase
-from lerobot_memobench.evaluation.tables import Cell, Name, Report, Section, Table
-from lerobot_memobench.io import count_of
+from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Record, Summary, percent, summarise
+from lerobot_memobench.evaluation.records import Run
+from lerobot_memobench.evaluation.report_tables import AVERAGE
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Section, Table, figure
+from lerobot_memobench.paper import raw_tables, shuffled_control
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import LEVELS, OPERATIONS
+from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES
 
-Pairs = dict[int | None, tuple[list[Record], list[Record]]]
-"""Replan interval -> the rollouts of the first and of the second set, episode by episode."""
+LEAST_GAP = 0.01
+"""Smallest gap to 100 % of which a share is given: below it, one rollout would turn the share around."""
 
 
-def pairs_by_replan(
-    first: Sequence[Path], second: Sequence[Path], ignore: Sequence[str] = ()
-) -> tuple[Pairs, list[str]]:
-    """Return the paired rollouts of two sets of evaluations, and what a reader must know.
+@dataclass(frozen=True)
+class Control:
+    """A setting in which two evaluations differ on purpose.
 
-    Raises:
-        MemobenchError: their protocols differ in more than what is ignored, or they have no interval in common.
+    Attributes:
+        title: name of the control.
+        setting: key of the protocol, or of the policy's settings where ``of_policy``.
+        default: its value in the first evaluation; the second has another.
+        meaning: how to read the difference.
+        of_policy: whether the policy's training, not the evaluation, has the setting.
+        one_policy: whether both evaluations have to be of one policy.
+        gap_closed: whether the share of the gap to 100 % is reported.
+        by_checkpoint: whether prefix completion is compared checkpoint by checkpoint.
     """
-    check_alike(first, second, ignore)
-    notes: list[str] = []
-    inputs: list[str] = []
-    a, b = (
-        by_replan([record for folder in folders for record in _rollouts(folder, notes, inputs)])
-        for folders in (first, second)
-    )
-    common = [replan for replan in a if replan in b]
-    if not common:
-        raise MemobenchError(
-            f"the evaluations have no replan interval in common ({', '.join(map(str, a))} and "
-            f"{', '.join(map(str, b))}); evaluate both with the same replan="
-        )
-    notes += [
-        f"replan interval {replan} is in one of them only and is left out"
-        for replan in [*a, *b]
-        if replan not in common
-    ]
-    found: Pairs = {}
-    for replan in common:
-        left, right, partnerless = paired(a[replan], b[replan])
-        found[replan] = (left, right)
-        if partnerless:
-            alone = count_of(partnerless, "rollout")
-            notes.append(f"replan interval {replan}: {alone} without a partner left out")
-    return found, notes + inputs
+
+    title: str
+    setting: str
+    default: Any
+    meaning: str
+    of_policy: bool = False
+    one_policy: bool = False
+    gap_closed: bool = False
+    by_checkpoint: bool = False
+
+    def value_in(self, run: Run) -> Any:
+        """Return the setting's value in an evaluation, the default where its log does not record it."""
+        known = run.protocol[POLICY].get("settings", {}) if self.of_policy else run.protocol
+        return known.get(self.setting, self.default)
 
 
-def check_alike(first: Sequence[Path], second: Sequence[Path], ignore: Sequence[str] = ()) -> None:
-    """Refuse evaluations that differ in more than the policy, the replan interval and what is ignored.
-
-    Raises:
-        MemobenchError: naming the first two of them.
-    """
-    for folders in (first, second):
-        check_one_policy(folders)
-    reference = read_protocol(first[0])
-    for folder in [*first[1:], *second]:
-        found = differences(reference, read_protocol(folder), ignore=("replan_steps", *ignore))
-        if found:
-            raise MemobenchError(
-                f"{first[0]} and {folder} were evaluated under different protocols ({'; '.join(found)}); evaluate both "
-                "under the same one"
-            )
-
-
-def check_place(folders: Sequence[Path], setting: str, value: Any, *, of_policy: bool = False) -> None:
-    """Refuse evaluations that tell another value of a setting than their place among a control's arguments says.
-
-    Args:
-        of_policy: the setting is its policy's, by the card.
-
-    Raises:
-        MemobenchError: naming the first of them.
-    """
-    for folder in folders:
-        protocol = read_protocol(folder)
-        told = protocol[POLICY].get("settings", {}) if of_policy else protocol
-        if told.get(setting, value) != value:
-            raise MemobenchError(
-                f"{folder} is of {setting}={told[setting]}, and stands where {setting}={value} is expected; name the "
-                "folders in the order that `memobench controls --help` says"
-            )
-
-
-def check_one_policy(folders: Sequence[Path]) -> None:
-    """Refuse evaluations of two policies where those of one, at several replan intervals, were expected.
-
-    Raises:
-        MemobenchError: naming the first two.
-    """
-    told = {folder: read_protocol(folder)[POLICY] for folder in folders}
-    for key in ("type", "sha256"):
-        known = {folder: policy[key] for folder, policy in told.items() if policy.get(key)}
-        if len(set(known.values())) > 1:
-            (a, mine), (b, other) = next(pair for pair in combinations(known.items(), 2) if pair[0][1] != pair[1][1])
-            raise MemobenchError(
-                f"{a} and {b} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); expected one policy "
-                "at several replan intervals, so leave one of them out"
-            )
-
-
-def _rollouts(folder: Path, notes: list[str], inputs: list[str]) -> list[Record]:
-    """Return the rollouts of an evaluation that were asked for; its policy's inputs are told in ``inputs``."""
-    lines = asked_for(folder, read_log(folder, notes), notes)
-    found: list[Record] = [record for record in lines if "not_run" not in record]
-    inputs.append(f"{folder}: {inputs_phrase(policy_inputs(found))}")
-    return found
-
-
-def by_replan(records: Sequence[Record]) -> dict[int | None, list[Record]]:
-    """Group rollouts by replan interval, ascending; unknown intervals last."""
-    groups: dict[int | None, list[Record]] = {}
-    for record in records:
-        groups.setdefault(record.get("replan_steps"), []).append(record)
-    return dict(sorted(groups.items(), key=lambda item: (item[0] is None, item[0] or 0)))
-
-
-def paired(a: Sequence[Record], b: Sequence[Record]) -> tuple[list[Record], list[Record], int]:
-    """Return the rollouts of episodes that both have, in one order, and how many of either had no partner.
-
-    Raises:
-        MemobenchError: no episode is in both, one is in either of them twice, or a task differs in its checkpoints.
-    """
-    tables = []
-    for records in (a, b):
-        table: dict[tuple[Any, ...], Record] = {}
-        for record in records:
-            key = (record["task"], record.get("referent", "fixed"), record["episode"], record.get("seed"))
-            if key in table:
-                raise MemobenchError(
-                    f"episode {record['episode']} of {record['task']!r} was given twice under one replan interval; "
-                    "name each evaluation once"
-                )
-            table[key] = record
-        tables.append(table)
-    common = [key for key in tables[0] if key in tables[1]]
-    if not common:
-        raise MemobenchError(
-            f"the evaluations have no episode in common ({len(a)} and {count_of(len(b), 'rollout')}); compare "
-            "evaluations of the same tasks, seeds and referent"
-        )
-    for key in common:
-        first, second = (operations(table[key]) for table in tables)
-        if first != second:
-            raise MemobenchError(
-                f"{key[0]!r} has other checkpoints in one evaluation ({first}) than in the other ({second}); compare "
-                "evaluations of one version of the task"
-            )
-    alone = len(tables[0]) + len(tables[1]) - 2 * len(common)
-    return [tables[0][key] for key in common], [tables[1][key] for key in common], alone
-
-
-def rollouts_by_level(*folders: Path) -> tuple[dict[str, list[Record]], list[str]]:
-    """Return the rollouts of an evaluation per language level of the subgoals taught, and what a reader must know.
-
-    Args:
-        folders: one for each of `LEVELS`, in their order.
-
-    Raises:
-        MemobenchError: they were evaluated under different protocols or at different replan intervals.
-    """
-    for level, folder in zip(LEVELS, folders, strict=True):
-        check_place([folder], "subgoal_level", level, of_policy=True)
-        check_alike(folders[:1], [folder])
-    notes: list[str] = []
-    inputs: list[str] = []
-    levels: dict[str, list[Record]] = {
-        level: _rollouts(folder, notes, inputs) for level, folder in zip(LEVELS, folders, strict=True)
-    }
-    intervals = {level: list(by_replan(records)) for level, records in levels.items()}
-    if len({tuple(found) for found in intervals.values()}) > 1:
-        told = ", ".join(f"{level} {'/'.join(map(str, found))}" for level, found in intervals.items())
-        raise MemobenchError(f"the levels were evaluated at different replan intervals ({told}); use the same replan=")
-    if len(intervals[LEVELS[0]]) > 1:
-        notes.append("the evaluations mix replan intervals; the figures are over all of them")
-    return levels, notes + inputs
-
-
-# --- tables ---
-
-PAPER = "paper"
-PAPER_TASK = "paper, stove task of three checkpoints"
-
-
-def replan_title(replan: int | None) -> str:
-    """Return the title of a table of rollouts of one replan interval."""
-    return f"replan interval {'unknown' if replan is None else replan}"
-
-
-def prefix_header(second: str, width: int) -> tuple[str, ...]:
-    """Return the header; ``second`` names the column after the task, ``width`` is the number of checkpoints."""
-    return ("task", second, *(f"c{k + 1}" for k in range(width)), "success")
-
-
-def prefix_row(task: str, second: str, cells: Sequence[Cell], width: int) -> tuple[Cell, ...]:
-    """Return a row; a task with fewer checkpoints than the widest has empty cells, and success comes last."""
-    *checkpoints, success = cells
-    return (task, second, *checkpoints, *([None] * (width - len(checkpoints))), success)
-
-
-# --- annotation granularity: metrics by the language level that a policy was taught with ---
-
-PAPER_GRANULARITY = {"coarse": (4, 50), "intermediate": (3, 50), "fine": (3, 50)}
-"""Successful rollouts of that task by subgoal level (paper, annotation granularity; said in its text only)."""
-
-GRANULARITY_SENTENCE = (
-    "Per cent with Wilson's 95 % interval over rollouts. MSR, MUR and MCR are averages over memory types, under "
-    "the evaluated (intermediate) labels and under those of the level itself."
+CONTROLS = (
+    Control(
+        "Pauses",
+        "pause_steps",
+        0,
+        "The robot rests at times that the seed draws. The policy observes and does the same, only later. A policy "
+        "that reads a clock loses; a policy that remembers events does not.",
+        one_policy=True,
+    ),
+    Control(
+        "Slower actions",
+        "speed",
+        1.0,
+        "Each action takes longer, so all events happen later. A policy that reads a clock loses; a policy that "
+        "remembers events loses no more than the expert.",
+        one_policy=True,
+    ),
+    Control(
+        "Oracle memory",
+        "oracle_memory",
+        False,
+        "The second policy reads the true memory content. Gap closed is (second − first) / (100 − first): the share "
+        "that a perfect memory would recover. It is left out where the gap is under one point.",
+        gap_closed=True,
+    ),
+    Control(
+        "Shuffled memory",
+        "shuffle_subgoals",
+        False,
+        "The second policy was trained on subgoals in another order; tasks with fewer than three such subgoals on "
+        "subgoals of other episodes. c1, c2, … count rollouts in which that checkpoint and all before it were "
+        "satisfied.",
+        of_policy=True,
+        by_checkpoint=True,
+    ),
 )
 
 
-def _with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
-    """Return rollouts of the catalogue's tasks with the operation labels of a level, others as they are."""
-    index = LEVELS.index(level)
-    there = {record["task"] for record in records} & set(task_names(suite=None))
-    return relabelled(
-        records, {name: [each.operations_by_level[index] for each in get_task(name).checkpoints] for name in there}
-    )
+def control_between(a: Run, b: Run) -> Control | None:
+    """Return the control that two evaluations are, None where none of `CONTROLS` differs.
 
-
-def relabelled(records: Sequence[Record], labels: Mapping[str, Sequence[str]]) -> list[Record]:
-    """Return rollouts with the operation labels of another language level; tasks without labels keep theirs.
-
-    Args:
-        labels: task → operation per checkpoint ("S", "U" or "C").
+    Raises:
+        MemobenchError: the evaluation with the control comes first, or they are of two policies.
     """
-    result: list[Record] = []
-    for record in records:
-        wanted = labels.get(record["task"])
-        if wanted is None:
-            result.append(record)
+    for control in CONTROLS:
+        first, second = control.value_in(a), control.value_in(b)
+        if first == second:
             continue
-        if len(wanted) != len(record["checkpoints"]) or not set(wanted) <= set(OPERATIONS):
+        if first != control.default:
             raise MemobenchError(
-                f"a rollout of {record['task']!r} has {len(record['checkpoints'])} checkpoints, its labels are "
-                f"{', '.join(wanted)}; the log was written by another version of the task"
+                f"{a.folder} was evaluated with {control.setting}={first} and {b.folder} with {control.setting}="
+                f"{second}; expected the evaluation with {control.setting}={control.default} first: exchange them"
             )
-        checkpoints = [
-            {**checkpoint, "operation": operation}
-            for checkpoint, operation in zip(record["checkpoints"], wanted, strict=True)
-        ]
-        result.append({**record, "checkpoints": checkpoints})
-    return result
+        if control.one_policy:
+            _check_one_policy(a, b)
+        return control
+    return None
 
 
-def granularity_report(levels: Mapping[str, Sequence[Record]], paper: bool = False) -> Report:
-    """Return metrics by language level and prefix completion by level.
+def _check_one_policy(a: Run, b: Run) -> None:
+    for key in ("type", "sha256"):
+        mine, other = (run.protocol[POLICY].get(key) for run in (a, b))
+        if mine and other and mine != other:
+            raise MemobenchError(
+                f"{a.folder} and {b.folder} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); "
+                "expected one policy with and without the control"
+            )
 
-    Args:
-        levels: level -> rollouts of the policy that was taught at it. paper: add the published successes.
+
+def gap_closed(first: float | None, second: float | None) -> float | None:
+    """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory).
+
+    It is negative where the second is worse, and None where a rate does not apply or the gap is under `LEAST_GAP`.
     """
-    summaries = {level: summarise(records) for level, records in levels.items()}
-    own = {level: summarise(_with_labels_of(level, records)) for level, records in levels.items()}
-    tables = (_rates(summaries, own), _prefixes(summaries, paper))
-    data = {
-        level: {
-            "n": summary.rollouts,
-            "average": {metric: percent(rate.value) for metric, rate in summary.average.items()},
-            "own_labels": {metric: percent(rate.value) for metric, rate in own[level].average.items()},
-            "tasks": {
-                task: {
-                    "SR": percent(row["SR"].value),
-                    "prefix": [percent(rate.value) for rate in summary.prefix[task]],
-                }
-                for task, row in summary.tasks.items()
-            },
-        }
-        for level, summary in summaries.items()
-    }
-    return Report("Annotation granularity", (Section("", tables, sentences=(GRANULARITY_SENTENCE,)),), data)
+    if first is None or second is None or 1.0 - first < LEAST_GAP:
+        return None
+    return (second - first) / (1.0 - first)
 
 
-def _rates(summaries: Mapping[str, Summary], own: Mapping[str, Summary]) -> Table:
+# --- the paper's figures ---
+
+
+def published_table(control: Control) -> Table | None:
+    """Return the paper's figures of a control, None where it has none."""
+    if control.gap_closed:
+        return _published_oracle()
+    return _published_shuffled() if control.by_checkpoint else None
+
+
+def _published_oracle() -> Table:
+    tables = raw_tables()["oracle_memory"]
+    rows: list[tuple[Cell, ...]] = []
+    for name in (*MEMORY_TYPES, "average"):
+        pairs = [
+            (_fraction(tables["standard_pi05"][name][m]), _fraction(tables["oracle_pi05"][name][m])) for m in METRICS
+        ]
+        cells = [NOT_APPLICABLE if a is None else f"{figure(a)}/{figure(b)}" for a, b in pairs]
+        rows.append((name, *cells, *(figure(gap_closed(a, b)) for a, b in pairs)))
+    header = ("memory type", *METRICS, *(f"{metric} gap closed" for metric in METRICS))
+    title = f"Paper: standard/oracle memory, replan interval {tables['replan_steps']}"
+    return Table("paper-oracle", title, header, tuple(rows), strong=frozenset({len(rows) - 1}))
+
+
+def _fraction(value: float | None) -> float | None:
+    return None if value is None else value / 100.0
+
+
+def _published_shuffled() -> Table:
+    published = shuffled_control()
+    change = [b - a for a, b in zip(published["normal"], published["shuffled"], strict=True)]
+    rows = [(name, *(f"{value:.1f}" for value in values)) for name, values in published.items()]
+    rows.append(("difference", *(f"{value:+.1f}" for value in change)))
+    title = "Paper: prefix completion of a temporal task of three checkpoints"
+    return Table("paper-shuffled", title, ("subgoals", *(f"c{k + 1}" for k in range(len(change)))), tuple(rows))
+
+
+# --- annotation granularity ---
+
+PAPER_GRANULARITY = "coarse 4/50, intermediate 3/50, fine 3/50"
+"""Successful rollouts of the paper's stove task of three checkpoints by subgoal level; stated in its text only."""
+
+
+def granularity(runs: Iterable[Run]) -> dict[str, tuple[str, Summary]]:
+    """Return name of an evaluation -> level of the subgoals taught to its policy, and rates under that level's labels.
+
+    It is empty unless the policies were taught with several levels.
+    """
+    levels = [(run, run.protocol[POLICY].get("settings", {}).get("subgoal_level")) for run in runs]
+    known = [(run, level) for run, level in levels if level in LEVELS]
+    if len({level for _, level in known}) < 2:
+        return {}
+    return {run.name: (level, summarise(with_labels_of(level, run.records))) for run, level in known}
+
+
+def granularity_section(runs: Sequence[Run], paper: bool = False) -> list[Section]:
+    """Return the section of rates by subgoal level, [] unless the policies were taught with several levels."""
+    found = granularity(runs)
+    if not found:
+        return []
+    summaries = {run.name: run.summary for run in runs}
     rows: tuple[tuple[Cell, ...], ...] = tuple(
         (
+            name,
             level,
-            *(summary.average[metric] for metric in METRICS),
-            *(own[level].average[metric] for metric in PROCESS_METRICS),
+            *(summaries[name].average[metric] for metric in METRICS),
+            *(own.average[metric] for metric in PROCESS_METRICS),
         )
-        for level, summary in summaries.items()
+        for name, (level, own) in found.items()
     )
-    header = ("level", *METRICS, *(f"{metric}, own labels" for metric in PROCESS_METRICS))
-    return Table("granularity", "metrics by level", header, rows)
-
-
-def _prefixes(summaries: Mapping[str, Summary], paper: bool) -> Table:
-    width = max(len(rates) for summary in summaries.values() for rates in summary.prefix.values())
-    names = dict.fromkeys(task for summary in summaries.values() for task in summary.tasks)
-    rows: list[tuple[Cell, ...]] = [
-        prefix_row(Name(task), level, [*summary.prefix[task], summary.tasks[task]["SR"]], width)
-        for task in names
-        for level, summary in summaries.items()
-        if task in summary.tasks
+    header = ("evaluation", "level", *METRICS, *(f"{metric}, own labels" for metric in PROCESS_METRICS))
+    sentences = [
+        f"MSR, MUR and MCR are given under the evaluated (intermediate) labels and under those of each policy's own "
+        f"level: {AVERAGE}, per cent, with Wilson's 95 % interval over rollouts."
     ]
     if paper:
-        for level, (good, n) in PAPER_GRANULARITY.items():
-            rows.append(prefix_row(PAPER_TASK, level, [*([None] * width), Rate(good / n, n)], width))
-    return Table("granularity_prefix", "prefix completion by level", prefix_header("level", width), tuple(rows))
+        sentences.append(f"The paper's successes in a stove task of three checkpoints: {PAPER_GRANULARITY}.")
+    table = Table("granularity", "", header, rows)
+    return [Section("Annotation granularity", (table,), tuple(sentences))]
+
+
+def granularity_data(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return the rates of `granularity` as JSON values, per cent."""
+    return {
+        name: {
+            "level": level,
+            "own_labels": {metric: percent(own.average[metric].value) for metric in METRICS},
+        }
+        for name, (level, own) in granularity(runs).items()
+    }
+
+
+def with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
+    """Return rollouts with the operation labels of a subgoal level; tasks that the catalogue lacks keep theirs.
+
+    Raises:
+        MemobenchError: a rollout has another number of checkpoints than its task.
+    """
+    index, known = LEVELS.index(level), task_names(suite=None)
+    result: list[Record] = []
+    for record in records:
+        if record["task"] not in known:
+            result.append(record)
+            continue
+        labels = [checkpoint.operations_by_level[index] for checkpoint in get_task(record["task"]).checkpoints]
+        if len(labels) != len(record["checkpoints"]):
+            raise MemobenchError(
+                f"a rollout of {record['task']!r} has {len(record['checkpoints'])} checkpoints, its task has "
+                f"{len(labels)}; the log was written by another version of the task"
+            )
+        marks = zip(record["checkpoints"], labels, strict=True)
+        result.append({**record, "checkpoints": [{**mark, "operation": label} for mark, label in marks]})
+    return result

@@ -1,4 +1,4 @@
-"""The first line of every report: whose rollouts they are, under which protocol, and what the policy was given."""
+"""The first line of every report: policy, protocol, and inputs of the policy."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ def _seeds(run: Run) -> list[str]:
     found = sorted({record["seed"] for record in run.records if record.get("seed") is not None})
     if not found:
         return []
-    told = f"seeds {found[0]} to {found[-1]}" if len(found) > 1 else f"seed {found[0]}"
+    seeds = f"seeds {found[0]} to {found[-1]}" if len(found) > 1 else f"seed {found[0]}"
     name = next((name for name, split in SPLITS.items() if found[0] in split and found[-1] in split), PAPER)
     if name == PAPER:
-        return [told]
+        return [seeds]
     number = run.card.get("sealed", {}).get("run")
-    return [f"{told} ({name}{f', run {number} of this policy' if number else ''})"]
+    return [f"{seeds} ({name}{f', run {number} of this policy' if number else ''})"]
 
 
 def _extent(records: Sequence[Record]) -> str:
@@ -89,7 +89,7 @@ def _replan(records: Sequence[Record]) -> list[str]:
 
 
 def given(run: Run) -> str:
-    """Return what the policy was given: its inputs and, where there was a demonstration prompt, whether it saw it."""
+    """Return the policy's inputs and, where there was a demonstration prompt, whether the policy observed it."""
     return ", ".join([f"inputs: {policy_inputs(run.records)}", *_prompt(run.records, run.protocol)])
 
 
@@ -99,5 +99,5 @@ def _prompt(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]
     # A strict task without a prompt idles all the same; it shows nothing then.
     if not any(record.get("prompt_steps") and record.get("prompt_shown", True) is not None for record in records):
         return []
-    told = protocol.get("prompt_in")
-    return [PROMPT_IN[told]] if told in PROMPT_IN else []
+    prompt_in = protocol.get("prompt_in")
+    return [PROMPT_IN[prompt_in]] if prompt_in in PROMPT_IN else []

@@ -1,7 +1,7 @@
 """SR, MSR, MUR and MCR of rollouts with their intervals, prefix completion, and classes of failure.
 
 A rollout is one line of the episode log. Rates are fractions in [0, 1]; `report_values` turns them into percentages
-with one decimal. None stands for not applicable: a task without checkpoints of an operation has no rate for it and
+with one decimal. None means not applicable: a task without checkpoints of an operation has no rate for it and
 leaves that average.
 """
 
@@ -22,7 +22,7 @@ Record = Mapping[str, Any]
 """A rollout: one line of the episode log."""
 
 
-# --- what rollouts did ---
+# --- checkpoints of rollouts ---
 
 
 def operations(record: Record) -> str:
@@ -73,22 +73,25 @@ def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
     return dict(sorted(grouped.items(), key=lambda item: (order[item[1][0]["memory_type"]], item[0])))
 
 
-# --- under which protocol ---
+# --- protocol of rollouts ---
 
 NOT_RECORDED = "not recorded"
-"""What is said of a policy of which nobody wrote down its inputs."""
+"""Inputs of a policy whose log does not record them."""
 
 
 def policy_inputs(records: Iterable[Record]) -> str:
-    """Return the policy's inputs, by the rollouts' own words; of how many it is unknown where some tell it."""
-    told = Counter(str(record.get("inputs") or NOT_RECORDED) for record in records)
-    unknown = told.pop(NOT_RECORDED, 0)
-    parts = [*sorted(told), *([f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if told and unknown else [])]
+    """Return the inputs that rollouts record, and how many rollouts record none where others do."""
+    known = Counter(str(record.get("inputs") or NOT_RECORDED) for record in records)
+    unknown = known.pop(NOT_RECORDED, 0)
+    parts = [
+        *sorted(known),
+        *([f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if known and unknown else []),
+    ]
     return "; ".join(parts) or NOT_RECORDED
 
 
 def seed_base(record: Record) -> int:
-    """Return the seed of episode 0, from a rollout that tells its own; a scene may be run with each of its variants."""
+    """Return the seed of episode 0, computed from a rollout's own; a scene may be run with each of its variants."""
     return int(record["seed"]) - int(record["episode"]) // int(record.get("variants") or 1)
 
 
@@ -98,50 +101,50 @@ PROTOCOL: dict[str, Callable[[Record], Any]] = {
     "policy inputs": lambda record: record.get("inputs"),
     "seeds of episode 0": lambda record: None if record.get("seed") is None else seed_base(record),
 }
-"""What should agree within one report -> what a record says of it, None where nothing, which is no difference."""
+"""Parts of the protocol that should agree within a report -> its value in a record, None where it has none."""
 
 OWNER = ("policy", "run")
-"""Fields of a record that say whose it is."""
+"""Fields of a record that name its policy."""
 
 
 def mixtures(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each part of the protocol in which rollouts differ: their mean mixes unlike things."""
+    """Return a sentence for each part of the protocol in which rollouts differ."""
     records = list(records)
     notes = []
-    for words, told in PROTOCOL.items():
-        found = sorted({told(record) for record in records} - {None})
+    for words, value in PROTOCOL.items():
+        found = sorted({value(record) for record in records} - {None})
         if len(found) > 1:
             listed = ", ".join(map(str, found[:5])) + (", …" if len(found) > 5 else "")
             notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
     known = [field for field in OWNER if any(record.get(field) for record in records)]
-    nobodys = sum(any(not record.get(field) for field in known) for record in records)
-    if nobodys:
-        said = "does not say whose it is" if nobodys == 1 else "do not say whose they are"
-        notes.append(f"{count_of(nobodys, 'rollout')} of {len(records)} {said}; the figures are over all of them.")
+    unnamed = sum(any(not record.get(field) for field in known) for record in records)
+    if unnamed:
+        of_policy = "names no policy" if unnamed == 1 else "name no policy"
+        notes.append(f"{count_of(unnamed, 'rollout')} of {len(records)} {of_policy}; the figures are over all of them.")
     return notes
 
 
 def notes_on(records: Sequence[Record]) -> list[str]:
-    """Return a sentence for each thing about rollouts that a reader of their figures must know."""
+    """Return notes for a reader of the rollouts' figures, a sentence each."""
     return faults(records) + unshown_prompts(records) + mixtures(records) + missing_scans(records)
 
 
 def stand_ins_of(records: Iterable[Record]) -> list[str]:
-    """Return the classes for which boxes stood in, in any of the rollouts, because their scans were missing."""
+    """Return the classes whose scans were missing in any of the rollouts, so that boxes replaced them."""
     return sorted({name for record in records for name in record.get("stand_ins", ())})
 
 
 def missing_scans(records: Iterable[Record]) -> list[str]:
-    """Return a sentence where boxes stood in for scans."""
+    """Return a sentence where boxes replaced scans."""
     missing = ", ".join(stand_ins_of(records))
-    said = f"scans were missing, so boxes stood in for {missing}: figures with and without them do not compare"
+    said = f"scans were missing, so boxes replaced {missing}: figures with and without them do not compare"
     return [said] if missing else []
 
 
 def unshown_prompts(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each task of which demonstration prompts did not show what they had to."""
+    """Return a sentence for each task whose demonstration prompts did not show their scene."""
     return [
-        f"{task}: the demonstration prompt did not show what it had to in {count_of(len(group), 'rollout')}, the first "
+        f"{task}: the demonstration prompt did not show its scene in {count_of(len(group), 'rollout')}, the first "
         f"in episode {group[0]['episode']}; no memory of it can solve the task"
         for task, group in by_task(record for record in records if record.get("prompt_shown") is False).items()
     ]
@@ -237,7 +240,7 @@ def task_row(records: Sequence[Record]) -> Row:
 
 
 def value_of(record: Record, metric: str) -> float | None:
-    """Return what a rollout gives to a metric: success, or the share of its operation's checkpoints satisfied."""
+    """Return a rollout's contribution to a metric: success, or the share of its operation's checkpoints satisfied."""
     if metric == "SR":
         return float(bool(record["success"]))
     return checkpoint_rate([record], PROCESS_METRICS[metric]).value
@@ -300,11 +303,11 @@ _ALL = (*FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS)
 def failure_of(record: Record) -> str | None:
     """Return the failure class of a logged rollout, None for a success.
 
-    A log without the class gets it from its checkpoints. Drift cannot be told from them, so it is then never
-    named.
+    A log without the class gets it from its checkpoints. Drift cannot be derived from them, so it is then
+    never named.
 
     Raises:
-        MemobenchError: the class is unknown, or stands beside a success.
+        MemobenchError: the class is unknown, or a success has one.
     """
     logged = record.get("failure")
     if record["success"]:

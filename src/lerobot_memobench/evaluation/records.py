@@ -33,11 +33,11 @@ from lerobot_memobench.envs.episode_log import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreements
-from lerobot_memobench.evaluation.evidence_controls import FoundEvidence, evidence_of, ran_evidence
+from lerobot_memobench.evaluation.evidence import FoundEvidence, evidence_of, ran_evidence
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, is_there, read_json
 
-# --- types of the result card; what its parts mean, `run.card` says ---
+# --- types of the result card; `run.card` explains its parts ---
 
 
 class PolicySettings(TypedDict, total=False):
@@ -223,10 +223,10 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     """Return the protocol of the evaluation in ``folder``.
 
     Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
-    as found in the log where nobody wrote down what was asked for; ``suite``, ``world``, ``protocol`` as far as they
+    as found in the log where no file records it; ``suite``, ``world``, ``protocol`` as far as they
     are not the default; ``seed_base``, ``referent``,
     ``demonstration_prompt``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as
-    far as known; ``inputs``, of the policy; ``policy``, what is known of the policy ({} where nobody wrote it down).
+    far as known; ``inputs``, of the policy; ``policy``, the known facts of the policy ({} where no file records them).
 
     Raises:
         MemobenchError: there is no evaluation in the folder.
@@ -240,7 +240,7 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
 
 
 def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what a log tells of its protocol; settings in which its episodes differ are lists."""
+    """Return the protocol that a log shows; settings in which its episodes differ are lists."""
     numbers = (record["episode"] + 1 for record in records)
     found: dict[str, Any] = {
         "tasks": sorted({record["task"] for record in records}),
@@ -259,7 +259,7 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 APART = ("suite", "world")
-"""Settings of which figures of two values stand in no report together: other tasks, other scenes."""
+"""Settings whose values are reported separately: other tasks, other scenes."""
 
 
 def of_all(records: Iterable[Mapping[str, Any]], key: str) -> str:
@@ -340,7 +340,7 @@ class Run:
 
     @cached_property
     def replan_steps(self) -> int | None:
-        """The one interval of all rollouts; the policy's own where none was asked for; None where nobody knows."""
+        """The one interval of all rollouts; the policy's own where none was asked for; None where it is unknown."""
         found = {record.get("replan_steps") for record in self.records}
         if len(found) > 1:
             return None
@@ -414,8 +414,8 @@ def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
     logged = asked_for(Path(folder), read_log(folder, notes), notes)
     records = [record for record in logged if "not_run" not in record]
     if not records:
-        told = "".join(f"; {note}" for note in notes)
-        raise MemobenchError(f"{folder} holds no rollout that can be read{told}; run an evaluation first")
+        reasons = "".join(f"; {note}" for note in notes)
+        raise MemobenchError(f"{folder} holds no rollout that can be read{reasons}; run an evaluation first")
     return records, notes + notes_on(records)
 
 
@@ -454,7 +454,7 @@ def _split(word: str | Path) -> tuple[str | None, Path]:
 
 
 def folder_names(folders: Sequence[str | Path]) -> list[str]:
-    """Return the shortest ends of the folders' paths that tell them apart."""
+    """Return the shortest ends of the folders' paths that are distinct."""
     paths = [Path(folder).resolve() for folder in folders]
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
@@ -485,7 +485,7 @@ def _methods(runs: Sequence[Run]) -> list[str]:
         kind, digest = _policy(run)
         policy = kind if kinds[kind] == 1 else f"{kind} {digest[:HASH_DIGITS]}".strip()
         chosen.append(run.method or (policy if run.protocol[POLICY] else run.name))
-    # Where policies are not told, or several results of one stand at the same interval, folders are what is known.
+    # Where policies are unknown, or one has several results at the same interval, folders name the methods.
     places = Counter((method, run.replan_steps) for run, method in zip(runs, chosen, strict=True))
     repeated = {method for (method, _), count in places.items() if count > 1}
     taken = {run.method for run in runs if run.method} & repeated

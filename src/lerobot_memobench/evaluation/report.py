@@ -1,8 +1,8 @@
 """The report of evaluations: for the terminal, Markdown, CSV, LaTeX, and JSON for programs.
 
-``report.json`` beside an evaluation's log holds exactly the keys of the benchmark's specification, and ``evidence`` and
-``pacing`` of the controls that were run. As JSON among the
-formats the same keys stand with more beside them: intervals, prefix completion in order, pooled rates, protocol.
+``report.json`` in an evaluation's folder holds the keys of the benchmark's specification, and ``evidence`` where each
+scene was run with each variant. The format JSON adds intervals, prefix completion in order, pooled rates and protocol;
+of several evaluations also the controls among them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from rich.console import RenderableType
 
 from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, not_run, read_log, write_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.evaluation.evidence_controls import evidence_data, evidence_section
+from lerobot_memobench.evaluation.comparison import Comparison, comparison_data, comparison_section, controls_among
+from lerobot_memobench.evaluation.controls import granularity_data, granularity_section
+from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     METRICS,
@@ -29,7 +31,6 @@ from lerobot_memobench.evaluation.metrics import (
     percent,
     report_values,
 )
-from lerobot_memobench.evaluation.pacing_controls import kept_changes, pacing_section
 from lerobot_memobench.evaluation.records import CARD_FILE, Run, asked_for, read_protocol, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     PAPER_INPUTS,
@@ -67,7 +68,7 @@ TABLES = "tables"
 """Folder of the tables as CSV."""
 
 
-# --- beside the log ---
+# --- in the folder of the log ---
 
 
 def write_report(directory: str | Path, episodes: int | None = None) -> Run:
@@ -99,7 +100,7 @@ def write_report(directory: str | Path, episodes: int | None = None) -> Run:
     notes += notes_on(records)
     run = Run(directory.name, "", directory, records, read_protocol(directory), notes)
     unrun = {task: len(lines) for task, lines in not_run(logged).items()}
-    figures = {**report_values(run.summary), **control_data(run), **({"not_run": unrun} if unrun else {})}
+    figures = {**report_values(run.summary), **evidence_values(run), **({"not_run": unrun} if unrun else {})}
     write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")
     write_file(directory / REPORT_MARKDOWN, evaluation_markdown(run))
     return run
@@ -112,7 +113,7 @@ def table(summary: Summary) -> RenderableType:
 
 def evaluation_markdown(run: Run) -> str:
     """Return the report of one evaluation as Markdown."""
-    return markdown(Report(headline([run]), (_section(run), *control_sections(run))))
+    return markdown(Report(headline([run]), (_section(run), *_evidence(run))))
 
 
 def keep_log(folder: Path, kept: Path) -> None:
@@ -134,25 +135,27 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     """Return the report of one or several evaluations.
 
     Args:
-        paper: stand the published figures beside.
+        paper: add the published figures.
 
     Raises:
-        MemobenchError: the published figures are wanted beside those of other tasks.
+        MemobenchError: the published figures are of other tasks.
     """
     check_beside(runs, paper)
-    found = []
+    found, controls = [], list(controls_among(runs))
     if len(runs) > 1:
         found.append(Section("Evaluations", (overview(runs),), notes=tuple(unlike(runs))))
     found += [sweep(method, group) for method, group in sweeps(runs).items()]
+    found += [comparison_section(each, overall=True) for each in controls]
+    found += granularity_section(runs, paper)
     for run in runs:
         section = _section(run)
         if len(runs) > 1:
             where = f"Evaluation in {run.folder}."
             section = replace(section, title=run.name, sentences=(where, *section.sentences))
-        found += [section, *control_sections(run)]
+        found += [section, *_evidence(run)]
     if paper:
         found.append(beside_paper(runs))
-    return Report(headline(runs), tuple(found), report_data(runs, paper))
+    return Report(headline(runs), tuple(found), report_data(runs, controls, paper))
 
 
 def _section(run: Run) -> Section:
@@ -168,18 +171,14 @@ def _section(run: Run) -> Section:
     )
 
 
-def control_sections(run: Run) -> list[Section]:
-    """Return the sections of the controls that were run with an evaluation."""
-    changes = kept_changes(run.folder)
-    paced = [pacing_section(changes)] if changes else []
-    return [*([] if run.evidence is None else [evidence_section(run.evidence)]), *paced]
+def _evidence(run: Run) -> list[Section]:
+    """Return the section of evidence, [] where scenes were not run with each variant."""
+    return [] if run.evidence is None else [evidence_section(run.evidence)]
 
 
-def control_data(run: Run) -> dict[str, Any]:
-    """Return the figures of the controls that were run with an evaluation, per cent."""
-    changes = kept_changes(run.folder)
-    evidence = {} if run.evidence is None else {"evidence": evidence_data(run.evidence, run.records)}
-    return {**evidence, **({"pacing": changes} if changes else {})}
+def evidence_values(run: Run) -> dict[str, Any]:
+    """Return ``evidence`` with its rates as JSON values, {} where scenes were not run with each variant."""
+    return {} if run.evidence is None else {"evidence": evidence_data(run.evidence, run.records)}
 
 
 def render(found: Report, runs: Sequence[Run], format_: str, paper: bool = False) -> str:
@@ -208,11 +207,11 @@ def write_documents(runs: Sequence[Run], out: Path, wanted: Sequence[str], paper
 
 
 OF_EACH_EVALUATION = ("memory-types", "tasks", "prefix", "failures")
-"""Keys of the tables that stand in the section of every evaluation."""
+"""Keys of the tables in the section of every evaluation."""
 
 
 def _unique_keys(found: Report) -> Report:
-    """Number the labels of tables that stand in several sections."""
+    """Number the labels of tables that several sections have."""
     if len(found.sections) < 2:
         return found
     sections = []
@@ -228,13 +227,17 @@ def _unique_keys(found: Report) -> Report:
 # --- JSON ---
 
 
-def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
+def report_data(runs: Sequence[Run], controls: Sequence[Comparison], paper: bool) -> dict[str, Any]:
     """Return the figures of one or several evaluations, and the published ones where asked for."""
     found: dict[str, Any]
     if len(runs) == 1:
         found = run_data(runs[0])
     else:
         found = {"evaluations": {run.name: run_data(run) for run in runs}, "notes": unlike(runs)}
+        if controls:
+            found["controls"] = [comparison_data(each, overall=True) for each in controls]
+        if levels := granularity_data(runs):
+            found["granularity"] = levels
     if swept := sweeps(runs):
         found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
     if paper:
@@ -244,12 +247,12 @@ def report_data(runs: Sequence[Run], paper: bool) -> dict[str, Any]:
 
 
 def run_data(run: Run) -> dict[str, Any]:
-    """Return the figures of one evaluation: the keys of ``report.json``, and more beside them."""
+    """Return the figures of one evaluation: the keys of ``report.json`` and more."""
     summary = run.summary
     policy = run.protocol[POLICY]
     return {
         **report_values(summary),
-        **control_data(run),
+        **evidence_values(run),
         "name": run.name,
         "method": run.method,
         "replan_steps": run.replan_steps,
@@ -307,7 +310,7 @@ def _published_data(row: PublishedRow) -> dict[str, Any]:
 # --- CSV: one figure a row ---
 
 HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "inputs")
-"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent beside the paper's."""
+"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent."""
 
 CsvRow = tuple[object, ...]
 
@@ -330,7 +333,7 @@ def _run_rows(run: Run) -> Iterator[CsvRow]:
 
 
 def _extent(run: Run) -> Iterator[CsvRow]:
-    """Yield how much was run: beside rows of 30 tasks and 1,500 rollouts."""
+    """Yield how much was run; the paper's rows are of 30 tasks and 1,500 rollouts."""
     for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
         yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.inputs)
 

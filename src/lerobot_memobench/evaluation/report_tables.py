@@ -1,4 +1,4 @@
-"""Tables, sections and sentences of a report: of one evaluation, of several, and beside the paper's."""
+"""Tables, sections and sentences of a report: of one evaluation, of several, and with the paper's figures."""
 
 from __future__ import annotations
 
@@ -138,13 +138,13 @@ def prefix_table(summary: Summary) -> Table:
 
 FURTHER_NOTES = {
     "wrong_order": " Wrong order: the steps of a procedure were done in another order than its prompt's.",
-    "cut_off": " Cut off: the horizon is shorter than the protocol's, so nobody knows what was remembered.",
+    "cut_off": " Cut off: the horizon is shorter than the protocol's, so it is unknown what was remembered.",
     "miscount": " Miscount: the event was done too seldom or too often.",
     "wrong_place": " Wrong place: the thing was looked for where it is not.",
     "invalid_action": " Invalid action: one of another shape, or not finite, broke the rollout off.",
     "unstable_physics": " Unstable physics: MuJoCo warned of its own state, which broke the rollout off.",
 }
-"""Classes that not every evaluation has -> what the table says of them."""
+"""Classes that not every evaluation has -> their note under the table."""
 
 
 def failures_table(summary: Summary) -> Table:
@@ -283,7 +283,7 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
     return [run.replan_steps for run in best if run.replan_steps is not None], best[0].summary.average[metric]
 
 
-# --- beside the paper's tables ---
+# --- with the paper's figures ---
 
 PAPER_PROTOCOL = {
     **{"world": LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True, "horizon": HORIZON},
@@ -301,7 +301,7 @@ TABLES = (
 
 
 def check_beside(runs: Sequence[Run], paper: bool) -> None:
-    """Refuse to stand the paper's figures (``paper``) beside those of other tasks than it published.
+    """Refuse to report the paper's figures (``paper``) with those of tasks that it did not publish.
 
     Raises:
         MemobenchError: naming the first such evaluation.
@@ -330,9 +330,9 @@ def extent(run: Run) -> str:
 
 
 def _beside(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -> Table:
-    """Return a table of the paper's; ours are named with their extent, beside rows of 30 tasks and 1,500 rollouts."""
+    """Return a table of the paper's, ours on top, named with their extent: the paper ran 1,500 rollouts."""
     published = published_rows(*sources)
-    names = [f"{run.name} ({told})" if (told := extent(run)) else run.name for run in runs]
+    names = [f"{run.name} ({size})" if (size := extent(run)) else run.name for run in runs]
     rows = (
         *((name, *run_row(run)[1:]) for name, run in zip(names, runs, strict=True)),
         *(_published_row(row) for row in published),
@@ -379,8 +379,8 @@ def departures(run: Run) -> list[str]:
     if counts != {PAPER_EPISODES}:
         low, high = min(counts), max(counts)
         found.append(f"{low if low == high else f'{low} to {high}'} episodes of each instead of {PAPER_EPISODES}")
-    told = {**UNTOLD, **run.protocol}
+    known = {**UNTOLD, **run.protocol}
     for key, value in PAPER_PROTOCOL.items():
-        if key in told and told[key] != value:
-            found.append(f"{key.replace('_', ' ')} {told[key]} instead of {value}")
+        if key in known and known[key] != value:
+            found.append(f"{key.replace('_', ' ')} {known[key]} instead of {value}")
     return found

@@ -1,4 +1,4 @@
-"""Tables of a report, and what they are written as: terminal, text, Markdown, LaTeX, JSON, CSV."""
+"""Tables of a report and their formats: terminal, text, Markdown, LaTeX, JSON, CSV."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ Cell = Rate | PrefixRates | str | int | None
 
 @dataclass(frozen=True)
 class Table:
-    """A table and what is said under it.
+    """A table and its note.
 
     Attributes:
         key: short name, unique in a report. header: names of the columns.
@@ -231,7 +231,7 @@ def latex_text(words: str) -> str:
 
 
 def latex(report: Report) -> str:
-    """Return the report's tables as LaTeX, to be read by ``\\input``; the head says which packages they need."""
+    """Return the report's tables as LaTeX, to be read by ``\\input``; the head names the packages they need."""
     lines = [
         f"% {' '.join(report.title.split())}, written by `memobench report`.",
         r"% Needs \usepackage[T1]{fontenc}, \usepackage{booktabs} and \usepackage{graphicx}.",
@@ -296,7 +296,7 @@ WIDTH = 140
 """Columns of a report that is written to a file."""
 
 MOST_COLUMNS = 15
-"""Columns of a table with groups that fit beside one another in a terminal."""
+"""Columns of a table with groups that fit into a terminal."""
 
 
 def terminal(report: Report) -> RenderableType:
@@ -312,7 +312,7 @@ def terminal(report: Report) -> RenderableType:
 
 
 def text(report: Report) -> str:
-    """Return what the terminal shows, as text for a file."""
+    """Return the terminal's output as text for a file."""
     out = io.StringIO()
     Console(file=out, width=WIDTH, highlight=False, markup=False).print(terminal(report), crop=False)
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()).strip("\n") + "\n"
@@ -321,13 +321,13 @@ def text(report: Report) -> str:
 INDENT = 2
 
 PLAIN = Console(width=10_000, markup=False, highlight=False)
-"""What texts are measured with."""
+"""Measures the width of texts."""
 
 
 class Unbroken:
     """A table in which no name is broken, however narrow the terminal is: to be printed with ``crop=False``.
 
-    In a terminal that is too narrow names stand on lines of their own, each over its row; a file has no edge.
+    In a terminal that is too narrow each name has a line of its own, over its row; a file has no edge.
 
     Args:
         table: not to be changed any more. column: that of the names.
@@ -351,7 +351,7 @@ class Unbroken:
             yield from self._under_names(options.max_width)
 
     def _under_names(self, room: int) -> RenderResult:
-        """Yield a row in two: what stands up to the name, and under it the rest."""
+        """Yield each row in two lines: the cells up to the name, and the others below."""
         columns = self.table.columns
         before, after = columns[: self.column + 1], columns[self.column + 1 :]
         wished = [[Measurement.get(PLAIN, PLAIN.options, cell) for cell in (c.header, *c.cells)] for c in after]
@@ -455,7 +455,7 @@ WRITERS: Mapping[str, Callable[[Report], str]] = {
     "latex": latex,
     "json": json_text,
 }
-"""Format -> what writes a report in it."""
+"""Format -> its writer."""
 
 
 def csv_tables(report: Report) -> dict[str, str]:
@@ -474,7 +474,7 @@ def csv_tables(report: Report) -> dict[str, str]:
 
 
 def _csv_rows(table: Table) -> list[dict[str, object]]:
-    """Return a table's rows as column -> value: rates in per cent, each with the bounds of its interval beside it."""
+    """Return a table's rows as column -> value: rates in per cent, each followed by the bounds of its interval."""
     names = [f"{title} {name}".lstrip() for title, name in zip(table.titles, table.header, strict=True)]
     rates = {c for row in table.rows for c, cell in enumerate(row) if isinstance(cell, Rate)}
     rows = []
@@ -498,7 +498,7 @@ def _csv_rows(table: Table) -> list[dict[str, object]]:
 def csv_text(rows: Sequence[Sequence[object]], header: Sequence[str]) -> str:
     """Return rows as CSV (RFC 4180, but lines end in a plain line feed); None is an empty field.
 
-    A name that a spreadsheet would take for a formula, of a stranger's log perhaps, stands behind an apostrophe.
+    A name that a spreadsheet would take for a formula gets an apostrophe in front: logs may be of strangers.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

@@ -1,8 +1,8 @@
-"""What the MEMOBench paper publishes: its tables as data (``tables.json``), and typed access to them.
+"""The figures that the MEMOBench paper publishes: its tables as data (``tables.json``), and typed access to them.
 
 Source: H. Sun, H. Wang, J. Chen et al., "MEMOBench: A Process Level Memory Benchmark for Robotic Manipulation",
 https://github.com/Collab-Gen/MEMOBench. The data are the figures as printed there, percentages with one decimal. It
-imports nothing of the project but its errors, so every other package may stand its own figures beside these.
+imports nothing of the project but its errors, so every other package may use them.
 """
 
 from __future__ import annotations

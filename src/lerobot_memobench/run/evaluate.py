@@ -20,7 +20,7 @@ from lerobot_memobench.envs.command_line import quiet, read_rename_map
 from lerobot_memobench.envs.configuration_memobench import Opener
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.jobs.threads import limit_torch
-from lerobot_memobench.run.memory_reads import ReadLog
+from lerobot_memobench.policies.memory_reads import ReadLog
 from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
 from lerobot_memobench.run.recording import Recorder
 from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
@@ -54,7 +54,8 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     asked = range(plan.seed, plan.seed + plan.grid.runs)
     by = acting(policy, plan.policy_path, asked, environment.obs_type, environment.oracle_memory)
     environments = Environments(environment.opener(policy, by, plan.log), plan.eval_settings.use_async_envs)
-    reads, seeds = ReadLog.of(plan), BatchSeeds(actor.policy, plan.seed)
+    seeds = BatchSeeds(actor.policy, plan.seed)
+    reads = ReadLog(plan.log, environment.seed_base, environment.referent) if plan.options.memory_reads else None
     amp = torch.autocast(device_type=device.type) if policy.use_amp else nullcontext()
     done, total = 0, sum(len(plan.grid.runs_of(number)) for _, number in cells)
     with amp, closing(environments):

@@ -23,10 +23,10 @@ from lerobot_memobench.envs.episode_log import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreement
-from lerobot_memobench.evaluation.memory_reads import MEMORY_READS
 from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, is_there
+from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import (
     drawn_otherwise,
     extended,

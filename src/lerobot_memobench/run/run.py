@@ -11,12 +11,12 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_log, read_protocol_file
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.memory_reads import MEMORY_READS
 from lerobot_memobench.evaluation.records import CARD_FILE, Run, read_card, read_protocol
 from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
 from lerobot_memobench.io import count_of, is_there, remove_drafts, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
+from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import (
     CARD_MARKDOWN,
     card_of,

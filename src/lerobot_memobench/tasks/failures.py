@@ -1,6 +1,6 @@
 """Why a rollout failed: one class per rollout, from what its checkpoints show (paper, failure taxonomy).
 
-The paper's five classes stand as they are, and are refined by two where they would name a memory's failure wrongly or
+The paper's five classes are kept, and refined by two where they would name a memory's failure wrongly or
 not at all: the steps of a procedure in another order than its prompt's, and a horizon that is shorter than the
 protocol's.
 """
@@ -17,7 +17,7 @@ REFERENCE_DRIFT = "reference_drift"
 WRONG_ORDER = "wrong_order"
 """The class of a procedure whose steps were done in another order than the prompt showed."""
 CUT_OFF = "cut_off"
-"""The class of a rollout that a horizon below the protocol's ended: nobody knows what it would have remembered."""
+"""The class of a rollout that a horizon below the protocol's ended: it is unknown what it would have remembered."""
 
 #: Failure classes of the published tasks, in the order of the report.
 FAILURES = (
@@ -27,12 +27,12 @@ FAILURES = (
     REFERENCE_DRIFT,
     "execution_failure",
 )
-#: Classes beside the paper's; a report names them where they occur.
+#: Classes in addition to the paper's; a report names them where they occur.
 REFINED_FAILURES = (WRONG_ORDER, CUT_OFF)
 
 INVALID_ACTION, UNSTABLE_PHYSICS = "invalid_action", "unstable_physics"
 FAULTS = (INVALID_ACTION, UNSTABLE_PHYSICS)
-"""What breaks a rollout off and tells nothing of a memory: an action that is none, and physics that broke down."""
+"""Classes of rollouts that were broken off, which show nothing of memory: invalid actions, unstable physics."""
 
 _BY_OPERATION = {"S": "storage_failure", "U": "stale_memory", "C": "compression_collapse"}
 

@@ -1,5 +1,1 @@
-"""The report that a person opens in a browser: one folder, no server, no network.
-
-`data` turns logs into what the page shows; `write` finds and places the videos, assembles ``index.html`` from the
-template beside it, and makes the folder.
-"""
+"""The report for the browser: `data` computes its figures, `write` fills the template and makes the folder."""

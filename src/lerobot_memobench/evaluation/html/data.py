@@ -12,9 +12,9 @@ from typing import Any
 
 from lerobot_memobench import __version__
 from lerobot_memobench.envs.video import OPERATION_COLOURS
-from lerobot_memobench.evaluation.evidence_controls import evidence_phrase
+from lerobot_memobench.evaluation.comparison import comparison_phrase, controls_among
+from lerobot_memobench.evaluation.evidence import evidence_phrase
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.memory_reads import Chunk
 from lerobot_memobench.evaluation.metrics import (
     Rate,
     Record,
@@ -25,12 +25,12 @@ from lerobot_memobench.evaluation.metrics import (
     operations,
     percent,
 )
-from lerobot_memobench.evaluation.pacing_controls import kept_changes, pace_phrase
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.report import build
 from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
 from lerobot_memobench.io import count_of
+from lerobot_memobench.policies.memory_reads import Chunk
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES
@@ -59,6 +59,9 @@ def page_data(
         reads: the same -> what its chunks have read of what the policy remembered; nothing is known where None.
         known: task name -> task, for language and checkpoint texts.
     """
+    controls: dict[str, list[str]] = {run.name: [] for run in runs}
+    for each in controls_among(runs):
+        controls[each.b].append(comparison_phrase(each))
     return {
         "version": __version__,
         "notices": unlike(runs),
@@ -72,7 +75,7 @@ def page_data(
         "failures": list(dict.fromkeys([*FAILURES, *(name for run in runs for name in failure_counts(run.records))])),
         "tasks": tasks_data([record for run in runs for record in run.records], known),
         "runs": [
-            run_data(run, addresses, of_run)
+            run_data(run, addresses, of_run, controls[run.name])
             for run, addresses, of_run in zip(runs, videos, reads or [{}] * len(runs), strict=True)
         ],
     }
@@ -119,13 +122,15 @@ def _variant(record: Record) -> int:
 # --- runs ---
 
 
-def run_data(run: Run, videos: Mapping[int, str], reads: Mapping[int, Sequence[Chunk]]) -> dict[str, Any]:
+def run_data(
+    run: Run, videos: Mapping[int, str], reads: Mapping[int, Sequence[Chunk]], controls: Sequence[str]
+) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
     summary, starts = run.summary, run.card.get("runs", [])
     return {
         "name": run.name,
         "headline": headline([run]),
-        "facts": facts(run),
+        "facts": [*facts(run), *controls],
         "commands": [shlex.join(start["command"]) for start in starts if start.get("command")],
         "notes": list(run.notes),
         "csv": csv_tables(build([run])),
@@ -137,11 +142,10 @@ def run_data(run: Run, videos: Mapping[int, str], reads: Mapping[int, Sequence[C
 
 
 def facts(run: Run) -> list[str]:
-    """Return what stands below the first line: how many rollouts, their horizon, and controls that were run."""
+    """Return the line below the first one: rollouts, their horizon, and how often choices follow the evidence."""
     horizon = run.protocol.get("horizon")
     evidence = [] if run.evidence is None else evidence_phrase(run.evidence)
-    controls = [*evidence, *map(pace_phrase, kept_changes(run.folder))]
-    return [count_of(len(run.records), "rollout"), *([] if horizon is None else [f"horizon {horizon}"]), *controls]
+    return [count_of(len(run.records), "rollout"), *([] if horizon is None else [f"horizon {horizon}"]), *evidence]
 
 
 def task_data(name: str, summary: Summary) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Write the report: find each rollout's video, fill the template beside this module, make the folder.
+"""Write the report: find each rollout's video, fill the template, make the folder.
 
 Everything but the videos is inside ``index.html``, because a browser lets a page from disk read no other file. Its
 content security policy allows this style, this script and videos from its own place, and nothing else: the page cannot
@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from importlib import resources
@@ -24,18 +24,14 @@ from typing import Any
 from lerobot_memobench.envs.video import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_source
-from lerobot_memobench.evaluation.memory_reads import Chunk, find_reads
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.evaluation.records import Run, read_runs
-from lerobot_memobench.io import draft_of, file_name, parsed, read_json, short, write_file
+from lerobot_memobench.io import draft_of, file_name, write_file
 from lerobot_memobench.jobs.processes import locked
-from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.policies.memory_reads import Chunk, find_reads
 
 PAGE = "index.html"
 VIDEOS, VIDEO = "videos", ".mp4"
-PLACED = "placed.json"
-"""Addresses of the videos that a report has placed, beside its page: a later report removes these, and no others."""
-LEROBOT_INFO = "eval_info.json"
 SCRIPTS = (
     "dom",
     "address",
@@ -53,14 +49,14 @@ SCRIPTS = (
 )
 """Parts of the one script, in ``script/``; a later part uses earlier ones."""
 MARK = "memobench html"
-"""What the page's ``generator`` says; by it a folder is known as a report."""
+"""Value of the page's ``generator``, by which a folder is recognised as a report."""
 UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" content="{MARK}"><title>Unfinished</title>
-<p>This report was not finished; run <code>memobench html</code> again.'''
+<p>This report was not finished; run <code>memobench report --html</code> again.'''
 
 
 @dataclass(frozen=True)
 class Written:
-    """What a report holds: the page, its rollouts, how many of them have a video, and notes on the logs."""
+    """A written report: the page, its rollouts, how many of them have a video, and notes on the logs."""
 
     page: Path
     rollouts: int
@@ -68,16 +64,12 @@ class Written:
     notes: list[str]
 
 
-def write_html(
-    folders: Sequence[str | Path], out: str | Path, *, link: bool = False, task_dir: str | Path | None = None
-) -> Written:
+def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | Path | None = None) -> Written:
     """Write the report of one or several evaluations into ``out``; an earlier report there is replaced.
 
     Args:
-        folders: what evaluations have written, or ``NAME=FOLDER``.
-        link: let videos be symbolic links to where they are, which saves space on another file system but ties the
-            report to this machine.
-        task_dir: task folders in the published format whose texts are to be shown, beside the catalogue.
+        folders: of evaluations, or ``NAME=FOLDER``.
+        task_dir: task folders in the published format whose texts are shown, in addition to the catalogue.
 
     Raises:
         MemobenchError: a folder holds no log, or ``out`` holds something that is no report.
@@ -102,12 +94,9 @@ def write_html(
     with locked(out, out):
         if not (out / PAGE).exists():
             write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on
-        placed, earlier = {name for each in addresses for name in each.values()}, _placed(out)
-        _note_placed(out, earlier | placed)
-        place_videos(chosen, link)
+        place_videos(chosen)
         write_file(out / PAGE, text)
-        _remove_videos(out, earlier - placed)
-        _note_placed(out, placed)
+        _remove_other_videos(out, chosen)
     return Written(
         page=out / PAGE,
         rollouts=sum(len(run.records) for run in runs),
@@ -149,39 +138,14 @@ def _check_target(out: Path) -> None:
         raise MemobenchError(f"--out {out} holds files that are no earlier report; name a new or an empty folder")
 
 
-def _placed(out: Path) -> set[str]:
-    """Return the addresses of videos that an earlier report placed; none of a report that did not list them.
-
-    Raises:
-        MemobenchError: the list leads elsewhere.
-    """
-    advice = f"remove {out / PLACED}"
-    try:
-        names: list[str] = read_json(out / PLACED, list[str], advice)
-    except FileNotFoundError:
-        return set()
-    for name in names:
-        folder, *parts = name.split("/")
-        if folder != VIDEOS or len(parts) != 2 or not all(map(_names_a_file, parts)) or not name.endswith(VIDEO):
-            raise MemobenchError(f"{out / PLACED} lists {short(name)}, which is no video of a report; {advice}")
-    return set(names)
-
-
-def _note_placed(out: Path, names: Iterable[str]) -> None:
-    if found := sorted(names):
-        write_file(out / PLACED, json.dumps(found, indent=0) + "\n")
-    else:
-        (out / PLACED).unlink(missing_ok=True)
-
-
-def _remove_videos(out: Path, names: Iterable[str]) -> None:
+def _remove_other_videos(out: Path, placed: Collection[Path]) -> None:
     """Remove videos of an earlier report, and folders that this leaves empty."""
-    for path in (out / name for name in names):
-        if path.is_file() or path.is_symlink():
+    for path in (out / VIDEOS).glob(f"*/*{VIDEO}"):
+        if path not in placed:
             path.unlink()
-        for folder in (path.parent, out / VIDEOS):
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
+    for folder in (*(out / VIDEOS).glob("*/"), out / VIDEOS):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 # --- videos ---
@@ -192,7 +156,6 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
 
     A video counts only when it is as long as its rollout: a timeline under another rollout's video would mislead.
     """
-    others = _lerobot_videos(folder, records)
     found: dict[int, Path] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
@@ -200,14 +163,11 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
             continue
         video = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
         if video.is_file():
-            if _fits(frame_count(video), record, held=LAST_FRAMES + 1):
+            if _fits(frame_count(video), record):
                 found[k] = video
-                continue
-            misfits.append(video.name)
-        other = others.get(k)
-        if other is not None and _fits(frame_count(other), record, held=0):
-            found[k] = other
-    # A video's name does not tell the referent: where both settings are in one log, it could be of either.
+            else:
+                misfits.append(video.name)
+    # A video's name does not hold the referent: where both settings are in one log, it could be of either.
     claims = Counter(found.values())
     misfits += [video.name for video, count in claims.items() if count > 1]
     found = {k: video for k, video in found.items() if claims[video] == 1}
@@ -225,17 +185,19 @@ def _names_a_file(name: str) -> bool:
         return False
 
 
-def _fits(frames: int | None, record: Record, held: int) -> bool:
-    """Whether a video has a frame per control step and ``held`` more; logs without lengths take any."""
+def _fits(frames: int | None, record: Record) -> bool:
+    """Whether a video has a frame of the start, one per control step, and its last one held; logs without lengths take
+    any.
+    """
     if frames is None:
         return False
     if record.get("steps") is None:
         return True
-    return frames == int(record.get("prompt_steps") or 0) + int(record["steps"]) + held
+    return frames == int(record.get("prompt_steps") or 0) + int(record["steps"]) + LAST_FRAMES + 1
 
 
 def frame_count(path: Path) -> int | None:
-    """Return the number of frames that a video's header tells; None when it is no whole video."""
+    """Return the number of frames in a video's header; None when it is no whole video."""
     import av
 
     try:
@@ -245,63 +207,24 @@ def frame_count(path: Path) -> int | None:
         return None
 
 
-def _lerobot_videos(folder: Path, records: Sequence[Record]) -> dict[int, Path]:
-    """Return position -> LeRobot's video of it.
-
-    LeRobot numbers its videos by the order of its run and does not write the seeds down. They are believed only where
-    its list of successes is that of the task's logged rollouts, which it is not after a resumed or a sharded run.
-    """
-    try:
-        info: Any = parsed((folder / LEROBOT_INFO).read_bytes())
-        entries = [(e["task_group"], e["task_id"], e["metrics"]["successes"]) for e in info["per_task"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-    by_task: dict[str, list[int]] = {}
-    for k in sorted(range(len(records)), key=lambda k: int(records[k]["episode"])):
-        by_task.setdefault(records[k]["task"], []).append(k)
-    names = task_names(suite=None)  # LeRobot runs a task of the catalogue under its number
-    found: dict[int, Path] = {}
-    for group, task_id, successes in entries:
-        if not _names_a_file(f"{group}_{task_id}"):
-            continue
-        for task, positions in by_task.items():
-            rollouts = [records[k] for k in positions]
-            if rollouts[0]["memory_type"] != group or [r["success"] for r in rollouts] != successes:
-                continue
-            if task not in names or names.index(task) != task_id:
-                continue
-            for number, k in enumerate(positions):
-                video = folder / VIDEOS / f"{group}_{task_id}" / f"eval_episode_{number}.mp4"
-                if video.is_file():
-                    found[k] = video
-    return found
-
-
-def place_videos(chosen: Mapping[Path, Path], link: bool) -> None:
-    """Bring videos into the report, target -> source: as hard links or copies, so that it can be moved, or as links.
+def place_videos(chosen: Mapping[Path, Path]) -> None:
+    """Bring videos into the report, target -> source: as hard links, or copies on another file system.
 
     A target that is there and unchanged is left alone; each appears under its name only when it is whole.
     """
     for target, source in chosen.items():
-        if _is_same(source, target, link):
+        if _is_same(source, target):
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
         with draft_of(target) as draft:
-            _bring(source.resolve(), draft, link)
+            try:
+                os.link(source.resolve(), draft)
+            except OSError:  # another file system, or one without hard links
+                shutil.copy2(source, draft)
 
 
-def _bring(source: Path, target: Path, link: bool) -> None:
-    if link:
-        target.symlink_to(source)
-        return
-    try:
-        os.link(source, target)
-    except OSError:  # another file system, or one without hard links
-        shutil.copy2(source, target)
-
-
-def _is_same(source: Path, target: Path, link: bool) -> bool:
-    if not target.exists() or target.is_symlink() != link:
+def _is_same(source: Path, target: Path) -> bool:
+    if not target.exists():
         return False
     here, there = source.stat(), target.stat()
     return os.path.samestat(here, there) or (here.st_size, here.st_mtime_ns) == (there.st_size, there.st_mtime_ns)
@@ -326,7 +249,7 @@ def page(data: Mapping[str, Any], title: str) -> str:
 
 
 def inline_json(value: Any) -> str:
-    """Return JSON that may stand inside ``<script type="application/json">``.
+    """Return JSON for the inside of ``<script type="application/json">``.
 
     Nothing in it can end the element or open a comment: ``<``, ``>`` and ``&`` are written as escapes.
     """

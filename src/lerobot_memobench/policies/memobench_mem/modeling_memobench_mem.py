@@ -69,7 +69,6 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory, quick_gradients, quick_products
-from lerobot_memobench.policies.memobench_mem.reads import ChunkReads, chunk_reads
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, begin_training
 from lerobot_memobench.policies.memobench_mem.sharding import check_adapters, prepare_shards
@@ -83,6 +82,7 @@ from lerobot_memobench.policies.memobench_mem.training import (
     means_over_ranks,
     noise_and_time,
 )
+from lerobot_memobench.policies.memory_reads import Chunk, chunk_reads
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
 # A saved pipeline is built right after its policy, by the names under which its steps register when imported.
@@ -508,7 +508,7 @@ class MemobenchMemPolicy(PI05Policy):
         self.config.check_memory_reads()
         self._watched = watched
 
-    def memory_reads(self) -> list[list[ChunkReads]]:
+    def memory_reads(self) -> list[list[Chunk]]:
         """Return of each row how much the chunks of its episode have read."""
         return [row.reads for row in self.rollout.rows]
 

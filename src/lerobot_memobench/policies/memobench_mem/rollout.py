@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lerobot_memobench.policies.compatibility import begins_episode, is_frozen
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, rotation
-from lerobot_memobench.policies.memobench_mem.reads import ChunkReads
+from lerobot_memobench.policies.memory_reads import Chunk
 
 STILL, PER_RADIAN = 0.006, 0.1
 """How little a hand or a finger may move from one chunk to the next to be still, m, and what a radian counts, m."""
@@ -44,7 +44,7 @@ class Row:
     queue: deque[Tensor] = field(default_factory=deque)
     last: Tensor | None = None
     stood: Tensor | None = None
-    reads: list[ChunkReads] = field(default_factory=list)
+    reads: list[Chunk] = field(default_factory=list)
 
     def drop_chunk(self) -> None:
         """Forget planned actions; until there are others the action is zero."""

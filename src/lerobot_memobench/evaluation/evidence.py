@@ -1,8 +1,8 @@
-"""How often does the choice follow the evidence? Each scene was run with each variant: only the past differs.
+"""Evidence: how often the choice follows the past, where each scene was run with each variant of its task.
 
 A policy without the past that cannot look before it chooses gives the same answer in all variants of a scene. Its rate
-of right answers is the chance (`tasks.evidence.chance`), whatever the scenes are. The terms *warranted choice* and
-*reliable pair* are those of the Counterfactual Memory Audit (arXiv 2609.27247).
+of right answers is the chance (`tasks.evidence.chance`), for any scenes. The terms *warranted choice* and *reliable
+pair* are those of the Counterfactual Memory Audit (arXiv 2609.27247).
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Sect
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 
-AVERAGE = "average"
 RATES = ("follows", "wrong", "undecided", "success")
 """A warranted choice: the answer is the evidence's; another answer was given; none was; the goal held at the end."""
 RIGHT, RELIABLE = "right", "reliable"
@@ -48,7 +47,7 @@ class Evidence:
 
     Attributes:
         scenes, variants: how many; of several tasks the sum of scenes, and no number of variants.
-        chance: of following without the past; None where the instruction tells.
+        chance: of following without the past; None where the instruction names the answer.
         rates: of `RATES`, `RIGHT` and `RELIABLE`, with intervals; no `RIGHT` where nothing was decided.
         p: one-sided, of as many right answers when they are permuted within scenes.
         effective: number of scenes of equal weight with the same variance.
@@ -63,14 +62,16 @@ class Evidence:
 
 
 class FoundEvidence(NamedTuple):
-    """What `evidence_of` finds.
+    """The rates of an evaluation.
 
     Attributes:
-        rates: by task (``tasks``), memory type (``memory_types``), and on average (`AVERAGE`, in both places).
+        average: mean over memory types, None where no task has a chance.
         notes: what a reader must know.
     """
 
-    rates: dict[str, dict[str, Evidence]]
+    tasks: dict[str, Evidence]
+    memory_types: dict[str, Evidence]
+    average: Evidence | None
     notes: list[str]
 
 
@@ -86,54 +87,63 @@ class _Task:
 
 
 def ran_evidence(records: Sequence[Record]) -> bool:
-    """Return whether rollouts are of an evaluation in which each scene was run with each variant."""
-    return any(map(_tells, records))
+    """Return whether each scene was run with each variant."""
+    return any(map(_has_choice, records))
 
 
-def _tells(record: Record) -> bool:
+def _has_choice(record: Record) -> bool:
     return "choice" in record and bool(record.get("variants"))
 
 
 def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:
-    """Return how often choices follow the evidence. An evaluation (`records.Run`) keeps what was found for its reports.
-
-    Args:
-        records: of which those of scenes count that were run with every variant.
-    """
+    """Return how often choices follow the evidence; scenes that were not run with every variant are left out."""
     rng = np.random.default_rng(0)
     tasks: dict[str, _Task] = {}
-    kinds: dict[str, list[_Task]] = {}
-    left_out, nowhere = 0, list[str]()
-    for name, group in by_task(filter(_tells, records)).items():
-        variants = int(group[0]["variants"])
-        scenes: dict[int, dict[int, Record]] = {}
-        for record in group:
-            scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
-        whole = [list(scene.values()) for scene in scenes.values() if len(scene) == variants]
+    types: dict[str, list[_Task]] = {}
+    left_out, without_rate = 0, list[str]()
+    for name, group in by_task(filter(_has_choice, records)).items():
+        whole = _whole_scenes(group)
         left_out += len(group) - sum(map(len, whole))
         if not whole:
-            nowhere.append(name)
+            without_rate.append(name)
             continue
-        values = np.array([_rates_of_scene(scene) for scene in whole])
-        drawn = rng.integers(len(whole), size=(draws, len(whole)))
-        permuted = np.mean([_permuted(scene, rng, draws) for scene in whole], axis=0)
-        tasks[name] = _Task(variants, group[0].get("chance"), values, drawn, permuted)
-        kinds.setdefault(str(group[0]["memory_type"]), []).append(tasks[name])
-    absent = f"; no rate tells of {' and '.join(nowhere)}" if nowhere else ""
-    notes = [f"{count_of(left_out, 'rollout')} of scenes that were not run with every variant left out{absent}"]
-    asked = {name: told for name, group in kinds.items() if (told := [t for t in group if t.chance is not None])}
-    found = {
-        "tasks": {name: _rates([[task]]) for name, task in tasks.items()},
-        "memory_types": {name: _rates([group]) for name, group in asked.items()},
-        AVERAGE: {AVERAGE: _rates(list(asked.values()))} if asked else {},
-    }
-    whole_notes = notes if left_out else []
-    if asked and (average := found[AVERAGE][AVERAGE]).effective < ENOUGH:
-        whole_notes.append(
+        tasks[name] = _task(group[0], whole, rng, draws)
+        if tasks[name].chance is not None:
+            types.setdefault(str(group[0]["memory_type"]), []).append(tasks[name])
+    average = _rates(list(types.values())) if types else None
+    notes = []
+    if left_out:
+        absent = f"; no rate of {' and '.join(without_rate)}" if without_rate else ""
+        notes.append(f"{count_of(left_out, 'rollout')} of scenes that were not run with every variant left out{absent}")
+    if average is not None and average.effective < ENOUGH:
+        notes.append(
             f"the average has {average.effective:.0f} effective scenes; with fewer than {ENOUGH} the interval of a "
             "perfect policy begins below 90 %: run more episodes, 36 of each task by default"
         )
-    return FoundEvidence(found, whole_notes)
+    return FoundEvidence(
+        {name: _rates([[task]]) for name, task in tasks.items()},
+        {name: _rates([group]) for name, group in types.items()},
+        average,
+        notes,
+    )
+
+
+def _whole_scenes(group: Sequence[Record]) -> list[list[Record]]:
+    """Return the rollouts of each scene of a task that was run with every variant."""
+    scenes: dict[int, dict[int, Record]] = {}
+    for record in group:
+        scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
+    return [list(scene.values()) for scene in scenes.values() if len(scene) == int(group[0]["variants"])]
+
+
+def _task(first: Record, scenes: Sequence[Sequence[Record]], rng: np.random.Generator, draws: int) -> _Task:
+    return _Task(
+        variants=int(first["variants"]),
+        chance=first.get("chance"),
+        values=np.array([_rates_of_scene(scene) for scene in scenes]),
+        drawn=rng.integers(len(scenes), size=(draws, len(scenes))),
+        permuted=np.mean([_permuted(scene, rng, draws) for scene in scenes], axis=0),
+    )
 
 
 def _rates_of_scene(scene: Sequence[Record]) -> list[float]:
@@ -211,18 +221,18 @@ def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
 # --- the report ---
 
 
-def evidence_section(evidence: FoundEvidence) -> Section:
-    """Return the tables of an evaluation in which each scene was run with each variant, with a title."""
-    found, notes = evidence
+def evidence_section(found: FoundEvidence) -> Section:
+    """Return the tables of an evaluation in which each scene was run with each variant."""
     header = ("scenes", "chance", *SHOWN.values(), "p")
-    kinds = [*found["memory_types"].items(), *found[AVERAGE].items()]
-    tables = [
-        Table("evidence_tasks", "", ("task", *header), tuple(_row(Name(n), e) for n, e in found["tasks"].items()))
-    ]
-    if kinds:
-        rows = tuple(_row(name, each) for name, each in kinds)
-        tables.insert(0, Table("evidence", "", ("memory type", *header), rows, strong=frozenset({len(rows) - 1})))
-    return Section("Evidence", tuple(tables), (SENTENCE,), tuple(notes))
+    rows = [_row(name, each) for name, each in found.memory_types.items()]
+    tables = []
+    if found.average is not None:
+        rows.append(_row("average", found.average))
+        strong = frozenset({len(rows) - 1})
+        tables.append(Table("evidence", "", ("memory type", *header), tuple(rows), strong=strong))
+    of_tasks = tuple(_row(Name(name), each) for name, each in found.tasks.items())
+    tables.append(Table("evidence_tasks", "", ("task", *header), of_tasks))
+    return Section("Evidence", tuple(tables), (SENTENCE,), tuple(found.notes))
 
 
 def _row(name: str, found: Evidence) -> tuple[Cell, ...]:
@@ -234,18 +244,18 @@ def _cell(found: Estimate) -> Numbers:
     return Numbers(f"{figure(found.value)} [{figure(found.low)}–{figure(found.high)}]")
 
 
-def evidence_data(evidence: FoundEvidence, records: Sequence[Record]) -> dict[str, Any]:
-    """Return the same as JSON values, per cent, and what was chosen in the rollouts."""
-    told = {place: {name: _data(each) for name, each in rates.items()} for place, rates in evidence.rates.items()}
-    average = told.pop(AVERAGE)
-    for name, group in by_task(filter(_tells, records)).items():
-        if name in told["tasks"]:
-            told["tasks"][name]["choices"] = _choices(group)
-    return {AVERAGE: average.get(AVERAGE), **told}
+def evidence_data(found: FoundEvidence, records: Sequence[Record]) -> dict[str, Any]:
+    """Return the rates as JSON values, per cent, and of each task which variant was chosen how often."""
+    groups = by_task(filter(_has_choice, records))
+    return {
+        "average": None if found.average is None else _data(found.average),
+        "tasks": {name: {**_data(each), "choices": _choices(groups[name])} for name, each in found.tasks.items()},
+        "memory_types": {name: _data(each) for name, each in found.memory_types.items()},
+    }
 
 
 def _choices(group: Sequence[Record]) -> dict[str, dict[str, int]]:
-    """Return variant that was asked for -> variant that was chosen, "none" among them -> rollouts."""
+    """Return variant that was asked for -> variant that was chosen, or "none" -> rollouts."""
     found: dict[str, Counter[str]] = {}
     for record in group:
         chosen = "none" if record["choice"] is None else str(record["choice"])
@@ -263,9 +273,9 @@ def _data(found: Evidence) -> dict[str, Any]:
     return {**size, "chance": percent(found.chance), "p": found.p, **rates}
 
 
-def evidence_phrase(evidence: FoundEvidence) -> list[str]:
+def evidence_phrase(found: FoundEvidence) -> list[str]:
     """Return the average in words, for one line; [] where there is none."""
-    told = evidence.rates[AVERAGE].get(AVERAGE)
-    if told is None:
+    if found.average is None:
         return []
-    return [f"follows the evidence {figure(told.rates['follows'].value)} %, chance {figure(told.chance)} %"]
+    follows = figure(found.average.rates["follows"].value)
+    return [f"follows the evidence {follows} %, chance {figure(found.average.chance)} %"]

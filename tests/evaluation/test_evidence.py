@@ -11,9 +11,8 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.evaluation import evidence_controls
 from lerobot_memobench.evaluation import records as evaluations
-from lerobot_memobench.evaluation.evidence_controls import evidence_of
+from lerobot_memobench.evaluation.evidence import evidence_of
 from lerobot_memobench.evaluation.html.data import facts
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import mixtures
@@ -53,8 +52,8 @@ def hesitant(scene: int, variant: int) -> int | None:
 
 
 def test_who_ignores_the_past_is_exactly_at_chance() -> None:
-    found, notes = evidence_of(rollouts("bowl", "object", stubborn))
-    rate = found["tasks"]["bowl"]
+    found = evidence_of(rollouts("bowl", "object", stubborn))
+    rate, notes = found.tasks["bowl"], found.notes
     assert (rate.scenes, rate.variants, rate.chance) == (10, 3, pytest.approx(1 / 3))
     assert rate.rates["follows"].value == pytest.approx(1 / 3)
     assert len(notes) == 1
@@ -72,7 +71,7 @@ def test_answers_are_right_wrong_or_missing_and_pairs_are_reliable() -> None:
     for record in records[:3]:  # a scene: none given, one of no variant, one right
         record["choice"] = record["variant"] if record["variant"] == 2 else None
         record["answered"] = record["variant"] != 0
-    found = evidence_of(records)[0]["tasks"]["bowl"]
+    found = evidence_of(records).tasks["bowl"]
     rates = {name: rate.value for name, rate in found.rates.items()}
     assert rates["undecided"] == rates["wrong"] == pytest.approx(1 / 36)
     assert rates["follows"] == pytest.approx(34 / 36)
@@ -94,7 +93,7 @@ def test_answers_are_exchanged_among_variants_of_one_instruction() -> None:
         ]
         return variant if variant in same else same[0]
 
-    found = evidence_of(rollouts(name, "spatial", top, scenes=6, variants=12))[0]["tasks"][name]
+    found = evidence_of(rollouts(name, "spatial", top, scenes=6, variants=12)).tasks[name]
     assert found.rates["follows"].value == pytest.approx(1 / 3)
     assert found.p == 1.0
 
@@ -106,13 +105,14 @@ def test_an_average_is_of_memory_types_and_without_tasks_whose_instruction_tells
         *rollouts("drawer", "spatial", hesitant),
         *rollouts("count", "temporal", stubborn, chance=None),
     ]
-    found, _ = evidence_of(records)
-    assert set(found["memory_types"]) == {"object", "spatial"}
-    milk = found["tasks"]["milk"].rates["follows"].value
+    found = evidence_of(records)
+    assert set(found.memory_types) == {"object", "spatial"}
+    milk = found.tasks["milk"].rates["follows"].value
     assert milk == pytest.approx(6 / 18)  # of three answers, the third is none of the two that may be right
-    spatial = found["tasks"]["drawer"].rates
+    spatial = found.tasks["drawer"].rates
     assert (spatial["follows"].value, spatial["undecided"].value, spatial["right"].value) == (0.5, 0.5, 1.0)
-    average = found["average"]["average"]
+    average = found.average
+    assert average is not None
     assert average.rates["follows"].value == pytest.approx(((1 + 6 / 18) / 2 + 0.5) / 2)
     assert average.rates["right"].value == pytest.approx(((1 + 6 / 18) / 2 + 0.5) / 1.5), "half of one type is decided"
     assert average.chance == pytest.approx(((1 / 3 + 1 / 2) / 2 + 1 / 3) / 2)
@@ -120,12 +120,12 @@ def test_an_average_is_of_memory_types_and_without_tasks_whose_instruction_tells
 
 
 def test_scenes_that_were_not_run_with_every_variant_are_left_out() -> None:
-    found, notes = evidence_of(rollouts("bowl", "object", remembers)[:-1])
-    assert found["tasks"]["bowl"].scenes == 9
-    assert notes[0] == "2 rollouts of scenes that were not run with every variant left out"
-    found, notes = evidence_of(rollouts("bowl", "object", remembers) + rollouts("milk", "object", remembers, 1)[:-1])
-    assert set(found["tasks"]) == {"bowl"}
-    assert notes[0] == "2 rollouts of scenes that were not run with every variant left out; no rate tells of milk"
+    found = evidence_of(rollouts("bowl", "object", remembers)[:-1])
+    assert found.tasks["bowl"].scenes == 9
+    assert found.notes[0].startswith("2 rollouts of scenes")
+    found = evidence_of(rollouts("bowl", "object", remembers) + rollouts("milk", "object", remembers, 1)[:-1])
+    assert set(found.tasks) == {"bowl"}
+    assert found.notes[0].endswith("no rate of milk")
 
 
 def test_scenes_repeat_and_are_no_mixture_of_seeds() -> None:
@@ -160,25 +160,16 @@ def test_a_report_draws_its_scenes_once(tmp_path: Path, monkeypatch: pytest.Monk
         asked.append(len(found))
         return evidence_of(found, *more)
 
-    for module in (evidence_controls, evaluations):
-        monkeypatch.setattr(module, "evidence_of", noted)
+    monkeypatch.setattr(evaluations, "evidence_of", noted)
     write_report(folder)
     assert asked == [60]
     write_html([folder], tmp_path / "html")
     assert asked == [60, 60]
-    assert main(["controls", "evidence", folder]) == 0
-    assert asked == [60, 60, 60]
 
 
-def test_policies_stand_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_policies_in_one_report(tmp_path: Path) -> None:
     folders = [evaluation(tmp_path / who.__name__, who) for who in (remembers, stubborn)]
-    assert main(["controls", "evidence", *folders, "--out", str(tmp_path / "out")]) == 0
-    assert "100.0 [" in capsys.readouterr().out
-    written = json.loads((tmp_path / "out" / "evidence.json").read_text())
-    assert [written[name]["average"]["follows"]["percent"] for name in ("remembers", "stubborn")] == [100.0, 33.3]
-
-
-def test_other_evaluations_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_episodes(tmp_path, [rollout("bowl", "object", "S", [True], True, 0)])
-    assert main(["controls", "evidence", str(tmp_path)]) == 2
-    assert "evaluate with evidence=true" in " ".join(capsys.readouterr().err.split())
+    assert main(["report", *folders, "--format", "json", "--out", str(tmp_path / "out")]) == 0
+    written = json.loads((tmp_path / "out" / "report.json").read_text())["evaluations"]
+    follows = [written[name]["evidence"]["average"]["follows"]["percent"] for name in ("remembers", "stubborn")]
+    assert follows == [100.0, 33.3]

@@ -1,7 +1,12 @@
-"""`memobench gallery`: the tasks' initial scenes, every object from all sides, fixtures open and closed."""
+"""Pictures of the benchmark: initial scenes of tasks, objects from all sides, fixtures open and closed.
+
+python scripts/gallery.py --out outputs/gallery          # tasks.png, objects.png, fixtures.png
+python scripts/gallery.py --only tasks --out docs/figures  # the picture of README
+"""
 
 from __future__ import annotations
 
+import argparse
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
 from lerobot_memobench.sim.assets.asset import Asset
 from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, VISUAL_GROUP
@@ -21,7 +25,7 @@ from lerobot_memobench.sim.assets.registry import build_asset
 from lerobot_memobench.sim.rendering import RenderSettings, make_renderer
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import PUBLISHED, Task
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
 
 Pixels = NDArray[np.uint8]
 
@@ -49,14 +53,22 @@ TURNTABLE = tuple(View(azimuth) for azimuth in (25.0, 115.0, 205.0, 295.0))
 FRONT, SIDE = View(20.0, 30.0, 5.6), View(-40.0, 42.0, 5.6)
 
 
-def write_gallery(folder: str | Path, suite: str = PUBLISHED) -> list[Path]:
-    """Write ``tasks.png`` of a suite, ``objects.png`` and ``fixtures.png`` into a folder and return their paths."""
-    folder = Path(folder)
-    return [
-        save(draw_tasks(task_names(suite=suite)), folder / "tasks.png"),
-        save(draw_objects(), folder / "objects.png"),
-        save(draw_fixtures(), folder / "fixtures.png"),
-    ]
+def main() -> None:
+    """Write the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("outputs/gallery"), help="folder of the pictures")
+    parser.add_argument("--suite", choices=(PUBLISHED, STRICT), default=PUBLISHED, help="of the tasks")
+    parser.add_argument("--only", choices=("tasks", "objects", "fixtures"), help="one of the pictures")
+    parser.add_argument("--classes", nargs="+", help="object classes to draw instead of the catalogue's")
+    chosen = parser.parse_args()
+    pictures = {
+        "tasks": lambda: draw_tasks(task_names(suite=chosen.suite)),
+        "objects": lambda: draw_objects(chosen.classes),
+        "fixtures": draw_fixtures,
+    }
+    for name, draw in pictures.items():
+        if chosen.only in (None, name):
+            print(save(draw(), chosen.out / f"{name}.png"))
 
 
 def draw_tasks(names: Sequence[str] | None = None, size: int = 256) -> Image.Image:
@@ -198,8 +210,6 @@ def layout(names: Sequence[str], picture: tuple[int, int], columns: int, label: 
 
 def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, heading: str = "") -> Image.Image:
     """Return pictures of one size in rows, each above its label, under a heading where there is one."""
-    if not cells:
-        raise MemobenchError("there is nothing to draw: name at least one task or class")
     height, width = cells[0][1].shape[:2]
     there = layout([name for name, _ in cells], (width, height), columns, label, heading)
     sheet = Image.new("RGB", (there.width, there.height), BACKGROUND)
@@ -233,23 +243,14 @@ def stack(sheets: Sequence[Image.Image]) -> Image.Image:
     return whole
 
 
-def save(sheet: Image.Image, path: str | Path) -> Path:
-    """Write a figure as a PNG of at most `LARGEST_FILE` bytes: fewer colours first, then fewer pixels.
-
-    Raises:
-        MemobenchError: when the file cannot be written.
-    """
-    path, content = Path(path), _png(sheet)
+def save(sheet: Image.Image, path: Path) -> Path:
+    """Write a figure as a PNG of at most `LARGEST_FILE` bytes: fewer colours first, then fewer pixels."""
+    content = _png(sheet)
     while len(content) > LARGEST_FILE:
         sheet = sheet.resize((sheet.width * 9 // 10, sheet.height * 9 // 10), Image.Resampling.LANCZOS)
         content = _png(sheet)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return write_file(path, content)
-    except OSError as error:
-        raise MemobenchError(
-            f"the figure {path} cannot be written ({error.strerror or error}); choose another folder"
-        ) from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return write_file(path, content)
 
 
 def _png(sheet: Image.Image) -> bytes:
@@ -262,3 +263,7 @@ def _png(sheet: Image.Image) -> bytes:
         if buffer.tell() <= LARGEST_FILE:
             break
     return buffer.getvalue()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""Figures of evaluations and of the paper's tables, in the style of a paper; `style.save` writes PDF and PNG."""

@@ -1,0 +1,299 @@
+"""Figures of a report: outcomes of rollouts as bars, and rates by replan interval.
+
+Colours are safe for the colour-blind; hatches, markers and dashes keep them apart in grey. Operations have the colours
+of videos and of the HTML report (Okabe and Ito's palette). The figures of the paper are drawn by
+``examples/paper_figures.py``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
+from lerobot_memobench.evaluation.metrics import METRICS, Rate
+from lerobot_memobench.evaluation.records import Run, sweeps
+from lerobot_memobench.evaluation.report_tables import PAPER_INPUTS, extent, outcomes, published_rate
+from lerobot_memobench.io import draft_of
+from lerobot_memobench.paper import failure_taxonomy, published_rows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OPERATION_COLOURS = {key: "#" + bytes(colour).hex() for key, colour in VIDEO_COLOURS.items()}
+METRIC_NAMES = {"SR": "success", "MSR": "storage", "MUR": "update", "MCR": "compression"}
+INK, FAINT, GRID = "#222222", "#777777", "#d9d9d9"
+
+OUTCOMES = {
+    "success": ("#e8e8e8", ""),
+    "storage_failure": (OPERATION_COLOURS["S"], "////"),
+    "stale_memory": (OPERATION_COLOURS["U"], "\\\\\\\\"),
+    "compression_collapse": (OPERATION_COLOURS["C"], "...."),
+    "reference_drift": ("#f0e442", "||||"),
+    "execution_failure": ("#d55e00", "xxxx"),
+    "wrong_order": ("#c2a878", "\\\\||"),
+    "cut_off": ("#bdbdbd", "--"),
+    "miscount": ("#cc79a7", "++++"),
+    "wrong_place": ("#8a8a8a", "oooo"),
+    "invalid_action": ("#b39ddb", "OO"),
+    "unstable_physics": ("#b39ddb", "**"),
+}
+"""Outcome -> colour, as in the HTML report, and hatch."""
+
+_COLOURS = (
+    "#0072b2", "#d55e00", "#000000", "#cc79a7", "#882255", "#999933", "#777777", "#332288", "#44aa99", "#aa4499",
+    "#661100",
+)  # fmt: skip
+"""Okabe and Ito's without those of the operations, then Paul Tol's muted ones."""
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", "h", ">")
+_DASHES: tuple[Any, ...] = (
+    "-", "--", "-.", ":",
+    (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (4, 1, 1, 1, 1, 1)), (0, (2, 2)),
+    (0, (6, 1, 1, 1)),
+)  # fmt: skip
+
+
+def line_style(number: int, published: bool) -> dict[str, Any]:
+    """Return matplotlib's keywords of the line of a method; the paper's have open markers."""
+    size = len(_COLOURS)
+    colour, other = _COLOURS[number % size], (number + number // size) % size
+    face = "white" if published else colour
+    return {"color": colour, "marker": _MARKERS[other], "ls": _DASHES[other], "mfc": face, "ms": 4}
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """Set fonts and lines of everything drawn inside."""
+    import matplotlib as mpl
+
+    settings = {
+        "font.size": 8,
+        "axes.titlesize": 8.5,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.edgecolor": FAINT,
+        "axes.linewidth": 0.7,
+        "xtick.color": INK,
+        "ytick.color": INK,
+        "text.color": INK,
+        "legend.frameon": False,
+        "hatch.linewidth": 0.4,
+        "pdf.fonttype": 42,  # text stays text
+    }
+    with mpl.rc_context(settings):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, laid out without overlaps."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def literal(name: str) -> str:
+    """Return a name as matplotlib sets it: the models π0 and π0.5 with an index, everything else literally."""
+    return re.sub(r"π(\d(?:\.\d)?)", r"$\\pi_{\1}$", name.replace("$", r"\$"))
+
+
+def legend_below(figure: Figure, handles: Mapping[str, Any], columns: int) -> None:
+    """Put one legend, label -> handle, under all panels."""
+    labels = [literal(label) for label in handles]
+    figure.legend(list(handles.values()), labels, loc="outside lower center", ncols=columns, handlelength=3.2)
+
+
+def save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure as ``name``.pdf and ``name``.png into a folder; return the files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.pdf", folder / f"{name}.png"]
+    for path in paths:
+        # Without its date, the same figure is the same file.
+        metadata = {"CreationDate": None} if path.suffix == ".pdf" else None
+        with draft_of(path) as draft, paper_style():
+            figure.savefig(draft, dpi=200, metadata=metadata)
+    return paths
+
+
+def draw_figures(runs: Sequence[Run], folder: Path, paper: bool = False) -> list[Path]:
+    """Draw the figures of a report into a folder; return the files.
+
+    Args:
+        paper: draw the published figures as well.
+    """
+    files = save(draw_outcomes(bars(runs, paper)), folder, "outcomes")
+    if sweeps(runs):
+        files += save(draw_replan(runs, paper), folder, "replan")
+    return files
+
+
+# --- outcomes of rollouts ---
+
+NARROWEST_LABEL = 5.0
+"""Per cent; narrower parts of a bar have no room for a figure."""
+HEADING = 52
+"""Characters of a line left of a bar."""
+
+
+class Bar(NamedTuple):
+    """One bar.
+
+    Attributes:
+        heading: memory type, written left of the first bar of a group. name: of the evaluation, "" for a single one.
+        parts: outcome -> rollouts, from the left.
+    """
+
+    heading: str
+    name: str
+    parts: Mapping[str, int]
+
+
+def bars(runs: Sequence[Run], paper: bool = False) -> list[Bar]:
+    """Return the bars of all rollouts, then of each memory type, and of the paper's temporal task."""
+    groups: dict[str, dict[str, list[str]]] = {}  # heading -> name of the evaluation -> tasks
+    for run in runs:
+        for task, memory_type in run.summary.memory_type_of.items():
+            for heading in ("all rollouts", memory_type):
+                groups.setdefault(heading, {}).setdefault(run.name, []).append(task)
+    summaries = {run.name: run.summary for run in runs}
+    found = [
+        Bar(heading, name if len(runs) > 1 else "", outcomes(summaries[name], tasks))
+        for heading, members in groups.items()
+        for name, tasks in members.items()
+    ]
+    if paper:
+        counts = failure_taxonomy()
+        late = counts["stale_memory_first_update"] + counts["stale_memory_late"]
+        parts = {"success": counts["success"], "storage_failure": counts["storage_failure"], "stale_memory": late}
+        found.append(Bar("paper, a temporal task", "", parts))
+    return found
+
+
+def draw_outcomes(found: Sequence[Bar]) -> Figure:
+    """Draw bars, those of one heading together."""
+    from matplotlib.patches import Patch
+
+    steps = [1.0 if a.heading == b.heading else 1.45 for a, b in pairwise(found)]
+    places = list(accumulate(steps, initial=0.0))  # from the top
+    with paper_style():
+        figure = new_figure(7.0, 1.35 + 0.27 * (places[-1] + 1))
+        axis = figure.subplots()
+        for bar, place in zip(found, places, strict=True):
+            _draw_bar(axis, bar, place)
+        axis.set_ylim(places[-1] + 0.6, -0.6)
+        axis.set_xlim(0, 100)
+        axis.set_xlabel("rollouts, %")
+        axis.set_yticks(places, [_label(found, k) for k in range(len(found))])
+        axis.tick_params(axis="y", length=0)
+        axis.spines["left"].set_visible(False)
+        there = {name for bar in found for name, count in bar.parts.items() if count}
+        handles = {
+            name.replace("_", " "): Patch(facecolor=colour, hatch=hatch, edgecolor=INK, lw=0.5)
+            for name, (colour, hatch) in OUTCOMES.items()
+            if name in there
+        }
+        legend_below(figure, handles, 3)
+        return figure
+
+
+def _draw_bar(axis: Any, bar: Bar, place: float) -> None:
+    left, rollouts = 0.0, sum(bar.parts.values())
+    for outcome, count in bar.parts.items():
+        width = 100 * count / rollouts
+        colour, hatch = OUTCOMES[outcome]
+        axis.barh(place, width, 0.8, left, color=colour, hatch=hatch, edgecolor=INK, linewidth=0.5, zorder=2)
+        if width >= NARROWEST_LABEL:
+            box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+            axis.text(left + width / 2, place, f"{width:.0f}", ha="center", va="center", size=7, zorder=3, bbox=box)
+        left += width
+    axis.text(101, place, f"n = {rollouts:,}", ha="left", va="center", size=7, color=FAINT)
+
+
+def _label(found: Sequence[Bar], k: int) -> str:
+    bar = found[k]
+    first = k == 0 or found[k - 1].heading != bar.heading
+    heading = textwrap.fill(bar.heading, HEADING) if first else ""
+    return "   ".join(part for part in (heading, literal(bar.name)) if part)
+
+
+# --- rates by replan interval ---
+
+Curve = Mapping[int, Rate]
+"""Replan interval -> rate."""
+
+
+def draw_replan(runs: Sequence[Run], paper: bool = False) -> Figure:
+    """Draw SR, MSR, MUR and MCR on average over replan intervals, a line per method, with Wilson's intervals."""
+    from matplotlib.lines import Line2D
+
+    methods = {
+        **{(name, False): _curves(group) for name, group in sweeps(runs).items()},
+        **({(name, True): found for name, found in _published_curves().items()} if paper else {}),
+    }
+    styles = {key: line_style(number, published=key[1]) for number, key in enumerate(methods)}
+    with paper_style():
+        figure = new_figure(7.4, 2.5)
+        for metric, place in zip(METRICS, figure.subplots(1, len(METRICS)), strict=True):
+            for key, found in methods.items():
+                _draw_curve(place, found[metric], styles[key])
+            place.set_title(f"{metric} ({METRIC_NAMES[metric]})", fontsize=7.5)
+            place.set_xlabel("replan interval, steps")
+            place.set_xticks(sorted({steps for found in methods.values() for steps in found[metric]}))
+            # Room for markers at the top, and at least ten points of scale: noise is not to look like a trend.
+            place.set_ylim(bottom=0)
+            place.set_ylim(top=min(102.0, max(10.0, place.get_ylim()[1])))
+            place.grid(axis="y", color=GRID, lw=0.5)
+        figure.axes[0].set_ylabel("average, %")
+        remarks = {name: remark(group[0]) for name, group in sweeps(runs).items()} if paper else {}
+        handles = {
+            f"paper: {name}" if published else f"{name}{remarks.get(name, '')}": Line2D(
+                [], [], **styles[name, published]
+            )
+            for name, published in methods
+        }
+        legend_below(figure, handles, 3)
+        return figure
+
+
+def remark(run: Run) -> str:
+    """Return how much was run and the policy's inputs, each where it is not the paper's, for a legend."""
+    inputs = "" if run.summary.inputs == PAPER_INPUTS else f"inputs: {run.summary.inputs}"
+    return "".join(f"\n({part})" for part in (extent(run), inputs) if part)
+
+
+def _curves(runs: Sequence[Run]) -> dict[str, Curve]:
+    """Return metric -> its average at each replan interval where it applies."""
+    return {
+        metric: {
+            run.replan_steps: rate
+            for run in runs
+            if (rate := run.summary.average[metric]).value is not None and run.replan_steps is not None
+        }
+        for metric in METRICS
+    }
+
+
+def _published_curves() -> dict[str, dict[str, Curve]]:
+    """Return model -> the same of the paper's main results."""
+    found: dict[str, dict[str, dict[int, Rate]]] = {}
+    for row in published_rows("main"):
+        curves = found.setdefault(row.label, {metric: {} for metric in METRICS})
+        for metric, value in row.average.items():
+            if value is not None and row.replan_steps is not None:
+                curves[metric][row.replan_steps] = published_rate(value)
+    return {name: dict(curves) for name, curves in found.items()}
+
+
+def _draw_curve(place: Any, found: Curve, style: Mapping[str, Any]) -> None:
+    rates = list(found.values())
+    values = [math.nan if rate.value is None else 100 * rate.value for rate in rates]
+    intervals = [rate.interval for rate in rates if rate.interval is not None]
+    if intervals:
+        low, high = ([100 * interval[k] for interval in intervals] for k in (0, 1))
+        place.fill_between(list(found), low, high, color=style["color"], alpha=0.15, lw=0, zorder=1)
+    place.plot(list(found), values, **style, lw=1.9 if intervals else 1.1, zorder=3, clip_on=False)

@@ -1,0 +1,204 @@
+"""Memory reads: how much each action chunk reads of each remembered frame, keyframe or slot.
+
+``memory_reads=true`` writes ``memory_reads/<task>.<episode>.json.gz`` next to the log as each episode ends. Rates do
+not need these files; the HTML report draws them.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.envs.observations import RESET
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import Count, Name, Number, Whole, count_of, file_name, read_json, write_file
+from lerobot_memobench.tasks.task import PUBLISHED
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
+
+MEMORY_READS = "memory_reads"
+"""Folder of the files, within that of the log."""
+
+
+class Chunk(TypedDict):
+    """The reads of one action chunk.
+
+    Attributes:
+        step: control step at which it was planned. The policy counts from its first observation, which is the
+            execution's first where the prompt plays in ``reset``.
+        entries: control steps of the frames that it could read, in ascending order; -1, -2, ... for entries without a
+            frame, such as slots.
+        weights: how much of each, as shares of attention; they sum to one where attention goes to memory alone.
+    """
+
+    step: Count
+    entries: list[Whole]
+    weights: list[Number]
+
+
+class EpisodeReads(TypedDict):
+    """The content of a file.
+
+    Attributes:
+        seed: that of episode 0 + the episode's number; the log has the scene's, which several episodes share where each
+            scene is run with each variant.
+        referent: of the episode, as in its line of the log.
+        chunks: in the order in which they were planned.
+    """
+
+    seed: Whole
+    referent: Name
+    chunks: list[Chunk]
+
+
+# --- from attention to chunks ---
+
+
+def chunk_reads(steps: list[int], memory: MemoryTokens, layers: list[Tensor]) -> list[Chunk]:
+    """Return the reads of the chunks of B rows, which are planned at these control steps.
+
+    Args:
+        layers: how much was read of each token in each layer and pass, (B, L) each. They are averaged, and summed over
+            the tokens of an entry, or over its shares of tokens (`MemoryTokens.sources`).
+    """
+    import torch
+    from einops import einsum
+
+    weights, real = torch.stack(layers).float().mean(dim=0), memory.mask
+    if memory.sources is not None:
+        shares, entries = memory.sources
+        weights, real = einsum(weights, shares, "b l, b l e -> b e"), entries >= 0
+    else:
+        entries = (-1 - torch.arange(real.shape[1], device=real.device)).expand_as(real)
+        if memory.steps is not None:
+            entries = torch.where(memory.steps < 0, entries, memory.steps)
+    found: list[Chunk] = []
+    for step, of, each, there in zip(steps, entries, weights, real, strict=True):
+        named, place = of[there].float().round().long().unique(return_inverse=True)
+        shares = torch.zeros(len(named), device=each.device).index_add(0, place, each[there].float())
+        found.append({"step": step, "entries": named.tolist(), "weights": shares.tolist()})
+    return found
+
+
+# --- files ---
+
+
+def reads_file(folder: Path, task: str, episode: int) -> Path:
+    """Return the place of an episode's file; ``folder`` is the log's."""
+    return folder / MEMORY_READS / f"{file_name(task, 'the name of a task')}.{episode}.json.gz"
+
+
+def write_reads(path: Path, reads: EpisodeReads) -> None:
+    """Write an episode's file, weights to four places."""
+    chunks = [{**chunk, "weights": [round(weight, 4) for weight in chunk["weights"]]} for chunk in reads["chunks"]]
+    text = json.dumps({**reads, "chunks": chunks}, separators=(",", ":"))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, gzip.compress(text.encode(), mtime=0))
+
+
+@dataclass(frozen=True)
+class ReadLog:
+    """Writes the reads of an evaluation's episodes.
+
+    Attributes:
+        folder: of the episode log. seed_base: seed of episode 0. referent: of every episode.
+    """
+
+    folder: Path
+    seed_base: int
+    referent: str
+
+    @contextmanager
+    def noting(self, task: str, policy: Any, seeds: Sequence[int]) -> Iterator[Callable[[NDArray[np.bool_]], None]]:
+        """Watch a batch of rollouts; the function that is yielded writes the reads of episodes that are over (rows,).
+
+        An episode that the log held already observes and plans nothing, and keeps the file that it has.
+
+        Raises:
+            MemobenchError: the policy does not give its reads.
+        """
+        policy.watch_memory()
+        written = np.zeros(len(seeds), bool)
+
+        def ended(over: NDArray[np.bool_]) -> None:
+            if (over == written).all():
+                return
+            rows = policy.memory_reads()
+            for row in np.flatnonzero(over & ~written):
+                written[row] = True
+                if row < len(rows) and rows[row]:
+                    reads: EpisodeReads = {"seed": seeds[row], "referent": self.referent, "chunks": rows[row]}
+                    write_reads(reads_file(self.folder, task, seeds[row] - self.seed_base), reads)
+
+        try:
+            yield ended
+            ended(np.ones(len(seeds), bool))
+        finally:
+            policy.watch_memory(False)
+
+
+def find_reads(
+    folder: Path, records: Sequence[Mapping[str, Any]], protocol: Mapping[str, Any]
+) -> tuple[dict[int, list[Chunk]], list[str]]:
+    """Return position of a rollout in ``records`` -> its chunks, and a note on files that are left out.
+
+    Steps are those of a report's timeline: the episode's, prompt included. A timeline leaves pauses out, so rollouts
+    with pauses have no chunks.
+    """
+    unseen = protocol.get("prompt_in") == RESET
+    found: dict[int, list[Chunk]] = {}
+    misfits: list[str] = []
+    for k, record in enumerate(records):
+        try:
+            path = reads_file(folder, record["task"], record["episode"])
+            reads: EpisodeReads = read_json(path, EpisodeReads, "run the episode again")
+        except FileNotFoundError:
+            continue
+        except MemobenchError as error:
+            misfits.append(str(error))
+            continue
+        # The clock of a strict task counts its prompt, seen or not.
+        shift = int(record.get("prompt_steps") or 0) if unseen and record.get("suite", PUBLISHED) == PUBLISHED else 0
+        chunks = [_later(chunk, shift) for chunk in reads["chunks"]]
+        if not _is_of(reads, record) or not _fit(chunks, record):
+            misfits.append(f"{path} is not of the rollout in the log")
+        elif not record.get("paused_steps"):
+            found[k] = chunks
+    if not misfits:
+        return found, []
+    return found, [f"{count_of(len(misfits), 'file')} of {MEMORY_READS} left out, the first because {misfits[0]}"]
+
+
+def _later(chunk: Chunk, shift: int) -> Chunk:
+    entries = [entry + shift if entry >= 0 else entry for entry in chunk["entries"]]
+    return {"step": chunk["step"] + shift, "entries": entries, "weights": chunk["weights"]}
+
+
+def _is_of(reads: EpisodeReads, record: Mapping[str, Any]) -> bool:
+    if record.get("seed") is None or reads["referent"] != record.get("referent", "fixed"):
+        return False
+    scene = int(record["episode"]) // int(record.get("variants") or 1)
+    return reads["seed"] - int(record["episode"]) == int(record["seed"]) - scene
+
+
+def _fit(chunks: Sequence[Chunk], record: Mapping[str, Any]) -> bool:
+    """Return whether chunks were planned within a rollout, each with one weight per entry, all of its past."""
+    paused, steps = int(record.get("paused_steps") or 0), record.get("steps")
+    end = None if steps is None else int(record.get("prompt_steps") or 0) + int(steps) + paused
+    return all(
+        len(chunk["entries"]) == len(chunk["weights"])
+        and max(chunk["entries"], default=0) <= chunk["step"]
+        and (end is None or chunk["step"] < end)
+        for chunk in chunks
+    )

@@ -1,0 +1,110 @@
+"""The demo: its commands are understood, and what it makes of evaluations. The evaluations are replaced here."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
+from lerobot_memobench.run.arguments import split_arguments
+from lerobot_memobench.run.plan import take_run_options
+from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.logs import rollout
+
+DEMO = Path(__file__).parents[1] / "examples" / "demo.py"
+HEIGHT, WIDTH = 32, 64
+FAILURES: dict[str, dict[int, str]] = {
+    "expert": {},
+    "with_memory": {3: "reference_drift"},
+    "without_memory": {1: "reference_drift", 2: "reference_drift", 3: "storage_failure"},
+}
+"""Name of an evaluation of the second part -> episode -> its failure."""
+
+
+@pytest.fixture(scope="module")
+def demo() -> SimpleNamespace:
+    return SimpleNamespace(**runpy.run_path(str(DEMO)))
+
+
+def film(path: Path, length: int, shade: int | None = None) -> Path:
+    """A video of one shade of grey, or from black to white."""
+    strip = VideoRecorder(path)
+    for k in range(length):
+        strip.add(np.full((HEIGHT, WIDTH, 3), 255 * k // (length - 1) if shade is None else shade, np.uint8))
+    strip.finish()
+    return path
+
+
+def evaluate(demo: SimpleNamespace, words: list[str]) -> None:
+    """Write what the evaluation of a command would leave."""
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    folder = Path(given["output_dir"])
+    if folder.name == "expert" and folder.parent.name != "memory":
+        for name in demo.TASKS:
+            film(folder / "videos" / f"{name}.0.mp4", 12)
+        return
+    ends = [FAILURES[folder.name].get(k) for k in range(5)]
+    records = [rollout(demo.BOWL, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)]
+    write_episodes(folder, records)
+    film(folder / "videos" / f"{demo.BOWL}.1.mp4", 6, 100)  # the first episode in which they differ
+
+
+def test_the_demo_folder(demo: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    typed: list[list[str]] = []
+
+    def replaced(command: list[str], **_: Any) -> None:
+        typed.append(command)
+        evaluate(demo, command)
+
+    monkeypatch.setattr(subprocess, "run", replaced)
+    monkeypatch.setattr(sys, "argv", ["demo.py", "--out", str(tmp_path)])
+    demo.main()
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("expert", "memory", "contact_sheet.png", "memory.mp4", "memory.png", "memory.md"),
+    }
+    assert [Path(command[0]).name for command in typed] == ["lerobot"] * 4
+    for command in typed:
+        take_run_options(split_arguments([word for word in command[2:] if not word.startswith("policy=")]))
+    # The three of the second part differ in the policy and their folder alone.
+    of_policy = ("policy=", "output_dir=")
+    assert len({tuple(word for word in command if not word.startswith(of_policy)) for command in typed[1:]}) == 1
+    assert [get_task(name).memory_type for name in demo.TASKS] == ["temporal", "spatial", "object", "procedural"]
+    assert "| without memory | 2/5 | 2 |" in (tmp_path / "memory.md").read_text()
+    with Image.open(tmp_path / "contact_sheet.png") as sheet:
+        pixels = np.asarray(sheet.convert("L")).astype(int)
+    assert pixels.shape == (4 * 160, demo.FRAMES_PER_VIDEO * demo.COLUMN_WIDTH)
+    means = pixels[:160].reshape(160, demo.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
+    assert (np.diff(means) >= 0).all()  # in time, left to right
+    assert (means[0] < 20, means[-1] > 235) == (True, True), "both ends are there"
+
+
+def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((picture == colour).all(axis=-1).any())
+
+
+def test_videos_side_by_side_say_how_they_ended(demo: SimpleNamespace, tmp_path: Path) -> None:
+    takes = {
+        "with": demo.Take(film(tmp_path / "with.mp4", 5, 60), True),
+        "without": demo.Take(film(tmp_path / "without.mp4", 9, 200), False),
+    }
+    frames = list(demo.joined(takes))
+    assert len(frames) == 9 + LAST_FRAMES
+    assert frames[0].shape == (demo.TITLE + HEIGHT, 2 * WIDTH, 3)
+    left, right = frames[0][demo.TITLE :, :WIDTH], frames[0][demo.TITLE :, WIDTH:]
+    assert abs(float(left.mean()) - 60) < 4
+    assert abs(float(right.mean()) - 200) < 4
+    ends = [[coloured(frame[: demo.TITLE], colour) for frame in frames] for colour in (demo.SOLVED, demo.FAILED)]
+    assert [end.index(True) for end in ends] == [5 + LAST_FRAMES - 1, 9 + LAST_FRAMES - 1]
+    picture = np.asarray(demo.strip(takes))
+    assert picture.shape == (2 * (demo.TITLE + demo.STRIP_WIDTH * HEIGHT // WIDTH), 6 * demo.STRIP_WIDTH, 3)
+    assert coloured(picture[: demo.TITLE], demo.SOLVED)
+    assert coloured(picture[len(picture) // 2 :][: demo.TITLE], demo.FAILED)
