@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.datasets.recording import HOLD_FRAMES
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.expert import Expert, rest_of, steps_of
+from lerobot_memobench.experts.expert import Expert, hold_steps_of, steps_of
 from lerobot_memobench.experts.grasping import grasp_pose
-from lerobot_memobench.experts.hand import EMPTY, Hand
-from lerobot_memobench.experts.travel import FULLY_OPEN, PRESSED, stands_out
+from lerobot_memobench.experts.hand import EMPTY_OPENING, Hand
+from lerobot_memobench.experts.travel import OPEN_WIDTH, PRESS_STEPS, protrudes_from_drawer
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -171,9 +171,9 @@ def test_a_rim_is_taken_with_room_beside_it(name: str, kind: str, room: float) -
     episode.reset(20_000)
     thing, asset = next(item for item in episode.sim.assets.items() if item[1].class_name == kind)
     (grasp,) = asset.grasps
-    target, _ = grasp_pose(Hand(episode.sim, np.random.default_rng(0)), thing, grasp, 0.0, FULLY_OPEN)
+    target, _ = grasp_pose(Hand(episode.sim, np.random.default_rng(0)), thing, grasp, 0.0, OPEN_WIDTH)
     off = np.linalg.norm(target[:2] - episode.sim.body_pose(thing)[0][:2])
-    inner = off + grasp.width / 2 - FULLY_OPEN / 2
+    inner = off + grasp.width / 2 - OPEN_WIDTH / 2
     assert grasp.position[0] - inner == pytest.approx(room, abs=1e-3)
 
 
@@ -212,7 +212,7 @@ def test_what_leans_in_a_drawer_is_laid_down_again() -> None:
             joint.qpos = np.concatenate([centre + rotation @ place, quaternion])
             joint.qvel = 0.0
             mujoco.mj_forward(sim.model, sim.data)
-            assert stands_out(Hand(sim, np.random.default_rng(0)), bowl, drawer)
+            assert protrudes_from_drawer(Hand(sim, np.random.default_rng(0)), bowl, drawer)
         return action
 
     assert not play(task, 10_000, disturb=lean).faults
@@ -271,7 +271,7 @@ def test_a_miss_is_seen_at_once() -> None:
         if left and action[6] > 0:
             left -= 1
             return np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0, 1.0])
-        if not left and episode.sim.gripper_opening() <= EMPTY and action[6] > 0:
+        if not left and episode.sim.gripper_opening() <= EMPTY_OPENING and action[6] > 0:
             height = episode.sim.eef_pose()[0][2]
             lowest, highest = min(lowest, height), max(highest, height)
         return action
@@ -303,7 +303,7 @@ def test_what_has_a_stop_is_pushed_on_against_it(name: str, shut: Atom) -> None:
     assert not played.faults
     for _ in range(HOLD_FRAMES):
         played.episode.step(look(played.episode, played.episode.expert_action()))
-    assert pressed >= PRESSED
+    assert pressed >= PRESS_STEPS
 
 
 @pytest.mark.parametrize("name", [SWAP, MILK])
@@ -344,9 +344,9 @@ def test_a_prompt_ends_with_what_it_shows() -> None:
 
 def test_an_order_within_an_order_is_waited_for_twice() -> None:
     first, second = Atom("close", ("a",)), Atom("close", ("b",))
-    assert rest_of(And((first, second))) == 0
-    assert rest_of(Then((first, second))) == HOLD_STEPS
-    assert rest_of(Then((first, And((Then((first, second)), second))))) == 2 * HOLD_STEPS
+    assert hold_steps_of(And((first, second))) == 0
+    assert hold_steps_of(Then((first, second))) == HOLD_STEPS
+    assert hold_steps_of(Then((first, And((Then((first, second)), second))))) == 2 * HOLD_STEPS
 
 
 def test_rests_once_its_plan_is_through() -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from lerobot_memobench.experts.hand import (
     DOWN,
-    EASY_CLOSING,
-    LATE,
+    MAX_OPENING_STEPS,
+    NEUTRAL_CLOSING,
     OPEN,
     Hand,
     cross,
@@ -51,10 +51,10 @@ def test_downward_closes_along_the_angle_the_easy_way_round(yaw: float) -> None:
     turn = downward(float(yaw))
     np.testing.assert_allclose(turn[:, 2], DOWN, atol=1e-12)
     assert abs(turn[:, 0] @ [np.cos(yaw), np.sin(yaw), 0.0]) == pytest.approx(1.0)
-    assert turn[:, 0] @ EASY_CLOSING > -1e-9
+    assert turn[:, 0] @ NEUTRAL_CLOSING > -1e-9
 
 
-@pytest.mark.parametrize(("kept_shut", "most"), [(0, 3), (9, 12), (500, LATE)])
+@pytest.mark.parametrize(("kept_shut", "most"), [(0, 3), (9, 12), (500, MAX_OPENING_STEPS)])
 def test_fingers_that_open_late_are_waited_for(
     kept_shut: int, most: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.experts.expert import counts, plan_of
+from lerobot_memobench.experts.expert import counts_events, plan_of
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, parse_formula
@@ -47,7 +47,7 @@ def test_what_is_counted_twice_is_planned_once() -> None:
     once = ["exactly", 1, ["round", ["open", "d"], ["close", "d"]]]
     from_home = ["exactly", 1, ["round", ["handhome"], ["open", "d"], ["close", "d"]]]
     goal = parse_formula(["and", from_home, once])
-    assert counts(goal)
+    assert counts_events(goal)
     assert plan_of(goal) == [Atom("handhome", ()), Atom("open", ("d",)), Atom("close", ("d",))]
 
 

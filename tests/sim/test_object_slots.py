@@ -15,7 +15,7 @@ from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import object_slots, simulation
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS, WIDTH
-from lerobot_memobench.sim.object_slots import POINTS, QUANTUM, ObjectSlots, classes, layout
+from lerobot_memobench.sim.object_slots import POINTS_PER_THING, POSE_RESOLUTION, ObjectSlots, classes, layout
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
@@ -25,7 +25,7 @@ NINE = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
 DRAWERS = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 TOMATO, TOP = "beefsteak_tomato__1_1", "wooden_cabinet_1_top_region"
 
-ROUNDED = QUANTUM / 2 + 1e-6
+ROUNDED = POSE_RESOLUTION / 2 + 1e-6
 """What a told pose may differ from the true one."""
 
 
@@ -94,7 +94,9 @@ def test_every_scene_fits_and_says_where_things_are(name: str) -> None:
         if bodies:
             nearest = min(np.abs(sim.body_pose(asset.name)[0] - place).max() for asset in bodies)
             assert nearest < ROUNDED
-    np.testing.assert_allclose(np.linalg.norm(column(rows, "rotation").reshape(-1, 2, 3), axis=2), 1.0, atol=QUANTUM)
+    np.testing.assert_allclose(
+        np.linalg.norm(column(rows, "rotation").reshape(-1, 2, 3), axis=2), 1.0, atol=POSE_RESOLUTION
+    )
     assert not column(rows, "highlighted").any()
 
 
@@ -162,7 +164,7 @@ def test_points_tried_in_turn_answer_as_all_of_them_at_once(monkeypatch: pytest.
             episode.step(episode.expert_action())
         in_turn = slots.observe()
         with monkeypatch.context() as patch:
-            patch.setattr(object_slots, "TURNS", (slice(0, POINTS),))
+            patch.setattr(object_slots, "TURNS", (slice(0, POINTS_PER_THING),))
             np.testing.assert_array_equal(in_turn, slots.observe())
             patch.setattr(object_slots, "TURNS", (slice(0, 3),))
             partly += not np.array_equal(in_turn, slots.observe())

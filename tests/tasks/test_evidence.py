@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evidence import Choice, chance, handled, scene_and_variant
+from lerobot_memobench.tasks.evidence import Choice, chance, handled_atoms, scene_and_variant
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import SUITES
 
@@ -77,7 +77,7 @@ def test_an_object_that_was_lifted_is_a_choice(variant: int) -> None:
 
 
 def test_an_answer_may_be_none_of_the_variants() -> None:
-    order = [lifted(atom.args[0]) for atom in handled(get_task(STACK).variant(0))]
+    order = [lifted(atom.args[0]) for atom in handled_atoms(get_task(STACK).variant(0))]
     choice = Choice(get_task(STACK).variant(0))
     assert not choice.answered
     for atom in (order[1], order[1], order[0]):

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.sim.libero.looks import drawn
+from lerobot_memobench.sim.libero.looks import drawing_model
 from lerobot_memobench.sim.libero.scene import scene_spec
 from lerobot_memobench.sim.raster.rasterizer import Rasterizer
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
@@ -44,7 +44,7 @@ def test_what_is_kept_draws_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyP
     pictures = []
     for folder in (closed, tmp_path, tmp_path):
         monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
-        model, draw_list = drawn(scene_spec(sim.task, visuals=True))
+        model, draw_list = drawing_model(scene_spec(sim.task, visuals=True))
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         renderer = Rasterizer(model, draw_list, 128, 128, 0)
