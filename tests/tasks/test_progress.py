@@ -33,8 +33,8 @@ def facts(progress: Progress) -> tuple[int, bool, int, tuple[bool, ...], list[in
         progress.success,
         progress.index,
         progress.satisfied,
-        progress.first_step,
-        progress.ordered_step,
+        [*progress.first_step],
+        [*progress.ordered_step],
     )
 
 

@@ -97,7 +97,7 @@ class _RendererCache(threading.local):
         self.renderers: OrderedDict[tuple[Any, RenderSettings], Renderer] = OrderedDict()
 
 
-_thread = _RendererCache()
+_cache = _RendererCache()
 
 
 def get_renderer(
@@ -111,7 +111,7 @@ def get_renderer(
         settings: size and quality of frames.
         draw_list: triangles to draw; by default all visual geoms of the model.
     """
-    renderers = _thread.renderers
+    renderers = _cache.renderers
     full = (key, settings)
     if full not in renderers:
         while len(renderers) >= CACHED_RENDERERS:
