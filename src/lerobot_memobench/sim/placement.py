@@ -48,7 +48,7 @@ def placing_atoms(task: Task, assets: Iterable[str]) -> dict[str, Atom]:
     missing = [name for name in assets if name not in places]
     if missing:
         raise MemobenchError(
-            f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to its :init"
+            f"task {task.name} has no start for {missing[0]!r}; add (On {missing[0]} <region>) to its :init"
         )
     return places
 

@@ -1,4 +1,4 @@
-"""Pictures of the paper's world are those of MuJoCo's renderer, from LIBERO's files or from what is kept of them."""
+"""Images of the paper's world equal MuJoCo's renderer, with and without the cache."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def test_the_burner_is_red_while_the_stove_is_on() -> None:
 
 @needs_assets
 @pytest.mark.slow
-def test_what_is_kept_draws_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a folder to write to, by the process that fills it, and by one that finds it filled."""
+def test_cached_assets_draw_equal_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a writable cache, with an empty one, and with a filled one."""
     sim = simulate(STOVE)
     closed = tmp_path / "closed"
     closed.touch()

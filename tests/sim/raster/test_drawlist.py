@@ -103,8 +103,8 @@ def test_edges_of_a_finer_mesh_are_sharp() -> None:
         assert agreement.min() > 0.8 - 1e-5
 
 
-def test_what_stands_still_comes_first() -> None:
-    """A door, the hand and what stands on the table move; the microwave's body and the arm's foot do not."""
+def test_static_rows_come_first() -> None:
+    """Doors, the hand and objects move; the microwave's body and the arm's base do not."""
     sim = Simulation(get_task("open_and_close_the_microwave"))
     listed = build_draw_list(sim.model, SHADOWLESS_BODIES)
     names = np.array([sim.model.body(sim.model.geom_bodyid[geom]).name for geom in listed.geoms])

@@ -1,4 +1,4 @@
-"""Pictures kept from frame to frame change no pixel, and the light is that of MuJoCo's own renderer."""
+"""Cached images change no pixel, and the light is that of MuJoCo's renderer."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def states(sims: list[Simulation], joint: str, opened: float) -> Iterator[str]:
 @pytest.mark.parametrize(
     ("task", "quality"), [*((task, "default") for task in SCENES), ("turn_on_the_stove_and_turn_it_off", "fast")]
 )
-def test_frames_depend_on_nothing_that_is_kept(task: str, quality: str) -> None:
+def test_frames_do_not_depend_on_caches(task: str, quality: str) -> None:
     """They are those of a renderer that has drawn nothing, and nearly those of one for which nothing stands still.
 
     Levels of textures are chosen at the ends of what is drawn of a surface, which things in front of it may part.
@@ -84,7 +84,7 @@ def test_a_state_that_is_not_finite_is_refused(place: float) -> None:
     np.testing.assert_array_equal(sim.render(), expected)
 
 
-def test_no_more_scenes_are_kept_than_are_allowed() -> None:
+def test_the_cache_of_still_states_is_bounded() -> None:
     sim = Simulation(get_task("open_and_close_the_microwave"), RenderSettings(32, 32))
     rasterizer = Rasterizer(sim.model, build_draw_list(sim.model, SHADOWLESS_BODIES), 32, 32, 64)
     for seed in range(MAX_STILL_STATES + 2):
