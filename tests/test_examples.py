@@ -23,7 +23,7 @@ from lerobot_memobench.policies.remote.transports import pack, unpack
 from lerobot_memobench.run.arguments import read_arguments, split_arguments
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.sim.object_layout import STARTS, WIDTH
-from lerobot_memobench.sim.object_slots import ObjectSlots, in_slots
+from lerobot_memobench.sim.object_slots import ObjectSlots, fill_slots
 from tests.support import logs
 from tests.support.libero import needs_assets, simulate
 from tests.support.remote_case import batch
@@ -182,7 +182,7 @@ def seen_at(step: int, rng: np.random.Generator) -> dict[str, Any]:
     things = rng.uniform(-0.5, 0.5, (5, WIDTH))
     things[:, STARTS["present"]], things[:, STARTS["class"]] = 1, rng.integers(0, 30, 5)
     return {
-        "observation.environment_state": torch.from_numpy(in_slots(things))[None],
+        "observation.environment_state": torch.from_numpy(fill_slots(things))[None],
         "observation.state": torch.from_numpy(rng.uniform(-0.5, 0.5, (1, 8)).astype(np.float32)),
         "observation.step": torch.tensor([float(step)]),
         "task": ["open the drawer"],

@@ -22,7 +22,7 @@ from lerobot_memobench.sim.assets.asset import Asset, Grasp
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.placement import GAP, PENETRATION
+from lerobot_memobench.sim.placement import DROP_HEIGHT, MAX_CONTACT_DEPTH
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE
 from lerobot_memobench.sim.simulation import Simulation
@@ -191,7 +191,7 @@ class DomainRandomisation:
         """Return the names of bodies, at the roots of their trees, that penetrate one another; a held one may."""
         model, data = self._sim.model, self._sim.data
         contact = data.contact
-        deep = contact.geom[contact.dist < -PENETRATION] if data.ncon else np.zeros((0, 2), np.int64)
+        deep = contact.geom[contact.dist < -MAX_CONTACT_DEPTH] if data.ncon else np.zeros((0, 2), np.int64)
         pairs = [{self._root(int(model.geom_bodyid[geom])) for geom in pair} for pair in deep]
         return {name for pair in pairs if pair != {held, ARM} for name in pair} - {"world", held}
 
@@ -246,7 +246,7 @@ def away(index: int) -> Array:
 def standing(asset: Asset, x: float, y: float, z: float, turn: Rotation) -> Array:
     """Return the pose (7,) of an object with a rotation whose lowest corner is at a height z, m."""
     corners = np.array(list(itertools.product(*zip(asset.low, asset.high, strict=True))))
-    return pose(np.array([x, y, z + GAP - turn.apply(corners)[:, 2].min()]), turn)
+    return pose(np.array([x, y, z + DROP_HEIGHT - turn.apply(corners)[:, 2].min()]), turn)
 
 
 def held(grasp: Grasp, position: Array, rotation: Array) -> Array:

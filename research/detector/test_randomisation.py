@@ -8,7 +8,7 @@ import pytest
 from lerobot_memobench.experts.hand import downward
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.placement import PENETRATION
+from lerobot_memobench.sim.placement import MAX_CONTACT_DEPTH
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector import randomisation
 from research.detector.labels import Labeller
@@ -46,7 +46,7 @@ def test_nothing_stands_in_anything() -> None:
             continue
         free += 1
         places.append([sim.body_pose(name)[0] for name in objects])
-        for pair in sim.data.contact.geom[sim.data.contact.dist < -PENETRATION]:
+        for pair in sim.data.contact.geom[sim.data.contact.dist < -MAX_CONTACT_DEPTH]:
             roots = {sim.model.body(sim.model.body_rootid[sim.model.geom_bodyid[geom]]).name for geom in pair}
             assert roots - set(objects) == {"robot0_base"}  # only what is held is touched, by the fingers
     assert free > 10

@@ -28,7 +28,7 @@ from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.evaluation.metrics import wilson
 from lerobot_memobench.experts.expert import Expert, plan_of
 from lerobot_memobench.experts.hand import OPEN, UP
-from lerobot_memobench.experts.travel import go_home, let_go
+from lerobot_memobench.experts.travel import go_home, release_fixture
 from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, NO_CLOCK, VALIDATION_SEED
 from lerobot_memobench.sim.assets.registry import split_class
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
@@ -329,7 +329,7 @@ def peek(by: float, seat: Seat) -> Motion:
     for drawer in sorted(seat.sim.world.joints):
         yield from pull(seat.expert, drawer, opened_to(seat.expert, drawer, 0.0) - by)
         seen = bool(seat.rows(_asked(seat)[1]))
-        yield from let_go(seat.expert.hand)
+        yield from release_fixture(seat.expert.hand)
         if seen:
             yield from _fetch(seat)
             return

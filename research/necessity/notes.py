@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.grasping import pick, put_on_region
 from lerobot_memobench.experts.hand import OPEN
-from lerobot_memobench.experts.travel import let_go
+from lerobot_memobench.experts.travel import release_fixture
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.task import Task
 
@@ -48,7 +48,7 @@ def pull(expert: Expert, name: str, to: float) -> Motion:
 def leave_ajar(expert: Expert, name: str, to: float) -> Motion:
     """Open a drawer, door or knob up to a position, m or rad, and let go of it."""
     yield from pull(expert, name, to)
-    yield from let_go(expert.hand)
+    yield from release_fixture(expert.hand)
 
 
 def shift(expert: Expert, name: str, by: float) -> Motion:

@@ -29,7 +29,7 @@ from lerobot_memobench.envs.observations import METADATA, action_space, observat
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
-from lerobot_memobench.sim.controller import MASS_BY_DATA
+from lerobot_memobench.sim.controller import FULLM_READS_DATA
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -139,7 +139,7 @@ def stock_robosuite(images: bool = True) -> Any:
     Raises:
         MemobenchError: its controllers do not run on this MuJoCo.
     """
-    if MASS_BY_DATA:
+    if FULLM_READS_DATA:
         raise MemobenchError(f"robosuite's controllers need MuJoCo before 3.10, found {mujoco.__version__}")
     os.environ["MUJOCO_GL"] = STOCK_GL
     logging.getLogger("robosuite_logs").setLevel(logging.ERROR)

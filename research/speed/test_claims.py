@@ -14,13 +14,13 @@ def test_unknown_benchmark() -> None:
 
 
 def test_stock_robosuite_needs_an_earlier_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sides, "MASS_BY_DATA", True)
+    monkeypatch.setattr(sides, "FULLM_READS_DATA", True)
     with pytest.raises(MemobenchError, match=r"need MuJoCo before 3\.10"):
         sides.stock_robosuite()
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sides.MASS_BY_DATA, reason="robosuite's controllers do not run on MuJoCo 3.10 or later")
+@pytest.mark.skipif(sides.FULLM_READS_DATA, reason="robosuite's controllers do not run on MuJoCo 3.10 or later")
 def test_step_beside_robosuite(gl: str) -> None:
     result = claims.step_with_images(rounds=1)
     assert result.ratio == pytest.approx(result.theirs / result.ours, rel=0.01)

@@ -9,8 +9,8 @@ import pytest
 
 from lerobot_memobench.experts.hand import (
     DOWN,
-    EASY_CLOSING,
-    LATE,
+    MAX_OPENING_STEPS,
+    NEUTRAL_CLOSING,
     OPEN,
     Hand,
     cross,
@@ -35,7 +35,7 @@ def test_small_vector_helpers_agree_with_numpy(rng: np.random.Generator) -> None
     np.testing.assert_array_equal(unit(np.zeros(3)), np.zeros(3))
 
 
-def test_frame_is_a_rotation_that_points_where_it_is_told(rng: np.random.Generator) -> None:
+def test_frame_is_a_rotation_along_the_given_axes(rng: np.random.Generator) -> None:
     for _ in range(20):
         approach, closing = rng.normal(size=(2, 3))
         turn = frame(approach, closing)
@@ -51,22 +51,22 @@ def test_downward_closes_along_the_angle_the_easy_way_round(yaw: float) -> None:
     turn = downward(float(yaw))
     np.testing.assert_allclose(turn[:, 2], DOWN, atol=1e-12)
     assert abs(turn[:, 0] @ [np.cos(yaw), np.sin(yaw), 0.0]) == pytest.approx(1.0)
-    assert turn[:, 0] @ EASY_CLOSING > -1e-9
+    assert turn[:, 0] @ NEUTRAL_CLOSING > -1e-9
 
 
-@pytest.mark.parametrize(("kept_shut", "most"), [(0, 3), (9, 12), (500, LATE)])
-def test_fingers_that_open_late_are_waited_for(
+@pytest.mark.parametrize(("kept_shut", "most"), [(0, 3), (9, 12), (500, MAX_OPENING_STEPS)])
+def test_late_opening_fingers_are_waited_for(
     kept_shut: int, most: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three steps in which they are told to open count; those in which something kept them shut do not."""
-    told = iter([1.0] * (kept_shut + 1) + [0.75, 0.5, 0.25])
+    """Three steps with an opening command count; steps in which the command stays closed do not."""
+    commands = iter([1.0] * (kept_shut + 1) + [0.75, 0.5, 0.25])
     sim = SimpleNamespace(eef_pose=lambda: (np.zeros(3), np.eye(3)), command=1.0)
     sim.gripper_command = lambda: sim.command
     monkeypatch.setattr(Hand, "toward", lambda self, position, rotation, gripper: np.full(7, gripper, np.float32))
     actions = []
-    next(told)
+    next(commands)
     for action in Hand(sim, rng).open(3):
         actions.append(action)
-        sim.command = next(told)
+        sim.command = next(commands)
     assert len(actions) == most
     assert {float(action[6]) for action in actions} == {OPEN}

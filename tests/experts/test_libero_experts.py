@@ -1,4 +1,4 @@
-"""The expert solves the published tasks in the paper's world, whose handles, grasps and floors are others."""
+"""The expert solves the published tasks in the paper's world, which has other handles, grasps and floors."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def test_solves_every_task_in_order_and_smoothly(name: str) -> None:
         "turn_on_the_stove_and_turn_it_off_near_the_shelf",
     ],
 )
-def test_things_stand_upright_on_their_underside(name: str) -> None:
-    """Milk and ketchup stand on their y axis; what an asset says of them holds as they stand."""
+def test_objects_are_upright_on_the_table(name: str) -> None:
+    """Milk and ketchup have their y axis up; asset frames have z up."""
     sim = simulate(name)
     sim.reset(SEED)
     for thing in sim.task.objects:

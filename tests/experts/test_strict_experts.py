@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.experts.expert import counts, plan_of
+from lerobot_memobench.experts.expert import counts_events, plan_of
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, parse_formula
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task
+from tests.experts.test_expert import play
 
 MICROWAVE = "open_and_close_the_microwave_a_given_number_of_times"
 BOWL = "check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer"
@@ -22,8 +22,6 @@ PAIR = "find_the_charger_or_the_cap_hidden_in_two_of_the_drawers"
 MILK = "put_only_the_milk_pointed_out_in_the_prompt_video_on_the_plate"
 WASTE_FIRST = "follow_the_prompt_to_determine_the_items,_discard_the_waste_first,_then_plate_the_remaining_item"
 WASTE = "discard_and_plate_strictly_as_demonstrated_in_the_prompt_video"
-SMOOTH = 0.25
-"""Largest change of an action's component from one step to the next."""
 
 
 def words(task: Task) -> list[str]:
@@ -47,7 +45,7 @@ def test_what_is_counted_twice_is_planned_once() -> None:
     once = ["exactly", 1, ["round", ["open", "d"], ["close", "d"]]]
     from_home = ["exactly", 1, ["round", ["handhome"], ["open", "d"], ["close", "d"]]]
     goal = parse_formula(["and", from_home, once])
-    assert counts(goal)
+    assert counts_events(goal)
     assert plan_of(goal) == [Atom("handhome", ()), Atom("open", ("d",)), Atom("close", ("d",))]
 
 
@@ -96,43 +94,23 @@ def follows(task: Task) -> bool:
     return progress.success
 
 
-def play(task: Task, seed: int) -> Episode:
-    """Let the expert act until the episode ends; check that it went as a demonstration must."""
-    episode = Episode(task)
-    episode.reset(seed)
-    actions = []
-    while not episode.done:
-        action = episode.expert_action()
-        if episode.phase == EXECUTION:
-            actions.append(action)
-        episode.step(action)
-    assert episode.success
-    assert None not in episode.progress.ordered_step
-    assert episode.prompt_shown is not False
-    assert np.abs(actions).max() <= 1.0
-    assert np.abs(np.diff(np.array(actions)[:, :6], axis=0)).max() <= SMOOTH
-    return episode
+BOWL_SLIPS, BEHIND_BOTTLE, HOLD_IN_PROMPT = (BOWL, 10_027), (MILK, 20_034), (WASTE, 20_043)
+"""Seeds of fixed failures: a bowl tipped by the grasp, a carton behind a bottle, a prompt that ended too early."""
 
 
 @pytest.mark.parametrize(("name", "variant"), [(MICROWAVE, 1), (DRAWERS, 5), (STOVE, 0), (CHARGER, 2)])
 def test_solves_a_task_of_each_family(name: str, variant: int) -> None:
-    play(get_task(name).variant(variant), 20_000)
+    assert not play(get_task(name).variant(variant), 20_000, prompt=True).faults
 
 
-def test_lets_go_of_a_bowl_that_tipped_as_it_was_grasped() -> None:
-    # It had slipped out of the fingers on its way, and fallen onto its side in the drawer.
-    play(get_task("check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer"), 10_027)
-
-
-def test_leans_over_what_keeps_it_from_reaching() -> None:
-    """The carton stands behind a bottle as tall: it had been reached for in vain, upright, until the end."""
-    assert play(get_task(MILK), 20_034).exec_steps < 500
-
-
-@pytest.mark.parametrize(("name", "seed"), [(WASTE, 20_043), pytest.param(WASTE_FIRST, 10_011, marks=pytest.mark.slow)])
-def test_a_prompt_goes_on_until_what_it_shows_has_held(name: str, seed: int) -> None:
-    """The plan had ended at the ninth of the ten steps for which the goal has to hold."""
-    assert play(get_task(name), seed).prompt_shown
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [BOWL_SLIPS, BEHIND_BOTTLE, HOLD_IN_PROMPT, pytest.param(WASTE_FIRST, 10_011, marks=pytest.mark.slow)],
+)
+def test_solves_seeds_that_once_failed(name: str, seed: int) -> None:
+    played = play(get_task(name), seed, prompt=True)
+    assert not played.faults
+    assert name != MILK or played.episode.exec_steps < 500, "it tried the unreachable low grasp repeatedly"
 
 
 def test_comes_home_between_events_and_does_not_rest_there() -> None:
@@ -155,11 +133,11 @@ def test_comes_home_between_events_and_does_not_rest_there() -> None:
 @pytest.mark.parametrize("name", task_names(suite="strict"))
 def test_solves_every_variant(name: str) -> None:
     base = get_task(name)
-    for k in range(base.num_variants):
-        play(base.variant(k), 20_000 + k)
+    faults = [play(base.variant(k), 20_000 + k, prompt=True).faults for k in range(base.num_variants)]
+    assert not any(faults)
 
 
 @pytest.mark.slow
-def test_two_hidings_fit_into_a_prompt() -> None:
-    for seed in range(20_000, 20_005):
-        assert play(get_task(PAIR), seed).prompt_shown
+@pytest.mark.parametrize("seed", range(20_000, 20_005))
+def test_two_hidings_fit_into_a_prompt(seed: int) -> None:
+    assert not play(get_task(PAIR), seed, prompt=True).faults

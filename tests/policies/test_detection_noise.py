@@ -19,7 +19,7 @@ from lerobot_memobench.policies.memobench_mem.detection_noise import (
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, ObjectEncoder
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
-from lerobot_memobench.sim.object_slots import classes, in_slots
+from lerobot_memobench.sim.object_slots import classes, fill_slots
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, made_for_training
 
@@ -32,7 +32,7 @@ def thing(name: str, place: tuple[float, float, float], axes: tuple[float, ...] 
 
 
 def scene(*things: list[float]) -> torch.Tensor:
-    return torch.from_numpy(in_slots(np.array(things))).reshape(1, SLOTS, WIDTH)
+    return torch.from_numpy(fill_slots(np.array(things))).reshape(1, SLOTS, WIDTH)
 
 
 TABLE = scene(

@@ -1,4 +1,4 @@
-"""Object observations hold what a camera sees now, without identity, and nothing is drawn for them."""
+"""Object observations contain visible things without identity, and need no rendering."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import object_slots, simulation
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS, WIDTH
-from lerobot_memobench.sim.object_slots import POINTS, QUANTUM, ObjectSlots, classes, layout
+from lerobot_memobench.sim.object_slots import POINTS_PER_THING, POSE_RESOLUTION, ObjectSlots, classes, layout
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
@@ -25,8 +25,8 @@ NINE = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
 DRAWERS = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 TOMATO, TOP = "beefsteak_tomato__1_1", "wooden_cabinet_1_top_region"
 
-ROUNDED = QUANTUM / 2 + 1e-6
-"""What a told pose may differ from the true one."""
+ROUNDED = POSE_RESOLUTION / 2 + 1e-6
+"""Largest rounding error of a pose."""
 
 
 def started(name: str, seed: int = 20_000) -> Simulation:
@@ -36,7 +36,7 @@ def started(name: str, seed: int = 20_000) -> Simulation:
 
 
 def table(sim: Simulation, slots: ObjectSlots | None = None) -> NDArray[np.float32]:
-    """The filled slots (n, WIDTH)."""
+    """Return the filled slots (n, WIDTH)."""
     found = (slots or ObjectSlots(sim)).observe().reshape(SLOTS, WIDTH)
     count = int(found[:, 0].sum())
     assert not found[count:].any()
@@ -64,26 +64,20 @@ def pull(sim: Simulation, region: str, q: float) -> None:
     mujoco.mj_forward(sim.model, sim.data)
 
 
-def test_the_layout_tells_how_to_read_it() -> None:
-    told = layout()
-    assert told["slots"] == SLOTS
-    starts = [(field["name"], field["start"], field["size"]) for field in told["fields"]]
+def test_the_layout_describes_the_observation(capsys: pytest.CaptureFixture[str]) -> None:
+    description = layout()
+    starts = [(field["name"], field["start"], field["size"]) for field in description["fields"]]
     assert [name for name, _, _ in starts] == list(FIELDS)
-    assert sum(size for _, _, size in starts) * SLOTS == SIZE
+    assert sum(size for _, _, size in starts) * description["slots"] == SIZE
     assert all(start == sum(size for _, _, size in starts[:k]) for k, (_, start, _) in enumerate(starts))
-    assert len(set(told["classes"])) == len(told["classes"])
-    assert {"drawer", "door", "knob", "butter", "wooden_cabinet"} <= set(told["classes"])
-
-
-def test_the_command_prints_the_layout(capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(set(description["classes"])) == len(description["classes"])
+    assert {"drawer", "door", "knob", "butter", "wooden_cabinet"} <= set(description["classes"])
     assert main(["objects", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == layout()
-    assert main(["objects"]) == 0
-    assert "16 slots" in capsys.readouterr().out
+    assert json.loads(capsys.readouterr().out) == description
 
 
 @pytest.mark.parametrize("name", task_names())
-def test_every_scene_fits_and_says_where_things_are(name: str) -> None:
+def test_every_scene_fits_with_correct_poses(name: str) -> None:
     sim = started(name)
     rows = table(sim)
     kinds = names(rows)
@@ -94,12 +88,14 @@ def test_every_scene_fits_and_says_where_things_are(name: str) -> None:
         if bodies:
             nearest = min(np.abs(sim.body_pose(asset.name)[0] - place).max() for asset in bodies)
             assert nearest < ROUNDED
-    np.testing.assert_allclose(np.linalg.norm(column(rows, "rotation").reshape(-1, 2, 3), axis=2), 1.0, atol=QUANTUM)
+    np.testing.assert_allclose(
+        np.linalg.norm(column(rows, "rotation").reshape(-1, 2, 3), axis=2), 1.0, atol=POSE_RESOLUTION
+    )
     assert not column(rows, "highlighted").any()
 
 
 def seen_pixels(sim: Simulation, name: str) -> int:
-    """Pixels of both cameras that change when an object is taken away; nothing throws shadows."""
+    """Return the pixels of both cameras that change without the object; there are no shadows."""
     pictures, state = [], sim.state()
     for _ in range(2):
         pictures.append(np.stack([sim.render(camera) for camera in MJCF_CAMERAS]))
@@ -109,7 +105,7 @@ def seen_pixels(sim: Simulation, name: str) -> int:
 
 
 @pytest.mark.parametrize("name", [pytest.param(NINE, marks=pytest.mark.slow), DRAWERS])
-def test_what_shows_many_pixels_is_there_and_what_shows_none_is_not(name: str) -> None:
+def test_visibility_agrees_with_pixels(name: str) -> None:
     episode = Episode(get_task(name), demonstration_prompt=False, render=RenderSettings(256, 256, "fast"))
     episode.reset(20_001)
     sim, other = episode.sim, Simulation(get_task(name), RenderSettings(256, 256, "fast"))
@@ -127,7 +123,7 @@ def test_what_shows_many_pixels_is_there_and_what_shows_none_is_not(name: str) -
             assert not there or count > 0, (step, asset)
 
 
-def test_what_is_in_a_shut_drawer_is_absent_and_shows_when_it_is_open() -> None:
+def test_hidden_things_are_absent() -> None:
     sim = started(DRAWERS)
     slots = ObjectSlots(sim)
     kind = sim.assets[TOMATO].class_name.partition("__")[0]
@@ -141,18 +137,12 @@ def test_what_is_in_a_shut_drawer_is_absent_and_shows_when_it_is_open() -> None:
     assert kind in names(rows)
     drawn = column(rows[[k for k, name in enumerate(names(rows)) if name == "drawer"]], "joint")
     assert np.abs(drawn - articulation.open_q).min() < ROUNDED
-
-
-def test_what_stands_behind_something_is_absent() -> None:
-    sim = started(DRAWERS)
-    slots = ObjectSlots(sim)
-    kind = sim.assets[TOMATO].class_name.partition("__")[0]
-    put(sim, TOMATO, np.array([-0.6, 0.0, 0.3]))  # below the table, where no camera looks
+    put(sim, TOMATO, np.array([-0.6, 0.0, 0.3]))  # below the table
     assert kind not in names(table(sim, slots))
 
 
-def test_points_tried_in_turn_answer_as_all_of_them_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The arm and the drawers hide parts of things in many ways while the expert is at work."""
+def test_batches_of_points_equal_all_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the expert acts, arm and drawers hide parts of things in many ways."""
     episode = Episode(get_task(DRAWERS))
     episode.reset(20_000)
     slots = ObjectSlots(episode.sim)
@@ -162,14 +152,14 @@ def test_points_tried_in_turn_answer_as_all_of_them_at_once(monkeypatch: pytest.
             episode.step(episode.expert_action())
         in_turn = slots.observe()
         with monkeypatch.context() as patch:
-            patch.setattr(object_slots, "TURNS", (slice(0, POINTS),))
+            patch.setattr(object_slots, "TURNS", (slice(0, POINTS_PER_THING),))
             np.testing.assert_array_equal(in_turn, slots.observe())
             patch.setattr(object_slots, "TURNS", (slice(0, 3),))
             partly += not np.array_equal(in_turn, slots.observe())
-    assert partly, "three points told as much as all; the scenes are too easy"
+    assert partly, "three points suffice; the scenes are too easy"
 
 
-def test_equal_things_may_change_places() -> None:
+def test_exchanging_equal_objects_changes_nothing() -> None:
     sim = started(NINE)
     slots = ObjectSlots(sim)
     before = slots.observe()
@@ -183,8 +173,8 @@ def test_equal_things_may_change_places() -> None:
     assert sim.body_pose(one)[0] @ sim.body_pose(one)[0] != pytest.approx(poses[0][:3] @ poses[0][:3])
 
 
-def test_nothing_but_the_present_counts() -> None:
-    """Neither how the state came about nor the goal: a variant of the task sees the same."""
+def test_observations_depend_on_the_present_state_only() -> None:
+    """Neither history nor goal matter: a variant of the task has the same observation."""
     task = get_task(NINE)
     sim, other = Simulation(task), Simulation(task.variant(3))
     sim.reset(20_000)
@@ -197,7 +187,7 @@ def test_nothing_but_the_present_counts() -> None:
     np.testing.assert_array_equal(slots.observe(), seen)
 
 
-def test_a_highlight_is_seen_on_what_stands_in_it() -> None:
+def test_a_highlight_marks_its_object() -> None:
     sim = started(NINE)
     chosen = next(name for name, asset in sim.assets.items() if asset.class_name == "butter")
     place = sim.body_pose(chosen)[0]
@@ -208,9 +198,9 @@ def test_a_highlight_is_seen_on_what_stands_in_it() -> None:
     np.testing.assert_allclose(column(lit, "position")[0], place, atol=ROUNDED)
 
 
-def test_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_image_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
-        raise AssertionError("a picture was asked for")
+        raise AssertionError("an image was rendered")
 
     monkeypatch.setattr(simulation, "get_renderer", refuse)
     assert table(started(NINE)).any()
@@ -218,12 +208,12 @@ def test_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_scene_with_more_things_than_slots_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(object_slots, "SLOTS", 5)
-    with pytest.raises(MemobenchError, match=r"10 objects and moving parts, more than the 5"):
+    with pytest.raises(MemobenchError, match=r"10 .* 5 slots"):
         ObjectSlots(started(NINE))
 
 
-def test_what_is_told_is_rounded_before_it_is_put_in_order() -> None:
-    """A nanometre, as between a drawer that holds something and an empty one, changes no bit and no slot's place."""
+def test_poses_are_rounded_before_sorting() -> None:
+    """A nanometre, the difference between a full and an empty drawer, changes no bit and no order."""
     sim = started(NINE)
     butters = [name for name, asset in sim.assets.items() if asset.class_name == "butter"]
     places = [sim.body_pose(name)[0] for name in butters]

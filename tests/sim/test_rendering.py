@@ -24,6 +24,8 @@ from lerobot_memobench.tasks.catalogue import get_task
 
 Simulate = Callable[..., Simulation]
 STOVE = "turn_on_the_stove_and_turn_it_off"
+MICROWAVE = "open_and_close_the_microwave"
+TOMATO = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
 
 
@@ -35,21 +37,6 @@ def difference(a: np.ndarray, b: np.ndarray) -> float:
 def turn_knob(sim: Simulation, q: float) -> None:
     sim.data.joint("flat_stove_1_button").qpos[0] = q
     mujoco.mj_step1(sim.model, sim.data)
-
-
-@pytest.mark.parametrize("camera", MJCF_CAMERAS)
-def test_frame(simulate: Simulate, camera: str) -> None:
-    frame = simulate().render(camera)
-    assert frame.shape == (256, 256, 3)
-    assert frame.dtype == np.uint8
-    assert frame.flags["C_CONTIGUOUS"]
-    assert frame.std() > 10
-
-
-def test_frame_is_upright(simulate: Simulate) -> None:
-    """The agentview camera sees the light table in the lower half and the dark wall in the upper."""
-    frame = simulate().render("agentview").astype(float).mean(axis=2)
-    assert frame[180:, :].mean() > frame[:60, :60].mean() + 40
 
 
 def test_things_are_seen_where_the_camera_maths_says(simulate: Simulate) -> None:
@@ -84,33 +71,16 @@ def test_frame_depends_on_the_state_alone(simulate: Simulate) -> None:
         np.testing.assert_array_equal(first[camera], again[camera])
 
 
-def test_two_renderers_take_turns(simulate: Simulate) -> None:
-    sims = [simulate(name) for name in (STOVE, BOWLS)]
-    alone = []
-    for sim in sims:
-        alone.append(sim.render())
-        rendering._thread.renderers.clear()
-    for _ in range(3):
-        for sim, expected in zip(sims, alone, strict=True):
-            np.testing.assert_array_equal(sim.render(), expected)
-
-
-def test_more_scenes_than_renderers() -> None:
-    names = [
-        STOVE,
-        BOWLS,
-        "open_and_close_the_microwave",
-        "put_the_tomato_into_the_top_drawer_of_the_cabinet",
-        "check_all_three_drawers_of_the_cabinet",
-    ]
-    sims = [Simulation(get_task(name)) for name in names]
+def test_more_scenes_than_renderers_take_turns() -> None:
+    names = [STOVE, BOWLS, MICROWAVE, TOMATO, "check_all_three_drawers_of_the_cabinet"]
+    sims = [Simulation(get_task(name), RenderSettings(64, 64)) for name in names]
     assert len(sims) > rendering.CACHED_RENDERERS
     for sim in sims:
         sim.reset(7)
     first = [sim.render() for sim in sims]
     for sim, expected in zip(sims, first, strict=True):
         np.testing.assert_array_equal(sim.render(), expected)
-    assert len(rendering._thread.renderers) == rendering.CACHED_RENDERERS
+    assert len(rendering._cache.renderers) == rendering.CACHED_RENDERERS
 
 
 @pytest.mark.parametrize("quality", ["default", "high"])
@@ -121,7 +91,7 @@ def test_threads_have_renderers_of_their_own(simulate: Simulate, quality: str) -
     frames: list[np.ndarray] = []
 
     def draw() -> None:
-        mine = Simulation(get_task("put_the_tomato_into_the_top_drawer_of_the_cabinet"), sim.render_settings)
+        mine = Simulation(get_task(TOMATO), sim.render_settings)
         mine.reset(7)
         frames.extend(mine.render() for _ in range(5))
 
@@ -135,33 +105,6 @@ def test_threads_have_renderers_of_their_own(simulate: Simulate, quality: str) -
     assert len(frames) == 15
     for frame in frames:
         np.testing.assert_array_equal(frame, expected)
-
-
-_FORK = """
-import os, sys
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.catalogue import get_task
-sim = Simulation(get_task(sys.argv[1]), RenderSettings(quality=sys.argv[2]))
-sim.reset(7)
-child = os.fork()  # before anything is drawn: both may draw
-expected = sim.render()
-if child:
-    assert os.waitpid(child, 0)[1] == 0
-    child = os.fork()
-    if child:
-        assert os.waitpid(child, 0)[1] == 0
-    else:
-        os._exit(0 if (sim.render() == expected).all() else 1)
-"""
-
-
-@pytest.mark.parametrize("quality", ["default", "high"])
-def test_a_fork_draws_the_same_before_and_after_a_frame(quality: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", _FORK, STOVE, quality], capture_output=True, text=True, timeout=120
-    )
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_qualities(simulate: Simulate) -> None:
@@ -263,39 +206,48 @@ def test_high_draws_the_whole_arm(
     assert off["default"] > 3 * off["high"]
 
 
-def test_unknown_camera(simulate: Simulate) -> None:
-    with pytest.raises(MemobenchError, match="there is no camera 'agentwiev'; did you mean 'agentview'"):
+def test_invalid_settings_are_errors(simulate: Simulate) -> None:
+    with pytest.raises(MemobenchError, match=r"'agentwiev'.*'agentview'"):
         simulate().render("agentwiev")
-
-
-def test_unknown_quality() -> None:
-    with pytest.raises(MemobenchError, match="render quality 'hihg' is unknown; did you mean 'high'"):
+    with pytest.raises(MemobenchError, match=r"'hihg'.*'high'"):
         RenderSettings(quality="hihg")
-
-
-def test_sizes_below_one() -> None:
-    with pytest.raises(MemobenchError, match="0×256 pixels cannot be drawn"):
+    with pytest.raises(MemobenchError, match="0×256"):
         RenderSettings(height=0)
 
 
 _FRAME = """
-import hashlib, sys
+import hashlib, os, sys
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
+
+def show():
+    print(hashlib.sha256(sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest(), flush=True)
+
 sim = Simulation(get_task(sys.argv[1]), RenderSettings(quality=sys.argv[2]))
 sim.reset(7)
-print(hashlib.sha256(sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest(), "OpenGL.GL" in sys.modules)
+for _ in range(int(sys.argv[3])):  # fork before and after a frame
+    child = os.fork()
+    show()
+    if not child:
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+show()
+print("OpenGL.GL" in sys.modules)
 """
 
 
-def frame_hash(quality: str, **variables: str) -> tuple[str, str]:
-    environment = {**os.environ, **variables}
+def frame_hashes(quality: str, forks: int = 0, **variables: str) -> list[str]:
+    """Return the hashes of frames drawn by a new process and its forks, and whether OpenGL was loaded."""
     done = subprocess.run(
-        [sys.executable, "-c", _FRAME, STOVE, quality], env=environment, capture_output=True, text=True, timeout=500
+        [sys.executable, "-W", "ignore", "-c", _FRAME, STOVE, quality, str(forks)],
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=500,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout, done.stderr
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout.split()
 
 
 def own_hash(quality: str) -> str:
@@ -306,14 +258,13 @@ def own_hash(quality: str) -> str:
 
 @pytest.mark.parametrize("quality", ["default", "high"])
 def test_frames_are_equal_in_every_process_without_gl(quality: str) -> None:
-    """Whatever the number of threads; MUJOCO_GL names what is not there."""
+    """Independent of threads, forks and MUJOCO_GL."""
     variables = {"OMP_NUM_THREADS": "3", "NUMBA_NUM_THREADS": "2", "MUJOCO_GL": "glfw", "DISPLAY": ""}
-    assert frame_hash(quality, **variables) == (f"{own_hash(quality)} False\n", "")
+    assert frame_hashes(quality, 2, **variables) == [own_hash(quality)] * 5 + ["False"]
 
 
 @pytest.mark.slow
-def test_default_frames_are_equal_on_another_processor(tmp_path: Path) -> None:
-    """Compiled for one without the vector instructions of this one, and without optimisation."""
-    for variables in ({"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, {"NUMBA_OPT": "0"}):
-        found, _ = frame_hash("default", NUMBA_CACHE_DIR=str(tmp_path / "_".join(variables)), **variables)
-        assert found == f"{own_hash('default')} False\n"
+@pytest.mark.parametrize("variables", [{"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, {"NUMBA_OPT": "0"}])
+def test_default_frames_are_equal_on_another_processor(variables: dict[str, str], tmp_path: Path) -> None:
+    """Compiled without this processor's vector instructions, and without optimisation."""
+    assert frame_hashes("default", NUMBA_CACHE_DIR=str(tmp_path), **variables) == [own_hash("default"), "False"]

@@ -1,4 +1,4 @@
-"""The arm is robosuite's, of one version, byte for byte."""
+"""The arm equals robosuite 1.4.1 byte for byte."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lerobot_memobench.sim import robot
 
 
 @pytest.mark.parametrize("found", [None, "1.4.0"])
-def test_another_robosuite_is_told_what_to_type(monkeypatch: pytest.MonkeyPatch, found: str | None) -> None:
+def test_another_robosuite_names_the_install_command(monkeypatch: pytest.MonkeyPatch, found: str | None) -> None:
     def version(name: str) -> str:
         if found is None:
             raise metadata.PackageNotFoundError(name)
@@ -24,7 +24,7 @@ def test_another_robosuite_is_told_what_to_type(monkeypatch: pytest.MonkeyPatch,
         robot.robot_spec()
 
 
-def test_an_arm_that_was_changed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_modified_arm_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     xml = robot._robosuite_xml()
     assert robot.arm_hash(xml) == robot.ARM_SHA256
     monkeypatch.setattr(robot, "_robosuite_xml", lambda: xml.replace('mass="', 'mass="1', 1))
@@ -32,7 +32,7 @@ def test_an_arm_that_was_changed_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
         robot._build()
 
 
-def test_the_folder_of_the_arm_does_not_count_but_its_meshes_do(tmp_path: Path) -> None:
+def test_the_arms_hash_covers_meshes_but_not_folders(tmp_path: Path) -> None:
     hashes = set()
     for folder, mesh in (("a", b"1"), ("b", b"1"), ("c", b"2")):
         (tmp_path / folder).mkdir()

@@ -1,4 +1,4 @@
-"""Strict scenes: what is nearly closed goes back to where it began, what rolls comes to rest; published scenes stay."""
+"""Strict scenes: nearly closed joints return to their start, rolling objects stop; published scenes are unchanged."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def left_at(name: str, thing: str, q: float, steps: int = 20) -> tuple[float, fl
         pytest.param(KNOB, 0.03, id="knob a little on"),
     ],
 )
-def test_what_is_nearly_closed_goes_back_to_where_it_began(place: tuple[str, str], q: float) -> None:
+def test_nearly_closed_joints_return_to_their_start(place: tuple[str, str], q: float) -> None:
     start, now = left_at(*place, q)
     assert abs(now - start) < AT_REST
 
 
 @pytest.mark.parametrize(("place", "q"), [(DRAWER, -0.03), (DRAWER, -0.15), (DOOR, -0.2), (KNOB, 0.32), (KNOB, 0.6)])
-def test_what_stands_open_stays_where_it_was_left(place: tuple[str, str], q: float) -> None:
+def test_open_joints_stay(place: tuple[str, str], q: float) -> None:
     assert abs(left_at(*place, q)[1] - q) < 1e-4
 
 
@@ -103,7 +103,7 @@ def rolled(task: str, name: str) -> tuple[float, float]:
     return float(np.linalg.norm(joint.qpos[:2] - start)), float(np.linalg.norm(joint.qvel[:3]))
 
 
-def test_what_rolls_in_a_published_scene_stops_in_a_strict_one() -> None:
+def test_rolling_objects_stop_in_strict_scenes() -> None:
     far, fast = rolled(PUBLISHED, "artichoke_1")
     near, slow = rolled(STRICT, "artichoke_1")
     assert fast > 0.02, "in the published scene it still rolls"

@@ -1,4 +1,4 @@
-"""Predicates on states made by hand: each threshold from both sides."""
+"""Predicates on constructed states: each threshold from both sides."""
 
 from __future__ import annotations
 
@@ -61,14 +61,6 @@ def test_joints_have_the_published_thresholds(
     assert not holds(sim, predicate, name)
 
 
-def test_drawers_are_told_apart(simulate: Simulate) -> None:
-    sim = simulate()
-    turn(sim, f"{CABINET}_middle_level", -0.15)
-    assert holds(sim, "open", f"{CABINET}_middle_region")
-    assert not holds(sim, "open", f"{CABINET}_top_region")
-    assert holds(sim, "close", f"{CABINET}_top_region")
-
-
 def test_in_is_the_site_box_with_a_relaxed_floor(simulate: Simulate) -> None:
     sim = simulate()
     region = f"{CABINET}_top_region"
@@ -89,19 +81,14 @@ def test_in_is_the_site_box_with_a_relaxed_floor(simulate: Simulate) -> None:
     for under, inside in [(0.0099, True), (0.0101, False)]:
         put(sim, TOMATO, centre - frame @ np.array([0, 0, half[2] + under]))
         assert holds(sim, "in", TOMATO, region) is inside, under
-
-
-def test_in_moves_with_the_drawer(simulate: Simulate) -> None:
-    sim = simulate()
-    region = f"{CABINET}_top_region"
-    turn(sim, f"{CABINET}_top_level", -0.15)
-    put(sim, TOMATO, sim.site_pose(region)[0])
-    assert holds(sim, "in", TOMATO, region)
+    put(sim, TOMATO, centre)
     turn(sim, f"{CABINET}_top_level", 0.005)
-    assert not holds(sim, "in", TOMATO, region)
+    assert not holds(sim, "in", TOMATO, region), "the region moves with the drawer"
+    assert holds(sim, "close", region)
+    assert not holds(sim, "open", f"{CABINET}_middle_region")
 
 
-def test_on_an_object_wants_contact_height_and_nearness(simulate: Simulate) -> None:
+def test_on_an_object_needs_contact_height_and_distance(simulate: Simulate) -> None:
     sim = simulate(BOWLS)
     bowl, _ = sim.body_pose("bowl_left")
     inside = sim.assets["bowl_left"].supports - sim.assets["butter_1"].bottom
@@ -115,7 +102,7 @@ def test_on_an_object_wants_contact_height_and_nearness(simulate: Simulate) -> N
     assert not holds(sim, "on", "butter_1", "bowl_left"), "3.1 cm beside the bowl's middle"
 
 
-def test_on_a_site_wants_contact_with_its_fixture(simulate: Simulate) -> None:
+def test_on_a_site_needs_contact_with_its_fixture(simulate: Simulate) -> None:
     sim = simulate(STOVE)
     region, pan = "flat_stove_1_cook_region", "chefmate_8_frypan_1"
     centre, _ = sim.site_pose(region)
@@ -141,22 +128,21 @@ def test_on_a_region_of_the_table(simulate: Simulate) -> None:
 
 
 @pytest.mark.parametrize(
-    ("atom", "words"),
+    ("atom", "fragment"),
     [
-        (Atom("in", ("no_such_thing", "wooden_cabinet_1_top_region")), "no object or fixture 'no_such_thing'"),
-        (Atom("in", (TOMATO, "wooden_cabinet_1_attic_region")), "no region 'wooden_cabinet_1_attic_region'"),
+        (Atom("in", ("no_such_thing", "wooden_cabinet_1_top_region")), "'no_such_thing'"),
+        (Atom("in", (TOMATO, "wooden_cabinet_1_attic_region")), "'wooden_cabinet_1_attic_region'"),
         (Atom("open", (TOMATO,)), "cannot be opened"),
-        (Atom("turnon", ("wooden_cabinet_1_top_region",)), "'turnon' has no meaning"),
-        (Atom("wasopen", ("wooden_cabinet_1_top_region",)), "cannot answer 'wasopen'"),
+        (Atom("turnon", ("wooden_cabinet_1_top_region",)), "'turnon'"),
+        (Atom("wasopen", ("wooden_cabinet_1_top_region",)), "'wasopen'"),
     ],
 )
-def test_wrong_atoms_are_told_in_one_sentence(simulate: Simulate, atom: Atom, words: str) -> None:
-    with pytest.raises(MemobenchError, match=words) as caught:
+def test_invalid_atoms_are_errors(simulate: Simulate, atom: Atom, fragment: str) -> None:
+    with pytest.raises(MemobenchError, match=fragment):
         simulate().holds(atom)
-    assert "\n" not in str(caught.value)
 
 
-# --- compared with how the episode, and its execution, began: is the hand home, is a thing in its place? ---
+# --- predicates relative to the start of the execution ---
 
 TASK, BOWL = "open_and_close_the_microwave_a_given_number_of_times", "white_bowl_1"
 HOME, IN_PLACE = Atom("handhome", ()), Atom("inplace", (BOWL,))
@@ -178,20 +164,20 @@ def act(sim: Simulation, steps: int, **values: float) -> None:
         sim.step(action)
 
 
-def test_home_is_where_the_hand_settled_and_stays_home_at_rest(sim: Simulation) -> None:
-    for _ in range(60):
-        assert sim.holds(HOME)
+@pytest.mark.parametrize("move", [{"x": 0.2}, {"z": 0.5}, {"rz": 0.5}, {"grip": 1.0}])
+def test_a_moved_rotated_or_closed_hand_is_not_home(sim: Simulation, move: dict[str, float]) -> None:
+    start = sim.snapshot()
+    for _ in range(20):
+        assert sim.holds(HOME), "a resting hand stays home"
         act(sim, 1)
-
-
-@pytest.mark.parametrize("move", [{"x": 0.5}, {"z": 0.5}, {"rz": 0.5}, {"grip": 1.0}])
-def test_a_hand_that_is_moved_turned_or_shut_is_not_home(sim: Simulation, move: dict[str, float]) -> None:
     act(sim, 15, **move)
     assert not sim.holds(HOME)
+    sim.restore(start)
+    assert sim.holds(HOME)
 
 
 def arm(sim: Simulation) -> bytes:
-    """What the arm could carry on: joints, fingers, their speeds, what the controller holds."""
+    """Return the bits of the arm's state: joints, fingers, velocities, controller."""
     kept = sim.snapshot()
     parts = (sim.data.qpos[:9], sim.data.qvel[:9], kept.goal_position, kept.goal_rotation, kept.gripper)
     return b"".join(part.tobytes() for part in parts)
@@ -200,8 +186,8 @@ def arm(sim: Simulation) -> bytes:
 @pytest.mark.parametrize(
     "move", [{}, {"x": 0.25}, {"y": -0.2, "z": 0.2}, {"rx": 0.15}, {"y": 0.2, "rz": -0.1}, {"z": 0.2, "grip": 1.0}]
 )
-def test_a_hand_that_rests_near_home_stands_as_at_first_to_the_bit(sim: Simulation, move: dict[str, float]) -> None:
-    """No policy can leave itself a note in where, or how, it stands at home."""
+def test_a_hand_that_rests_near_home_is_restored_to_the_bit(sim: Simulation, move: dict[str, float]) -> None:
+    """A policy cannot store information in its pose at home."""
     first = arm(sim)
     act(sim, 3, **move)
     assert (arm(sim) == first) == (not move)
@@ -224,21 +210,16 @@ def test_a_hand_that_passes_or_rests_farther_away_is_not_home(sim: Simulation) -
         assert not sim.holds(HOME)
 
 
-def test_who_leaves_home_in_the_very_first_step_was_there(sim: Simulation) -> None:
+def test_a_hand_that_leaves_home_in_a_step_was_home(sim: Simulation) -> None:
     states = [sim.state()]
     for expected in (True, False):
         act(sim, 1, x=1.0)
         assert sim.holds(HOME) == expected
         states.append(sim.state())
     sim.set_state(states[0])
-    for state, expected in zip(states[1:], (True, False), strict=True):  # and so where states are read from a file
+    for state, expected in zip(states[1:], (True, False), strict=True):  # also for states from a file
         sim.set_state(state)
         assert sim.holds(HOME) == expected
-
-
-def test_a_small_action_leaves_home(sim: Simulation) -> None:
-    act(sim, 3, x=0.2)
-    assert not sim.holds(HOME)
 
 
 def test_published_scenes_have_no_detent() -> None:
@@ -249,30 +230,14 @@ def test_published_scenes_have_no_detent() -> None:
     assert np.linalg.norm(sim.eef_pose()[0] - sim.home[0]) > 0.005
 
 
-def test_home_again_after_coming_back(sim: Simulation) -> None:
-    start = sim.snapshot()
-    act(sim, 15, x=0.5)
-    sim.restore(start)
-    assert sim.holds(HOME)
-    sim.reset(20_001)
-    assert sim.holds(HOME)
-
-
-def test_a_thing_is_in_its_place_up_to_the_stated_distance(sim: Simulation) -> None:
+def test_an_object_is_in_place_up_to_the_stated_distance_from_the_start_of_the_execution(sim: Simulation) -> None:
     joint = sim.data.joint(f"{BOWL}_joint0")
+    state = sim.state()
     for shift, expected in ((0.9 * PLACE_DISTANCE, True), (1.1 * PLACE_DISTANCE, False)):
-        state = sim.state()
+        sim.set_state(state)
         joint.qpos[1] += shift
         sim.set_state(sim.state())
         assert sim.holds(IN_PLACE) == expected
-        sim.set_state(state)
-    assert sim.holds(IN_PLACE)
-
-
-def test_places_are_those_at_the_beginning_of_the_execution(sim: Simulation) -> None:
-    sim.data.joint(f"{BOWL}_joint0").qpos[1] += 0.1
-    sim.set_state(sim.state())
-    assert not sim.holds(IN_PLACE)
     sim.begin_execution()
     assert sim.holds(IN_PLACE)
     assert sim.holds(HOME)

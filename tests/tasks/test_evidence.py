@@ -1,11 +1,11 @@
-"""A scene with each of its variants: which one was chosen, and how often a policy is right without the past."""
+"""Chosen variants and chance levels of evidence episodes."""
 
 from __future__ import annotations
 
 import pytest
 
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evidence import Choice, chance, handled, scene_and_variant
+from lerobot_memobench.tasks.evidence import Choice, chance, handled_atoms, scene_and_variant
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import SUITES
 
@@ -48,40 +48,40 @@ def test_chance_is_that_of_the_best_answer_without_the_past() -> None:
     assert chance(get_task(TWO)) == 1 / 3, "where the other thing lies changes nothing"
     assert chance(get_task(STOVE)) is None, "the instruction says how often"
     tasks = [get_task(name) for suite in SUITES for name in task_names(suite=suite)]
-    told = [rate for task in tasks if task.num_variants > 1 and (rate := chance(task)) is not None]
-    assert len(told) == 30
-    assert all(0.1 < rate <= 0.5 for rate in told)
+    rates = [rate for task in tasks if task.num_variants > 1 and (rate := chance(task)) is not None]
+    assert len(rates) == 30
+    assert all(0.1 < rate <= 0.5 for rate in rates)
 
 
 @pytest.mark.parametrize("variant", [0, 1, 2])
-def test_the_choice_is_what_was_acted_on_first_whatever_was_asked_for(variant: int) -> None:
+def test_the_first_action_decides_whatever_is_requested(variant: int) -> None:
     middle = on("butter_1", "bowl_mid")
     assert chosen(BOWL, variant, set(), {middle}) == 1
     assert chosen(BOWL, variant, set()) is None
 
 
-def test_a_second_answer_does_not_mend_the_first() -> None:
+def test_a_second_answer_does_not_correct_the_first() -> None:
     fake, target = on("fake_milk_1", "plate_1"), on("target_milk", "plate_1")
     assert chosen(PUBLISHED_MILK, 0, {fake}, {fake, target}) == 1
 
 
-def test_a_drawer_that_was_opened_is_a_choice_though_nothing_came_of_it() -> None:
+def test_an_opened_drawer_is_a_choice() -> None:
     assert chosen(TOMATO, 0, {drawer("middle")}) == 1
     assert chosen(TOMATO, 1, {drawer("middle")}) == 1, "the right one, and the hand failed"
-    assert chosen(TOMATO, 0, {drawer("middle")}, {drawer("top")}) == 1, "a second one does not mend the first"
+    assert chosen(TOMATO, 0, {drawer("middle")}, {drawer("top")}) == 1, "a second one does not correct the first"
 
 
 @pytest.mark.parametrize("variant", [0, 1])
-def test_an_object_that_was_lifted_is_a_choice(variant: int) -> None:
+def test_a_lifted_object_is_a_choice(variant: int) -> None:
     assert chosen(PUBLISHED_MILK, variant, {lifted("fake_milk_1")}, {lifted("target_milk")}) == 1
 
 
 def test_an_answer_may_be_none_of_the_variants() -> None:
-    order = [lifted(atom.args[0]) for atom in handled(get_task(STACK).variant(0))]
+    order = [lifted(atom.args[0]) for atom in handled_atoms(get_task(STACK).variant(0))]
     choice = Choice(get_task(STACK).variant(0))
     assert not choice.answered
     for atom in (order[1], order[1], order[0]):
-        choice.step(lambda asked, atom=atom: asked == atom)
+        choice.step(lambda other, atom=atom: other == atom)
     assert choice.answered
 
 

@@ -1,86 +1,109 @@
-"""Formulas: walked through, renamed, and read from JSON."""
+"""Formulas: traverse, rename, format, and parse from JSON."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.formula import (
     MAX_DEPTH,
     And,
     Atom,
+    Exactly,
+    Formula,
+    Hold,
+    Never,
     Not,
     Or,
+    Round,
     Then,
+    When,
     atoms,
     format_formula,
     parse_formula,
     rename,
+    to_lists,
 )
 
-A, B, C = Atom("on", ("a", "p")), Atom("on", ("b", "p")), Atom("open", ("d",))
+A, B, C = Atom("on", ("a", "p")), Atom("open", ("d",)), Atom("handhome", ())
+LATCH, IN_PLACE = Atom("wasopen", ("d",)), Atom("inplace", ("a",))
+NUMBERS = st.integers(1, 4)
 
 
-def test_rename_is_simultaneous() -> None:
-    assert rename(And((A, Not(B))), {"a": "b", "b": "a"}) == And((B, Not(A)))
-    assert [atom.args[0] for atom in atoms(Then((A, Or((B, Not(A))))))] == ["a", "b", "a"]
-
-
-def test_parse_reads_lists_and_objects_in_any_case() -> None:
-    expected = And((A, Not(Or((B, C))), Then((Atom("wasturnedon", ("s",)), Atom("turnoff", ("s",))))))
-    lists = [
-        "AND",
-        ["On", "a", "p"],
-        ["Not", ["or", ["ON", "b", "p"], ["Open", "d"]]],
-        ["Then", ["WasTurnedon", "s"], ["Turnoff", "s"]],
-    ]
-    mixed = {
-        "and": [
-            ["on", "a", "p"],
-            {"not": {"or": [["on", "b", "p"], ["open", "d"]]}},
-            {"THEN": [["wasTurnedOn", "s"], ["turnoff", "s"]]},
-        ]
-    }
-    assert parse_formula(lists) == parse_formula(mixed) == expected
-    assert format_formula(expected) == (
-        "(And (On a p) (Not (Or (On b p) (Open d))) (Then (WasTurnedOn s) (TurnOff s)))"
+def _operators(inner: st.SearchStrategy[Formula]) -> st.SearchStrategy[Formula]:
+    several = st.lists(inner, min_size=1, max_size=3).map(tuple)
+    return st.one_of(
+        *(several.map(kind) for kind in (And, Or, Then, Round)),
+        *(inner.map(kind) for kind in (Not, Never)),
+        *(st.builds(kind, NUMBERS, inner) for kind in (Hold, Exactly)),
+        st.tuples(inner, inner).map(When),
     )
 
 
+FORMULAS = st.recursive(st.sampled_from([A, B, C, LATCH, IN_PLACE]), _operators, max_leaves=8)
+
+
+def as_objects(formula: Formula) -> Any:
+    """Return a formula in JSON objects, with bare atoms as lists."""
+    head, *rest = to_lists(formula)
+    return [head, *rest] if isinstance(formula, Atom) else {head.upper(): rest}
+
+
+@given(FORMULAS)
+def test_json_forms_are_equal_and_round_trip(formula: Formula) -> None:
+    assert parse_formula(to_lists(formula)) == parse_formula(as_objects(formula)) == formula
+    words = format_formula(formula).replace("(", " ").replace(")", " ").lower().split()
+    assert words == str(to_lists(formula)).replace("[", " ").replace("]", " ").replace(",", "").replace("'", "").split()
+
+
+def test_rename_is_simultaneous() -> None:
+    other = Atom("on", ("b", "p"))
+    assert rename(And((A, Not(other))), {"a": "b", "b": "a"}) == And((other, Not(A)))
+    assert rename(Exactly(2, A), {"a": "b"}) == Exactly(2, other)
+    assert [atom.args[0] for atom in atoms(Then((A, Or((other, Not(A))))))] == ["a", "b", "a"]
+
+
 def test_operator_over_a_bare_atom() -> None:
-    assert parse_formula({"not": ["on", "a", "p"]}) == parse_formula({"not": [["on", "a", "p"]]}) == Not(A)
+    assert parse_formula({"not": ["on", "a", "p"]}) == parse_formula({"not": [["On", "a", "p"]]}) == Not(A)
     assert parse_formula({"and": ["on", "a", "p"]}) == And((A,))
 
 
 @pytest.mark.parametrize(
-    ("value", "words"),
+    ("value", "fragment"),
     [
-        (["onn", "a", "b"], "unknown predicate or operator 'onn'"),
-        (["on", "a"], "expected 2 entity"),
-        (["open", "a", "b"], "expected 1 entity"),
+        (["onn", "a", "b"], "'onn'"),
+        (["on", "a"], "expected 2"),
+        (["open", "a", "b"], "expected 1"),
+        (["handhome", "a"], "expected 0"),
         (["on", "a", "a"], "twice"),
         (["and"], "nothing in it"),
-        ({"or": []}, "nothing in it"),
+        (["exactly", 2], "nothing in it"),
         (["not", ["open", "a"], ["open", "b"]], "exactly one"),
+        (["hold", 2, ["open", "d"], ["open", "d"]], "exactly one"),
+        (["when", ["open", "d"]], "exactly two"),
+        (["exactly", ["open", "d"]], "without a number"),
+        (["exactly", 0, ["open", "d"]], "found 0 after"),
+        (["hold", True, ["open", "d"]], "found True after"),
+        (["hold", "3", ["open", "d"]], "found '3' after"),
+        (["and", 2, ["open", "d"]], "found 2, expected a formula"),
         ({"and": [], "or": []}, "2 keys"),
         ({"on": ["a", "b"]}, "the key 'on'"),
-        ({"and": "open"}, "expected a list of formulas"),
-        ({"and": 3}, "expected a list of formulas"),
-        (["on", "a", ["b"]], "expected an entity name"),
-        (["on", "a", ""], "expected an entity name"),
+        ({"and": "open"}, "a list of formulas"),
+        (["on", "a", ["b"]], "an entity name"),
+        (["on", "a", ""], "an entity name"),
         ("open a", "expected a formula"),
-        ([], "expected a formula"),
         ([["on", "a", "b"]], "expected a formula"),
         (None, "expected a formula"),
-        (7, "expected a formula"),
     ],
 )
-def test_malformed_formula_is_one_clear_error(value: Any, words: str) -> None:
+def test_malformed_formula_is_one_clear_error(value: Any, fragment: str) -> None:
     with pytest.raises(MemobenchError, match=r"^here: found ") as error:
         parse_formula(value, "here")
-    assert words in str(error.value)
+    assert fragment in str(error.value)
     assert "\n" not in str(error.value)
 
 

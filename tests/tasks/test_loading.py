@@ -70,10 +70,10 @@ def test_referent_is_the_object_that_has_siblings(write_task: Write, bddl: str, 
     assert prompt == Prompt("routine", "cup_2")
 
 
-# --- what is missing or malformed ---
+# --- missing or malformed files ---
 
 
-def test_missing_metadata_tells_file_and_content(write_task: Write, bddl: str) -> None:
+def test_missing_metadata_names_file_and_content(write_task: Write, bddl: str) -> None:
     folder = write_task(bddl, None)
     with pytest.raises(MemobenchError) as error:
         load_task(folder)

@@ -1,4 +1,4 @@
-"""The thirty strict tasks: whole, in the published scenes, and each goal reached by its own routine only."""
+"""The thirty strict tasks: complete, in published scenes, each goal reached by its own routine only."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_strict_task_for_each_published_one() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_strict_task_stands_in_the_published_scene(name: str) -> None:
+def test_a_strict_task_uses_the_published_scene(name: str) -> None:
     task = get_task(name)
     published = get_task(str(task.derived_from))
     assert (task.suite, suite_of(name), task.drawn) == (STRICT, STRICT, True)
@@ -90,7 +90,7 @@ def test_variants_are_complete_and_different(name: str) -> None:
             assert len(coarse) <= len(intermediate) + 12
             assert len(intermediate) < len(fine)
         said = [checkpoint.language for checkpoint in task.checkpoints]
-        assert len(set(said)) == len(said), "two checkpoints say the same"
+        assert len(set(said)) == len(said), "two checkpoints share a text"
     assert len({task.demo_summary for task in found}) == len(found) or get_task(name).family == "two_hidden_things"
 
 
@@ -99,27 +99,27 @@ def test_the_folders_are_what_the_script_writes() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_a_suite_knows_its_own_tasks_only() -> None:
+def test_a_suite_resolves_its_own_tasks_only() -> None:
     published = task_names()[0]
     assert resolve_tasks("all", STRICT) == NAMES
     assert resolve_tasks("object,temporal", STRICT) == task_names("object", STRICT) + task_names("temporal", STRICT)
     assert resolve_tasks(NAMES[3], STRICT) == [NAMES[3]]
-    with pytest.raises(MemobenchError, match="is a task of the strict suite; say suite=strict, or --suite strict"):
+    with pytest.raises(MemobenchError, match="suite=strict"):
         resolve_tasks(NAMES[3])
-    with pytest.raises(MemobenchError, match="is a task of the published suite; say suite=published"):
+    with pytest.raises(MemobenchError, match="suite=published"):
         resolve_tasks(f"object,{published}", STRICT)
     with pytest.raises(MemobenchError, match=r"suite is 'strikt'.*strict"):
         task_names(suite="strikt")
     assert suite_of("a_task_of_mine") is None
 
 
-def test_a_record_tells_suite_and_origin() -> None:
-    told = task_record(get_task(NAMES[0]), 71)
-    assert (told["suite"], told["derived_from"]) == (STRICT, get_task(NAMES[0]).derived_from)
+def test_a_record_has_suite_and_origin() -> None:
+    record = task_record(get_task(NAMES[0]), 71)
+    assert (record["suite"], record["derived_from"]) == (STRICT, get_task(NAMES[0]).derived_from)
     assert not {"suite", "derived_from"} & set(task_record(get_task(task_names()[0]), 71))
 
 
-# --- the instruction names the draw ---
+# --- the instruction states the drawn variant ---
 
 
 def numbers(formula: Formula) -> set[int]:
@@ -135,7 +135,7 @@ def test_counting_asks_for_the_number_in_its_instruction(name: str) -> None:
         assert TIMES[number - 1] in task.checkpoints[-1].language[1]
 
 
-def test_the_drawers_are_asked_for_in_every_order() -> None:
+def test_the_drawers_are_requested_in_every_order() -> None:
     orders = set()
     for task in variants("check_all_three_drawers_once_each_in_the_given_order"):
         said = tuple(sorted(DRAWERS, key=task.language.index))
@@ -147,7 +147,7 @@ def test_the_drawers_are_asked_for_in_every_order() -> None:
 
 
 @pytest.mark.parametrize("name", of_family("hidden_thing", "two_hidden_things"))
-def test_a_hiding_shows_where_the_thing_asked_for_is(name: str) -> None:
+def test_a_hiding_shows_the_requested_object(name: str) -> None:
     draws = Counter()
     for task in variants(name):
         (on_table,) = [atom for atom in atoms(task.goal) if atom.predicate == "on"]
@@ -163,11 +163,11 @@ def test_a_hiding_shows_where_the_thing_asked_for_is(name: str) -> None:
     assert len(draws) == 3 * len(task.prompt.places)
 
 
-# --- goals against routines, on paper ---
+# --- goals and routines without physics ---
 
 
 class Table:
-    """What holds in a scene on paper, step by step."""
+    """True atoms of an abstract scene, step by step."""
 
     def __init__(self, task: Task) -> None:
         self.true = {HOME, *(Atom("inplace", (thing,)) for thing in task.objects)}
@@ -179,7 +179,7 @@ class Table:
         self.stay(2)
 
     def stay(self, steps: int = 12) -> None:
-        """Let so many steps pass."""
+        """Append a number of equal steps."""
         ends = {"close": "open", "turnoff": "turnon"}
         joints = {atom.args for atom in self.start if atom.predicate in ends}
         ajar = {args for args in joints if not any(Atom(p, args) in self.true for pair in ends.items() for p in pair)}
@@ -224,7 +224,7 @@ class Table:
 
 DOOR, SWITCH = ("open", "close"), ("turnon", "turnoff")
 OTHERS = {"close": "turnoff", "turnoff": "close", "open": "turnon", "turnon": "open"}
-"""Every joint is closed and off at the start of a `Table`, whichever it is."""
+"""Each joint of a `Table` starts both closed and off, regardless of its kind."""
 
 
 def play(task: Task, steps: list[set[Atom]]) -> Progress:
@@ -237,16 +237,16 @@ def play(task: Task, steps: list[set[Atom]]) -> Progress:
 
 
 def fixture_of(task: Task) -> tuple[str, tuple[str, str]]:
-    """What a counting task counts."""
+    """Return the counted fixture of a counting task and its predicates."""
     atom = next(a for a in atoms(task.goal) if a.predicate in ("open", "turnon"))
     return atom.args[0], DOOR if atom.predicate == "open" else SWITCH
 
 
 @pytest.mark.parametrize("name", of_family("counting"))
-@pytest.mark.parametrize("asked", [1, 2, 3])
+@pytest.mark.parametrize("number", [1, 2, 3])
 @pytest.mark.parametrize("done", [0, 1, 2, 3, 4])
-def test_only_the_asked_number_and_then_rest(name: str, asked: int, done: int) -> None:
-    task = variants(name)[asked - 1]
+def test_only_the_requested_number_and_then_rest(name: str, number: int, done: int) -> None:
+    task = variants(name)[number - 1]
     table = Table(task)
     for _ in range(done):
         table.use(*fixture_of(task))
@@ -254,11 +254,11 @@ def test_only_the_asked_number_and_then_rest(name: str, asked: int, done: int) -
     end = len(table.steps)
     table.home(60)
     progress = play(task, table.steps)
-    assert (progress.success, progress.lost) == (done == asked, done != asked)
+    assert (progress.success, progress.lost) == (done == number, done != number)
     assert progress.success is False or progress.steps - end > 36, "success came before the rest"
     failure = classify_failure(task, progress.first_step, progress.success, lost=progress.lost)
-    assert failure == (None if done == asked else "miscount")
-    if done == asked:
+    assert failure == (None if done == number else "miscount")
+    if done == number:
         assert None not in progress.ordered_step
 
 
@@ -301,7 +301,7 @@ def test_a_joint_between_its_ends_loses_at_home(name: str) -> None:
 
 
 def orderings() -> Iterator[tuple[Task, list[Callable[[Table], None]]]]:
-    """Each ordering task's variants with the routine that they ask for."""
+    """Yield the variants of each ordering task with the requested routine."""
 
     def drawer(which: str) -> Callable[[Table], None]:
         return lambda table: table.use(f"wooden_cabinet_1_{which}_region", DOOR)
@@ -380,7 +380,7 @@ def test_only_the_right_drawer_leads_to_the_hidden_thing(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", of_family("only_referent", "strict_procedure"))
-def test_what_another_video_shows_cannot_be_mended(name: str) -> None:
+def test_following_another_video_cannot_be_corrected(name: str) -> None:
     def moves(task: Task) -> list[Atom]:
         return [atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)]
 

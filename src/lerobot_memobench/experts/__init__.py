@@ -1,1 +1,1 @@
-"""Scripted experts: closed-loop motions, plans from goals and checkpoints, prompts from plans."""
+"""Scripted experts: closed-loop motions, plans derived from goals and checkpoints, demonstration prompts."""

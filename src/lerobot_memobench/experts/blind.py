@@ -1,4 +1,4 @@
-"""A routine without a memory: the published task's, again and again, whatever was shown or is asked."""
+"""A baseline without memory: repeat the published task's routine, regardless of prompt and instruction."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from lerobot_memobench.tasks.task import Task
 
 
 def blind_routine(task: Task, sim: Simulation, rng: np.random.Generator) -> Steps:
-    """Carry out a published task's goal, come home and begin anew, for ever.
+    """Reach a published task's goal, return home and repeat, forever.
 
-    Nothing is carried over from one round to the next, so it cannot count, and it knows neither what was hidden nor
-    what was pointed at.
+    No state is kept between rounds, so the routine cannot count, and it ignores hidden and indicated objects.
 
     Args:
-        task: the published task; of a strict one the task it is derived from.
-        sim: the running scene; where its hand is at the first action is home.
-        rng: source of small variation.
+        task: published task; for a strict task the one it is derived from.
+        sim: running simulation; the hand's pose at the first action is home.
+        rng: random source of small variations.
     """
     home = sim.eef_pose()
     while True:

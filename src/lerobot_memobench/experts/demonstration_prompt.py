@@ -1,6 +1,6 @@
-"""Demonstration prompts, acted out by the arm.
+"""Generate the actions of demonstration prompts.
 
-The episode that plays one restores the scene exactly afterwards, but for what was hidden; here it only has to be shown.
+The episode restores the scene exactly after a prompt, except for hidden objects.
 """
 
 from __future__ import annotations
@@ -13,29 +13,29 @@ from numpy.typing import NDArray
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.grasping import pick, put_at
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand, Steps
-from lerobot_memobench.experts.travel import HOME, go_home, pointing
+from lerobot_memobench.experts.travel import HAND_HOME, go_home, pointing
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
-PAUSE = 8
-"""Still frames before and after, so that the demonstration prompt has a first and a last picture."""
+PAUSE_STEPS = 8
+"""Steps at rest before and after a prompt, so that it has a first and a last frame."""
 HIGHLIGHT_STEPS = 50
-BRISK = 1.25
-"""How much faster than at work the hand hides things: two of them fit into a demonstration prompt."""
+HIDING_SPEED_FACTOR = 1.25
+"""Speed factor while hiding objects, so that two hidings fit into a prompt."""
 
 
 class PromptDemonstrator:
     """Play one demonstration prompt.
 
     Args:
-        task: the episode's task, a variant of the published one where the referent is random.
-        sim: the running scene, at the episode's initial state.
-        rng: source of small variation.
+        task: task of the episode, a variant if the referent is random.
+        sim: running simulation in the episode's initial state.
+        rng: random source of small variations.
 
     Attributes:
-        shown: whether the last run showed what it had to, e.g. the goal of the routine really came about.
+        shown: whether the last prompt succeeded, for example whether a routine reached its goal.
     """
 
     def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
@@ -45,10 +45,10 @@ class PromptDemonstrator:
         self.shown = False
 
     def actions(self) -> Iterator[NDArray[np.float32]]:
-        """Yield the demonstrator's actions (7,), one per control step."""
+        """Yield the actions (7,) of the prompt, one per control step."""
         hand = Hand(self._sim, self._rng)
         position, rotation = self._sim.eef_pose()
-        yield from hand.wait(PAUSE, OPEN)
+        yield from hand.wait(PAUSE_STEPS, OPEN)
         match self._prompt.kind:
             case "routine":
                 yield from self._routine(position, rotation)
@@ -62,7 +62,7 @@ class PromptDemonstrator:
                 yield from self._hide()
                 return
         yield from go_home(hand, position, rotation)
-        yield from hand.wait(PAUSE, OPEN)
+        yield from hand.wait(PAUSE_STEPS, OPEN)
 
     def _referent(self) -> str:
         assert self._prompt.target is not None
@@ -76,25 +76,25 @@ class PromptDemonstrator:
         yield from go_home(expert.hand, position, rotation)
 
     def _hide(self) -> Steps:
-        """Put each thing into its drawer and shut that, then come home; shown if all are out of sight."""
+        """Put each object into its drawer, close the drawer, and return home; shown if all objects are hidden."""
         expert = Expert(self._task, self._sim, self._rng)
-        expert.hand.speed = min(1.0, BRISK * expert.hand.speed)
+        expert.hand.speed = min(1.0, HIDING_SPEED_FACTOR * expert.hand.speed)
         hidden = [
             atom
             for thing, drawer in self._prompt.places
             for atom in (Atom("in", (thing, drawer)), Atom("close", (drawer,)))
         ]
-        for atom in (*hidden, HOME):
+        for atom in (*hidden, HAND_HOME):
             yield from expert.achieve(atom)
-        yield from expert.hand.wait(PAUSE, OPEN)
-        self.shown = all(self._sim.holds(atom) for atom in (*hidden, HOME))
+        yield from expert.hand.wait(PAUSE_STEPS, OPEN)
+        self.shown = all(self._sim.holds(atom) for atom in (*hidden, HAND_HOME))
 
     def _pick(self, hand: Hand) -> Steps:
         place, turned = self._sim.asset_pose(self._referent())
         held = yield from pick(hand, self._referent())
         if held is not None:
             self.shown = True
-            yield from hand.wait(PAUSE, CLOSED)
+            yield from hand.wait(PAUSE_STEPS, CLOSED)
             yield from put_at(hand, held, place, turned)
 
     def _point(self, hand: Hand) -> Steps:
@@ -105,29 +105,29 @@ class PromptDemonstrator:
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.015)
         for height in (0.0, 0.05, 0.0):
             yield from hand.move(above + height * UP, rotation, CLOSED, tolerance=0.008, speed=0.6, timeout=60)
-        yield from hand.wait(PAUSE, CLOSED)
+        yield from hand.wait(PAUSE_STEPS, CLOSED)
         self.shown = bool(np.linalg.norm((hand.position - place)[:2]) < 0.03)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.02)
 
     def _highlight(self, hand: Hand) -> Steps:
-        self._sim.highlights = highlights_at(self._task, self._sim, PAUSE)
+        self._sim.highlights = highlights_at(self._task, self._sim, PAUSE_STEPS)
         self.shown = True
         yield from hand.wait(HIGHLIGHT_STEPS, OPEN)
         self._sim.highlights = ()
 
 
 def highlights_at(task: Task, sim: Simulation, frame: int) -> tuple[Highlight, ...]:
-    """Return what is highlighted at a frame of a task's demonstration prompt, where things stand in ``sim``."""
+    """Return the highlights at a frame of a task's demonstration prompt, at the present poses in ``sim``."""
     prompt = task.prompt
     if prompt is None or prompt.kind != "highlight" or prompt.target is None:
         return ()
-    if not PAUSE <= frame < PAUSE + HIGHLIGHT_STEPS:
+    if not PAUSE_STEPS <= frame < PAUSE_STEPS + HIGHLIGHT_STEPS:
         return ()
     return (highlight_of(sim, prompt.target),)
 
 
 def highlight_of(sim: Simulation, name: str) -> Highlight:
-    """Return the highlight of the place where a thing stands."""
+    """Return a highlight below an object."""
     asset, (place, _) = sim.assets[name], sim.asset_pose(name)
     spot = (float(place[0]), float(place[1]), float(place[2] + asset.bottom + 0.002))
     return Highlight(spot, asset.radius + 0.035)

@@ -1,6 +1,6 @@
-"""The expert: a plan made from the task's checkpoints and goal, carried out and checked.
+"""Solve tasks: derive a plan from checkpoints and goal, execute it and verify the result.
 
-A goal that counts events or asks for their order is its own plan (`plan_of`): what to do, how often, when to come home.
+For goals that count or order events, `plan_of` derives the plan from the goal: events, repetitions, returns home.
 """
 
 from __future__ import annotations
@@ -17,13 +17,19 @@ from lerobot_memobench.experts.fixtures import (
     close_drawer,
     open_door,
     open_drawer,
-    pull_open,
-    push_shut,
+    sweep_door_open,
+    sweep_door_shut,
     turn_knob,
 )
 from lerobot_memobench.experts.grasping import pick, put_in_drawer, put_on, put_on_region
 from lerobot_memobench.experts.hand import OPEN, UP, Hand, Steps
-from lerobot_memobench.experts.travel import come_home, drawer_around, outward_of, region_box, stands_out
+from lerobot_memobench.experts.travel import (
+    come_home,
+    drawer_containing,
+    opening_direction,
+    protrudes_from_drawer,
+    region_box,
+)
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import (
@@ -44,26 +50,26 @@ from lerobot_memobench.tasks.formula import (
 from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import STRICT, Task
 
-TRIES = 3
-"""How often a thing is picked up and placed, or a step taken, before the plan goes on without it."""
-LINGER = 10
-"""Control steps for which it stays at home between two events: who learns from a hand that turns there in a single step
-learns to turn short of it."""
-REPAIRS = 3
-"""How often the goal is gone through again when something in it does not hold at the end."""
+MAX_TRIES = 3
+"""Attempts at placing an object or executing a step before the plan continues without it."""
+HOME_REST_STEPS = 10
+"""Control steps at home between two events. Policies trained on a hand that turns around at home within one step learn
+to turn around before they reach it."""
+MAX_REPAIRS = 3
+"""Passes over the goal's atoms that do not hold at the end."""
 Step = Atom | Hold
-"""An atom to bring about, or a rest: a `Hold` whose child is so already."""
+"""An atom to achieve, or a rest: a `Hold` whose child is already true."""
 
-_NOT_BROUGHT_ABOUT = ("inplace", "ajar", "lifted")
-"""Predicates that an expert leaves alone."""
-_HOME = ("handhome", "asbegun")
-"""Predicates that an expert brings about by coming home."""
+_PASSIVE_PREDICATES = ("inplace", "ajar", "lifted")
+"""Predicates without a motion."""
+_HOME_PREDICATES = ("handhome", "asbegun")
+"""Predicates achieved by returning home."""
 
 
 def steps_of(formula: Formula) -> list[Atom]:
-    """Return the atoms to bring about, in order. What must not be (`Not`) is nothing to do; of an `Or` the first.
+    """Return the atoms to achieve, in order; skip negations and take the first alternative of an `Or`.
 
-    How often something is to be done is not in here: see `plan_of`.
+    Repetitions are not represented, see `plan_of`.
     """
     match formula:
         case Atom():
@@ -72,35 +78,35 @@ def steps_of(formula: Formula) -> list[Atom]:
             return []
         case Or(parts):
             return steps_of(parts[0])
-        case When((moment, then)):
-            return [*steps_of(then), *steps_of(moment)]
+        case When((condition, outcome)):
+            return [*steps_of(outcome), *steps_of(condition)]
     return [atom for part in children(formula) for atom in steps_of(part)]
 
 
-def rest_of(formula: Formula) -> int:
-    """Return for how many steps at most a goal's atoms have to hold until it does: each operator waits for its own."""
+def hold_steps_of(formula: Formula) -> int:
+    """Return the maximum number of steps for which a goal's atoms must hold, summed over nested operators."""
     own = formula.number if isinstance(formula, Hold) else HOLD_STEPS if isinstance(formula, Then) else 0
-    return own + max((rest_of(child) for child in children(formula)), default=0)
+    return own + max((hold_steps_of(child) for child in children(formula)), default=0)
 
 
-def counts(formula: Formula) -> bool:
-    """Return whether a formula asks how often something has come about."""
-    return isinstance(formula, Exactly) or any(counts(child) for child in children(formula))
+def counts_events(formula: Formula) -> bool:
+    """Return whether a formula counts events."""
+    return isinstance(formula, Exactly) or any(counts_events(child) for child in children(formula))
 
 
 def plan_of(formula: Formula) -> list[Step]:
     """Return the steps that make a formula true, in order.
 
-    What the parts of an ``And`` have in common is done once: counting the rounds that began at home, and counting
-    all rounds, is one counting.
+    Steps shared by parts of an ``And`` are planned once, for example if one part counts all rounds and another the
+    rounds that begin at home.
     """
     match formula:
         case Atom():
-            return [] if formula.predicate in _NOT_BROUGHT_ABOUT else [formula]
+            return [] if formula.predicate in _PASSIVE_PREDICATES else [formula]
         case Not() | Never():
             return []
         case And(parts):
-            return _together([plan_of(part) for part in sorted(parts, key=_rank)])
+            return _merge_plans([plan_of(part) for part in sorted(parts, key=_rank)])
         case Or(parts):
             return plan_of(parts[0])
         case Then(parts) | Round(parts):
@@ -109,98 +115,99 @@ def plan_of(formula: Formula) -> list[Step]:
             return plan_of(child) * number
         case Hold(child=child):
             return [*plan_of(child), formula]
-        case When((moment, then)):
-            return [*plan_of(then), *plan_of(moment)]
+        case When((condition, outcome)):
+            return [*plan_of(outcome), *plan_of(condition)]
     raise TypeError(f"not a formula: {formula!r}")
 
 
 def _rank(formula: Formula) -> int:
-    """What has to be so before another thing is begun goes first; where things belong goes before what is shut."""
+    """Return the planning order of a part: preconditions (`When`), then placements, then the rest (closing)."""
     places = isinstance(formula, Atom) and formula.predicate in ("in", "on")
     return 0 if isinstance(formula, When) else 1 if places else 2
 
 
-def _together(plans: list[list[Step]]) -> list[Step]:
-    """Return one plan that holds all of them, each step that two have in common once."""
+def _merge_plans(plans: list[list[Step]]) -> list[Step]:
+    """Return one plan that contains all plans, with shared steps once."""
     whole: list[Step] = []
     for plan in plans:
-        if not _within(plan, whole):
+        if not _is_subsequence(plan, whole):
             common = next(n for n in range(len(plan), -1, -1) if n == 0 or whole[-n:] == plan[:n])
             whole += plan[common:]
     return whole
 
 
-def _within(plan: list[Step], whole: list[Step]) -> bool:
-    """Return whether all steps of a plan occur in another, in order."""
+def _is_subsequence(plan: list[Step], whole: list[Step]) -> bool:
+    """Return whether the steps of a plan occur in another plan, in order."""
     left = iter(whole)
     return all(step in left for step in plan)
 
 
 class Expert:
-    """Solve a task by its checkpoints, in order, then by whatever of the goal is still open.
+    """Solve a task: achieve its checkpoints in order, then the goal's remaining atoms.
 
-    A goal that counts events is its own plan: what is true of the present does not tell what has been done.
-
-    It looks into the simulator, as a demonstrator with perfect sight would, and says one action per control step.
+    A goal that counts events defines the plan itself, because the present state does not show past events. The expert
+    reads the simulator state and returns one action per control step.
 
     Args:
-        task: goal and checkpoints.
-        sim: the running scene.
-        rng: source of small variation in speed, grasp and approach.
+        task: task with goal and checkpoints.
+        sim: running simulation.
+        rng: random source of small variations in speed, grasp and approach.
 
     Attributes:
-        done: nothing is left to do: the goal holds, or the plan has come to its end. Asked on, it goes on with what it
-            was at: who learns from it cannot see the moment at which the goal comes to hold.
-        succeeded: the goal held when the expert was last asked.
-        hand: the arm it moves.
+        done: whether the goal holds or the plan has ended. `act` may still be called and continues the present motion,
+            because policies trained on it cannot observe the step in which the goal becomes true.
+        succeeded: whether the goal held at the last call of `act`.
+        hand: controlled arm.
     """
 
     def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
         self.task, self.sim = task, sim
         self.hand = Hand(sim, rng)
-        self._watch = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
+        self._evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
         self._started = False
-        self._doing = self._plan()
+        self._motion = self._plan()
         self.done = self.succeeded = False
 
     def act(self) -> NDArray[np.float32]:
-        """Return the action (7,) for the present state; coming to rest with open fingers once the plan is done.
+        """Return the action (7,) for the present state; after the plan come to rest with open fingers.
 
-        Ask once per control step: each call moves the plan on.
+        Call once per control step: each call advances the plan.
         """
         if self._started:
-            # Latches and order are followed here too: what an atom says now does not tell whether a goal is reached.
-            self.succeeded, *_ = self._watch.step(self.sim.holds)
+            # Track latches and order: present atoms alone do not determine the goal.
+            self.succeeded, *_ = self._evaluator.step(self.sim.holds)
             self.done = self.done or self.succeeded
         self._started = True
         try:
-            return np.clip(next(self._doing), -1.0, 1.0)
+            return np.clip(next(self._motion), -1.0, 1.0)
         except StopIteration:
             self.done = True
         return self.hand.rest(OPEN)
 
     def _plan(self) -> Steps:
-        if counts(self.task.goal):
+        if counts_events(self.task.goal):
             for step in plan_of(self.task.goal):
-                yield from self._take(step)
+                yield from self._run_step(step)
             return
         for checkpoint in self.task.checkpoints:
             for atom in steps_of(checkpoint.goal):
                 yield from self.achieve(atom)
-        for _ in range(REPAIRS):
+        for _ in range(MAX_REPAIRS):
             missing = [atom for atom in steps_of(self.task.goal) if not self._holds(atom)]
             if not missing:
                 break
             for atom in missing:
                 yield from self.achieve(atom)
-        for _ in range(rest_of(self.task.goal)):
+        for _ in range(hold_steps_of(self.task.goal)):
             yield self.hand.rest(OPEN)
 
-    def _take(self, step: Step) -> Steps:
-        """Bring an atom about, or rest at home."""
-        rest = step.number if isinstance(step, Hold) else LINGER * (step.predicate in _HOME and not self._holds(step))
-        if isinstance(step, Atom):
-            for _ in range(TRIES):  # the count would be short of what is gone on without
+    def _run_step(self, step: Step) -> Steps:
+        """Achieve an atom, or rest at home."""
+        if isinstance(step, Hold):
+            rest = step.number
+        else:
+            rest = HOME_REST_STEPS if step.predicate in _HOME_PREDICATES and not self._holds(step) else 0
+            for _ in range(MAX_TRIES):  # a skipped step would make the count wrong
                 yield from self.achieve(step)
                 if self._holds(step):
                     break
@@ -209,11 +216,11 @@ class Expert:
 
     def _holds(self, atom: Atom) -> bool:
         if atom.predicate in LATCHES:
-            return atom in self._watch.latched
+            return atom in self._evaluator.latched
         return self.sim.holds(atom)
 
     def achieve(self, atom: Atom) -> Steps:
-        """Bring one atom about, unless it is already so."""
+        """Achieve one atom unless it already holds."""
         if self._holds(atom):
             return
         match atom.predicate, atom.args:
@@ -228,34 +235,34 @@ class Expert:
             case "turnoff", (name,):
                 yield from turn_knob(self.hand, name, on=False)
             case "in", (name, region):
-                yield from self._bring(atom, lambda: self._put_in(name, region))
+                yield from self._place_until_holds(atom, lambda: self._put_in(name, region))
             case "on", (name, support):
-                yield from self._bring(atom, lambda: self._put_on(name, support))
+                yield from self._place_until_holds(atom, lambda: self._put_on(name, support))
             case _:
                 raise MemobenchError(f"the expert has no motion for {atom}")
 
-    def _bring(self, atom: Atom, once: Callable[[], Steps]) -> Steps:
-        """Pick and place until it holds: a thing may slip on the way, or come to lean on a drawer's wall."""
-        for _ in range(TRIES):
+    def _place_until_holds(self, atom: Atom, once: Callable[[], Steps]) -> Steps:
+        """Pick and place until the atom holds: an object may slip, or lean on a drawer's wall."""
+        for _ in range(MAX_TRIES):
             yield from once()
-            if self._holds(atom) and not (atom.predicate == "in" and stands_out(self.hand, *atom.args)):
+            if self._holds(atom) and not (atom.predicate == "in" and protrudes_from_drawer(self.hand, *atom.args)):
                 return
 
     def _put_on(self, name: str, support: str) -> Steps:
         on_object = support in self.sim.assets
-        middle = self.sim.asset_pose(support)[0] if on_object else self._middle_of(support)
+        middle = self.sim.asset_pose(support)[0] if on_object else self._region_top(support)
         place = middle - self.sim.assets[name].bottom * UP
-        drawer = drawer_around(self.hand, name)
+        drawer = drawer_containing(self.hand, name)
         if drawer is not None:
             yield from self.achieve(Atom("open", (drawer,)))
         held = yield from pick(self.hand, name, place=place)
         if held is not None and on_object:
             yield from put_on(self.hand, held, support)
         elif held is not None:
-            yield from put_on_region(self.hand, held, self._middle_of(support))
+            yield from put_on_region(self.hand, held, self._region_top(support))
 
-    def _middle_of(self, region: str) -> NDArray[np.float64]:
-        """The middle of a region's upper face, (3,), m."""
+    def _region_top(self, region: str) -> NDArray[np.float64]:
+        """Return the centre (3,) of a region's upper face, m."""
         declared = self.task.regions.get(region)
         if declared is not None and declared.target == TABLE:
             x1, y1, x2, y2 = declared.ranges[0]
@@ -264,11 +271,11 @@ class Expert:
         return centre + rotation @ np.array([0.0, 0.0, half[2]])
 
     def _open(self, name: str) -> Steps:
-        door = pull_open if self.task.suite == STRICT else open_door
+        door = sweep_door_open if self.task.suite == STRICT else open_door
         return (door if self._is_door(name) else open_drawer)(self.hand, name)
 
     def _close(self, name: str) -> Steps:
-        door = push_shut if self.task.suite == STRICT else close_door
+        door = sweep_door_shut if self.task.suite == STRICT else close_door
         return (door if self._is_door(name) else close_drawer)(self.hand, name)
 
     def _is_door(self, name: str) -> bool:
@@ -282,12 +289,14 @@ class Expert:
             if part in asset.articulations
         ]
         if region not in drawers:
-            known = nearest(region, drawers) if drawers else "the scene has no drawer, let a policy of your own do it"
-            raise MemobenchError(f"the expert puts things into drawers only, and {region!r} is none; {known}")
+            known = nearest(region, drawers) if drawers else "the scene has no drawer; use another policy"
+            raise MemobenchError(
+                f"the expert places objects into drawers only, and {region!r} is not a drawer; {known}"
+            )
         articulation, q = self.sim.world.articulation(region)
         if q > articulation.open_below:
             yield from self._open(region)
-        out = outward_of(self.hand, articulation)
+        out = opening_direction(self.hand, articulation)
         held = yield from pick(self.hand, name, avoid=out)
         if held is not None:
             yield from put_in_drawer(self.hand, held, region, out)

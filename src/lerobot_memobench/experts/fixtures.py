@@ -1,4 +1,4 @@
-"""Fixtures: pull and push drawers by their handles, turn knobs, open and shut hinged doors."""
+"""Operate fixtures: pull and push drawers, turn knobs, open and close hinged doors."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.experts.grasping import ATTEMPTS, HOVER
+from lerobot_memobench.experts.grasping import HOVER_HEIGHT, MAX_ATTEMPTS
 from lerobot_memobench.experts.hand import (
     CLOSED,
     DOWN,
-    EASY_CLOSING,
+    MAX_STRETCH,
+    NEUTRAL_CLOSING,
     OPEN,
-    STRETCHED,
     UP,
     Array,
     Hand,
@@ -28,106 +28,114 @@ from lerobot_memobench.experts.hand import (
     unit,
 )
 from lerobot_memobench.experts.travel import (
-    FULLY_OPEN,
-    LOST,
-    far,
-    leaning,
-    let_go,
-    outward_of,
-    pressed,
+    DROP_DISTANCE,
+    OPEN_WIDTH,
+    distance_from_base,
+    leaned_rotation,
+    opening_direction,
     reach_lean,
+    release_fixture,
     rise,
+    sustained,
 )
 from lerobot_memobench.sim.assets.asset import Articulation
 
-TILT = np.radians(35)
-"""How far the hand points down when it takes a handle: enough for the flange to clear the table."""
-SKEW, SKEW_TILT = np.radians(40), np.radians(24)
-"""How far the hand is rolled to take a bar that is longer than its fingers open, one above and one below it, and how
-far it then points down: upright or steeper it would touch the table under the lowest drawer, or the handle above."""
-
-REACH = 0.72
-"""Distance from the arm's foot up to which a hand that points down moves freely, m."""
+HANDLE_TILT = np.radians(35)
+"""Downward tilt of the hand at a handle: the flange clears the table, rad."""
+WIDE_HANDLE_ROLL, WIDE_HANDLE_TILT = np.radians(40), np.radians(24)
+"""Roll and downward tilt of the hand at a bar that is longer than the open fingers, rad. With another tilt the hand
+would touch the table below the lowest drawer, or the handle above."""
+DOWNWARD_REACH = 0.72
+"""Distance from the arm's base up to which a downward hand moves freely, m."""
 DOOR_THICKNESS = 0.02
-EDGE_INSET, EDGE_DEPTH = 0.012, 0.018
-"""Where a door's upper edge is taken: so far from the handle towards the hinge and so deep, m."""
+DOOR_EDGE_INSET, DOOR_EDGE_DEPTH = 0.012, 0.018
+"""Grasp on a door's upper edge: distance from the handle towards the hinge, and depth, m."""
 SWING_LEAD = 0.13
 """Angle by which the hand leads a door along its arc, rad."""
-EASE = 0.04
-"""The same where the door is as far open as it should be, rad: a hand that arrives fast throws the door on, out of
-reach."""
-FREE_EASE = 0.015
-"""The same for a door that nothing but damping stops, rad."""
+SWING_END_LEAD = 0.04
+"""Lead at the end of the swing, rad; a faster hand would throw the door out of reach."""
+FREE_SWING_END_LEAD = 0.015
+"""Lead at the end of the swing of a door without friction, rad."""
 PUSH_GAP = 0.06
-"""Distance in front of a handle from which the closed fingers come to push it, m."""
+"""Distance of the closed fingers in front of a handle before pushing, m."""
+HANDLE_GRIP_DEPTH = 0.018
+"""Depth of the grasp below a handle's upper end, m."""
 
-LEAD = 0.16
-"""Angle by which the hand leads a door along its arc, rad."""
-GRIP_BELOW = 0.018
-"""How far under a handle's upper end it is taken, m."""
-PUSH_IN, PUSH_BELOW = 0.045, 0.030
-"""Where a door is pushed: beside the handle towards the hinge by so much, and so far below its upper edge, m."""
-BEFORE, TOUCHING = 0.06, 0.018
-"""Distance of the hand from the panel's middle before and while it pushes, m."""
-STEPS = 150
-"""Control steps after which a pull or push is given up."""
+SWEEP_LEAD = 0.16
+"""Angle by which the hand leads a door in one sweep, rad."""
+PANEL_PUSH_INSET, PANEL_PUSH_DEPTH = 0.045, 0.030
+"""Contact point for pushing a door: distance from the handle towards the hinge, and depth below the upper edge, m."""
+PANEL_APPROACH_GAP, PANEL_CONTACT_GAP = 0.06, 0.018
+"""Distance of the hand from the panel's centre plane before and during the push, m."""
+MAX_SWEEP_STEPS = 150
+"""Maximum number of control steps of a sweep."""
+
+
+def _joint_position(hand: Hand, name: str) -> float:
+    """Return the present position of a drawer, door or knob, m or rad."""
+    return hand.sim.world.articulation(name)[1]
+
+
+def _closing_sign(direction: Array) -> float:
+    """Return the sign that turns a closing direction (3,) towards the neutral one of the last joint."""
+    return float(np.sign(direction @ NEUTRAL_CLOSING) or 1.0)
 
 
 # --- drawers and knobs ---
 
 
-def _at_handle(hand: Hand, articulation: Articulation, tilt: float) -> tuple[Array, Array, Array]:
-    """Return a handle's position, the direction back along the fingers, and the hand's rotation to hold it.
+def _handle_pose(hand: Hand, articulation: Articulation, tilt: float) -> tuple[Array, Array, Array]:
+    """Return a handle's position (3,), the direction (3,) back along the fingers, and the hand's rotation (3, 3).
 
-    The fingers close level, along the front: the hand is 20 cm wide that way and thin the other, so that it neither
-    touches the table under the lowest drawer nor the handle above.
+    The fingers close horizontally along the front. The hand is 20 cm wide in that direction and thin in the other, so
+    it touches neither the table below the lowest drawer nor the handle above.
     """
     position, _ = hand.sim.site_pose(articulation.handle_site)
-    out = outward_of(hand, articulation)
+    out = opening_direction(hand, articulation)
     back = np.cos(tilt) * out + np.sin(tilt) * UP
     return position, back, frame(-back, cross(UP, out))
 
 
-def _off_handle(hand: Hand, articulation: Articulation, tilt: float, back: float) -> Callable[[], Array]:
-    """Return where the hand is when it stands ``back`` from a handle along its fingers, m, asked anew each time."""
+def _handle_target(hand: Hand, articulation: Articulation, tilt: float, back: float) -> Callable[[], Array]:
+    """Return the moving target at a distance ``back`` from a handle along the fingers, m."""
 
     def target() -> Array:
-        position, direction, _ = _at_handle(hand, articulation, tilt)
+        position, direction, _ = _handle_pose(hand, articulation, tilt)
         return position + back * direction
 
     return target
 
 
-def _grip_of(hand: Hand, articulation: Articulation, tilt: float) -> Array:
-    """Return the rotation (3, 3) of a hand that holds a handle: along the front, or askew where that is too long."""
-    _, back, rotation = _at_handle(hand, articulation, tilt)
-    if articulation.handle.length < FULLY_OPEN:
+def _handle_grip(hand: Hand, articulation: Articulation, tilt: float) -> Array:
+    """Return the hand's rotation (3, 3) for a handle: closing along the front, or rolled for a long bar."""
+    _, back, rotation = _handle_pose(hand, articulation, tilt)
+    if articulation.handle.length < OPEN_WIDTH:
         return rotation
-    return Rotation.from_rotvec(SKEW * back).as_matrix() @ rotation
+    return Rotation.from_rotvec(WIDE_HANDLE_ROLL * back).as_matrix() @ rotation
 
 
 def open_drawer(hand: Hand, region: str) -> Steps:
-    """Take a drawer's handle and pull until the drawer counts as open."""
+    """Grasp a drawer's handle and pull until the drawer counts as open."""
     articulation, _ = hand.sim.world.articulation(region)
-    steep = TILT if articulation.handle.length < FULLY_OPEN else SKEW_TILT
+    steep = HANDLE_TILT if articulation.handle.length < OPEN_WIDTH else WIDE_HANDLE_TILT
     tilt = steep + float(hand.rng.uniform(-0.06, 0.06))
-    for _ in range(ATTEMPTS):
-        out = outward_of(hand, articulation)
+    for _ in range(MAX_ATTEMPTS):
+        out = opening_direction(hand, articulation)
         yield from _take_handle(hand, articulation, tilt)
-        rotation = _grip_of(hand, articulation, tilt)
+        rotation = _handle_grip(hand, articulation, tilt)
         yield from _pull_drawer(hand, region, rotation, out)
         yield from hand.open(6)
-        back = _off_handle(hand, articulation, tilt, 0.09)
+        back = _handle_target(hand, articulation, tilt, 0.09)
         yield from hand.move(back, rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
-        if hand.sim.world.articulation(region)[1] < articulation.open_below:
+        if _joint_position(hand, region) < articulation.open_below:
             return
 
 
 def _take_handle(hand: Hand, articulation: Articulation, tilt: float) -> Steps:
-    at = partial(_off_handle, hand, articulation, tilt)
+    at = partial(_handle_target, hand, articulation, tilt)
 
     def turned() -> Array:
-        return _grip_of(hand, articulation, tilt)
+        return _handle_grip(hand, articulation, tilt)
 
     yield from rise(hand, OPEN, 0.16)
     yield from hand.move(at(0.14), turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
@@ -137,34 +145,34 @@ def _take_handle(hand: Hand, articulation: Articulation, tilt: float) -> Steps:
 
 
 def _pull_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
-    """Pull a drawer by its handle until it is open, or the handle is lost."""
+    """Pull a drawer by its handle until it is open or the handle slips."""
     for _ in range(90):
         articulation, q = hand.sim.world.articulation(region)
         if q < articulation.open_below - 0.006:
             break
         handle, _ = hand.sim.site_pose(articulation.handle_site)
-        if hand.empty or length(hand.position - handle) > LOST:
+        if hand.empty or length(hand.position - handle) > DROP_DISTANCE:
             break
         yield hand.toward(handle + 0.035 * out, rotation, CLOSED, speed=0.8)
 
 
 def close_drawer(hand: Hand, region: str) -> Steps:
-    """Push an open drawer shut with closed fingers on its handle."""
+    """Close a drawer with closed fingers on its handle."""
     articulation, _ = hand.sim.world.articulation(region)
-    tilt = TILT + float(hand.rng.uniform(-0.06, 0.06))
-    for _ in range(ATTEMPTS):
-        out = outward_of(hand, articulation)
-        rotation = _at_handle(hand, articulation, tilt)[2]
-        yield from _come_before(hand, articulation, rotation, out)
+    tilt = HANDLE_TILT + float(hand.rng.uniform(-0.06, 0.06))
+    for _ in range(MAX_ATTEMPTS):
+        out = opening_direction(hand, articulation)
+        rotation = _handle_pose(hand, articulation, tilt)[2]
+        yield from _approach_handle(hand, articulation, rotation, out)
         yield from _push_drawer(hand, region, rotation, out)
         back = hand.position + 0.08 * out
         yield from hand.move(back, rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=50)
-        if hand.sim.world.articulation(region)[1] > articulation.closed_above:
+        if _joint_position(hand, region) > articulation.closed_above:
             return
 
 
-def _come_before(hand: Hand, articulation: Articulation, rotation: Array, out: Array) -> Steps:
-    """Bring the closed fingers in front of a handle, from above."""
+def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, out: Array) -> Steps:
+    """Move the closed fingers in front of a handle, from above."""
 
     def before(gap: float) -> Array:
         return hand.sim.site_pose(articulation.handle_site)[0] + gap * out
@@ -176,10 +184,10 @@ def _come_before(hand: Hand, articulation: Articulation, rotation: Array, out: A
 
 
 def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
-    """Push a drawer by its handle until it is shut, or the fingers slip off sideways."""
+    """Push a drawer by its handle until it is closed or the fingers slip off sideways."""
     articulation, _ = hand.sim.world.articulation(region)
     spare = min(0.003, articulation.closed_q - articulation.closed_above)
-    shut = pressed(lambda: hand.sim.world.articulation(region)[1] > articulation.closed_above + spare)
+    shut = sustained(lambda: _joint_position(hand, region) > articulation.closed_above + spare)
     for _ in range(110):
         if shut():
             break
@@ -191,26 +199,26 @@ def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
 
 
 def turn_knob(hand: Hand, name: str, on: bool) -> Steps:
-    """Take a knob's ridge from above and turn it until it counts as on, or as off."""
+    """Grasp a knob's ridge from above and turn it until it counts as on or off."""
     articulation, _ = hand.sim.world.articulation(name)
     on_from, off_to = articulation.on_at_least, articulation.off_below
     aim = on_from + float(hand.rng.uniform(0.12, 0.25)) if on else off_to - 0.15
 
     def reached(spare: float) -> bool:
-        _, q = hand.sim.world.articulation(name)
+        q = _joint_position(hand, name)
         return q >= on_from + spare if on else q < off_to - min(spare, 1e-4)
 
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_ATTEMPTS):
         yield from _take_ridge(hand, articulation)
         turned = partial(reached, 0.08)
-        yield from _twist(hand, name, aim, turned if on else pressed(turned))
-        yield from let_go(hand, 0.10)
+        yield from _twist(hand, name, aim, turned if on else sustained(turned))
+        yield from release_fixture(hand, 0.10)
         if reached(0.0):
             return
 
 
 def _ridge(hand: Hand, articulation: Articulation) -> tuple[Array, Array]:
-    """Return the position of a knob's ridge, (3,), and the rotation (3, 3) of a hand that takes it from above."""
+    """Return the position (3,) of a knob's ridge and the hand's rotation (3, 3) for grasping it from above."""
     position, rotation = hand.sim.site_pose(articulation.handle_site)
     across = rotation[:, 1] * np.array([1.0, 1.0, 0.0])
     return position, downward(float(np.arctan2(across[1], across[0])))
@@ -224,13 +232,13 @@ def _take_ridge(hand: Hand, articulation: Articulation) -> Steps:
         return _ridge(hand, articulation)[1]
 
     yield from rise(hand, OPEN)
-    yield from hand.move(at(HOVER), turned, OPEN, tolerance=0.01, turn_tolerance=0.06)
+    yield from hand.move(at(HOVER_HEIGHT), turned, OPEN, tolerance=0.01, turn_tolerance=0.06)
     yield from hand.move(at(0.0), turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
     yield from hand.close()
 
 
 def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> Steps:
-    """Turn the hand with a knob in it, to the knob's position ``aim``, rad."""
+    """Turn a grasped knob to the position ``aim``, rad."""
     grip = hand.rotation
     articulation, start = hand.sim.world.articulation(name)
     for _ in range(100):
@@ -247,21 +255,21 @@ def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> St
 
 @dataclass(frozen=True)
 class Door:
-    """Where a hinged door stands now. Directions are level unit vectors (3,), places are (3,), m."""
+    """Present geometry of a hinged door. Directions are horizontal unit vectors (3,), positions are (3,), m."""
 
     q: float
     hinge: Array
     handle: Array
     outward: Array
-    """Out of the door's front."""
+    """Normal of the door's front."""
     along: Array
-    """From the hinge to the free edge."""
+    """Direction from the hinge to the free edge."""
     edge: Array
-    """A place on the upper edge, half way into the panel, near the handle."""
+    """Point on the upper edge near the handle, at the panel's centre plane."""
 
 
-def door_now(hand: Hand, name: str, ahead: float = 0.0) -> Door:
-    """Return a door's geometry, turned ``ahead`` by an angle of its joint, rad."""
+def door_geometry(hand: Hand, name: str, ahead: float = 0.0) -> Door:
+    """Return a door's geometry, rotated about its hinge by ``ahead``, rad."""
     articulation, q = hand.sim.world.articulation(name)
     joint = hand.sim.data.joint(articulation.joint)
     hinge = joint.xanchor.copy()
@@ -285,214 +293,218 @@ def door_now(hand: Hand, name: str, ahead: float = 0.0) -> Door:
 
 
 def _edge(hand: Hand, name: str, handle: Array, outward: Array, along: Array) -> Array:
-    """Return where a door's upper edge is taken, (3,), m."""
+    """Return the grasp position on a door's upper edge (3,), m."""
     articulation, _ = hand.sim.world.articulation(name)
     owner = _owner(hand, name)
     depth = articulation.handle.clearance + articulation.handle.thickness[0] / 2 + DOOR_THICKNESS / 2
-    edge = handle - depth * outward - EDGE_INSET * along
+    edge = handle - depth * outward - DOOR_EDGE_INSET * along
     edge[2] = hand.sim.asset_pose(owner)[0][2] + hand.sim.assets[owner].top
     return edge
 
 
 def _owner(hand: Hand, name: str) -> str:
-    """Return the fixture that an articulation's name (``microwave_1``, ``cabinet_1_top_region``) belongs to."""
+    """Return the fixture of an articulation's name (``microwave_1``, ``cabinet_1_top_region``)."""
     return max((other for other in hand.sim.assets if name == other or name.startswith(f"{other}_")), key=len)
 
 
-def wanted(q: float, articulation: Articulation, opening: bool) -> bool:
-    """Return whether a door is open, or closed, with a little to spare."""
+def door_is_at_goal(q: float, articulation: Articulation, opening: bool) -> bool:
+    """Return whether a door is open, or closed, with a margin."""
     return q < articulation.open_below - 0.015 if opening else q > articulation.closed_above + 0.002
 
 
 def open_door(hand: Hand, name: str) -> Steps:
-    """Pull a door by its handle as far as the arm comfortably reaches, then swing it on by its upper edge."""
+    """Pull a door by its handle within the arm's comfortable reach, then swing it by its upper edge."""
     articulation, _ = hand.sim.world.articulation(name)
-    for _ in range(ATTEMPTS):
-        if far(door_now(hand, name).handle) < REACH:
+    for _ in range(MAX_ATTEMPTS):
+        if distance_from_base(door_geometry(hand, name).handle) < DOWNWARD_REACH:
             yield from _pull_door(hand, name)
-        if hand.sim.world.articulation(name)[1] >= articulation.open_below:
+        if _joint_position(hand, name) >= articulation.open_below:
             yield from _swing_door(hand, name, opening=True)
-        if hand.sim.world.articulation(name)[1] < articulation.open_below:
+        if _joint_position(hand, name) < articulation.open_below:
             return
 
 
 def close_door(hand: Hand, name: str) -> Steps:
-    """Swing a door by its upper edge until its handle is in reach, then push it shut there."""
+    """Swing a door by its upper edge until its handle is in reach, then push the handle."""
     articulation, _ = hand.sim.world.articulation(name)
-    for _ in range(ATTEMPTS):
-        door = door_now(hand, name)
-        if far(door.handle + PUSH_GAP * door.outward) > REACH:
+    for _ in range(MAX_ATTEMPTS):
+        door = door_geometry(hand, name)
+        if distance_from_base(door.handle + PUSH_GAP * door.outward) > DOWNWARD_REACH:
             yield from _swing_door(hand, name, opening=False)
         yield from _push_door(hand, name)
-        if hand.sim.world.articulation(name)[1] > articulation.closed_above:
+        if _joint_position(hand, name) > articulation.closed_above:
             return
 
 
 def _pull_door(hand: Hand, name: str) -> Steps:
-    """Take the upper end of an upright handle between the fingers and follow the door's arc."""
+    """Grasp the upper end of a vertical handle and follow the door's arc."""
     articulation, _ = hand.sim.world.articulation(name)
-    up = (articulation.handle.length / 2 - 0.018) * UP
-    flip = np.sign(door_now(hand, name).along @ EASY_CLOSING) or 1.0
+    up = (articulation.handle.length / 2 - HANDLE_GRIP_DEPTH) * UP
+    flip = _closing_sign(door_geometry(hand, name).along)
 
     def at(height: float, ahead: float = 0.0) -> Callable[[], Array]:
-        return lambda: door_now(hand, name, ahead).handle + up + height * UP
+        return lambda: door_geometry(hand, name, ahead).handle + up + height * UP
 
     def turned(ahead: float = 0.0) -> Array:
-        return frame(DOWN, flip * door_now(hand, name, ahead).along)
+        return frame(DOWN, flip * door_geometry(hand, name, ahead).along)
 
     yield from rise(hand, OPEN, 0.26)
-    yield from hand.move(at(HOVER + 0.02), turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
+    yield from hand.move(at(HOVER_HEIGHT + 0.02), turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
     yield from hand.move(at(0.0), turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
     yield from hand.close()
     way = np.sign(articulation.open_q - articulation.closed_q)
     for _ in range(160):
-        door = door_now(hand, name)
-        if wanted(door.q, articulation, True) or far(door.handle) > REACH:
+        door = door_geometry(hand, name)
+        if door_is_at_goal(door.q, articulation, opening=True) or distance_from_base(door.handle) > DOWNWARD_REACH:
             break
-        if hand.empty or length(hand.position - door.handle - up) > LOST:
+        if hand.empty or length(hand.position - door.handle - up) > DROP_DISTANCE:
             break
         yield hand.toward(at(0.0, way * SWING_LEAD)(), turned(way * SWING_LEAD / 2), CLOSED, speed=0.8)
-    yield from let_go(hand)
+    yield from release_fixture(hand)
 
 
 def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
-    """Take a door that stands ajar by its upper edge and follow its arc."""
+    """Grasp a partly open door by its upper edge and follow its arc."""
     articulation, start = hand.sim.world.articulation(name)
     goal = articulation.open_below if opening else articulation.closed_q
     way = float(np.sign(goal - start))
     free = hand.sim.model.joint(articulation.joint).frictionloss[0] == 0.0
-    ease, over = (FREE_EASE, HOVER) if free else (EASE, 0.0)  # a free door stands wider open: lean on the way down, too
-    flip = np.sign(door_now(hand, name, (goal - start) / 2).outward @ EASY_CLOSING) or 1.0
+    # A door without friction opens wider: lean during the descent, too.
+    end_lead, over = (FREE_SWING_END_LEAD, HOVER_HEIGHT) if free else (SWING_END_LEAD, 0.0)
+    flip = _closing_sign(door_geometry(hand, name, (goal - start) / 2).outward)
 
     def turned(ahead: float = 0.0) -> Array:
-        # A door that stands wide open is taken with the fingers pointing outwards: upright, the hand is too short.
-        door = door_now(hand, name, ahead)
-        return leaning(flip * door.outward, reach_lean(hand, door.edge + over * UP, STRETCHED))
+        # A wide-open door is out of reach of an upright hand: the fingers point outwards.
+        door = door_geometry(hand, name, ahead)
+        return leaned_rotation(flip * door.outward, reach_lean(hand, door.edge + over * UP, MAX_STRETCH))
 
     def at(back: float, ahead: float = 0.0) -> Callable[[], Array]:
-        return lambda: door_now(hand, name, ahead).edge - back * turned(ahead)[:, 2]
+        return lambda: door_geometry(hand, name, ahead).edge - back * turned(ahead)[:, 2]
 
     yield from rise(hand, OPEN, 0.26)
-    yield from hand.move(at(HOVER), turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
-    yield from hand.move(at(-EDGE_DEPTH), turned, OPEN, tolerance=0.006, speed=0.6, timeout=60)
+    yield from hand.move(at(HOVER_HEIGHT), turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
+    yield from hand.move(at(-DOOR_EDGE_DEPTH), turned, OPEN, tolerance=0.006, speed=0.6, timeout=60)
     yield from hand.close()
     for _ in range(160):
-        door = door_now(hand, name)
-        if _swung(hand, door, articulation, opening):
+        door = door_geometry(hand, name)
+        if _swing_is_over(hand, door, articulation, opening):
             break
-        lead = way * min(SWING_LEAD, abs(goal - door.q) + ease)
-        yield hand.toward(at(-EDGE_DEPTH, lead)(), turned(lead / 2), CLOSED, speed=0.8)
-    yield from let_go(hand)
+        lead = way * min(SWING_LEAD, abs(goal - door.q) + end_lead)
+        yield hand.toward(at(-DOOR_EDGE_DEPTH, lead)(), turned(lead / 2), CLOSED, speed=0.8)
+    yield from release_fixture(hand)
 
 
-def _swung(hand: Hand, door: Door, articulation: Articulation, opening: bool) -> bool:
-    """Return whether swinging ends: the door is where it should be, can be pushed shut, or has slipped away."""
-    if wanted(door.q, articulation, opening):
+def _swing_is_over(hand: Hand, door: Door, articulation: Articulation, opening: bool) -> bool:
+    """Return whether the swing ends: the door is at its goal, can be pushed by its handle, or has slipped."""
+    if door_is_at_goal(door.q, articulation, opening):
         return True
-    if not opening and far(door.handle + PUSH_GAP * door.outward) < REACH - 0.04:
+    if not opening and distance_from_base(door.handle + PUSH_GAP * door.outward) < DOWNWARD_REACH - 0.04:
         return True
-    return hand.empty or length(hand.position - door.edge) > LOST + EDGE_DEPTH
+    return hand.empty or length(hand.position - door.edge) > DROP_DISTANCE + DOOR_EDGE_DEPTH
 
 
 def _push_door(hand: Hand, name: str) -> Steps:
-    """Push a door shut with closed fingers on the outside of its handle."""
+    """Close a door with closed fingers on the outside of its handle."""
     articulation, _ = hand.sim.world.articulation(name)
     way = float(np.sign(articulation.closed_q - articulation.open_q))
-    flip = np.sign(door_now(hand, name).along @ EASY_CLOSING) or 1.0
+    flip = _closing_sign(door_geometry(hand, name).along)
 
     def at(gap: float, height: float = 0.0, ahead: float = 0.0) -> Array:
-        door = door_now(hand, name, ahead)
+        door = door_geometry(hand, name, ahead)
         return door.handle + gap * door.outward + height * UP
 
     def turned(ahead: float = 0.0) -> Array:
-        return frame(DOWN, flip * door_now(hand, name, ahead).along)
+        return frame(DOWN, flip * door_geometry(hand, name, ahead).along)
 
     yield from rise(hand, CLOSED, 0.26)
     yield from hand.move(lambda: at(PUSH_GAP, 0.15), turned, CLOSED, tolerance=0.02, turn_tolerance=0.1)
     yield from hand.move(lambda: at(PUSH_GAP), turned, CLOSED, tolerance=0.012, turn_tolerance=0.1)
-    shut = pressed(lambda: wanted(hand.sim.world.articulation(name)[1], articulation, False))
+    shut = sustained(lambda: door_is_at_goal(_joint_position(hand, name), articulation, opening=False))
     for _ in range(160):
         if shut():
             break
-        door = door_now(hand, name)
+        door = door_geometry(hand, name)
         if abs(float((hand.position - door.handle) @ door.along)) > 0.04:
             break
         yield hand.toward(at(0.01, 0.0, way * SWING_LEAD), turned(), CLOSED, speed=0.8)
-    back = hand.position + 0.06 * door_now(hand, name).outward
+    back = hand.position + 0.06 * door_geometry(hand, name).outward
     yield from hand.move(back, hand.rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=40)
     yield from rise(hand, CLOSED, 0.26)
 
 
-# --- doors in one pull or push: half the steps of `open_door` and `close_door`, for rounds that are counted. The hand
-# leans out as far as the door goes, where that of the published demonstrations lets go and takes it anew ---
+# --- doors in one sweep, for counting tasks: half the steps of `open_door` and `close_door`. The hand leans as far as
+# the door moves; in the published demonstrations it releases the door and grasps it again ---
 
 
-def pull_open(hand: Hand, name: str) -> Steps:
-    """Take a door's handle and follow the arc until the door counts as open."""
-    for _ in range(ATTEMPTS):
+def sweep_door_open(hand: Hand, name: str) -> Steps:
+    """Grasp a door's handle and follow the arc until the door counts as open."""
+    articulation, _ = hand.sim.world.articulation(name)
+    for _ in range(MAX_ATTEMPTS):
         yield from _sweep_open(hand, name)
-        yield from let_go(hand, 0.08)
-        articulation, q = hand.sim.world.articulation(name)
-        if wanted(q, articulation, True):
+        yield from release_fixture(hand, 0.08)
+        if door_is_at_goal(_joint_position(hand, name), articulation, opening=True):
             return
 
 
-def push_shut(hand: Hand, name: str) -> Steps:
-    """Push a door's panel from outside until it is shut."""
-    for _ in range(ATTEMPTS):
+def sweep_door_shut(hand: Hand, name: str) -> Steps:
+    """Push a door's panel from outside until the door is closed."""
+    articulation, _ = hand.sim.world.articulation(name)
+    for _ in range(MAX_ATTEMPTS):
         yield from _sweep_shut(hand, name)
-        articulation, q = hand.sim.world.articulation(name)
-        if wanted(q, articulation, False):
+        if door_is_at_goal(_joint_position(hand, name), articulation, opening=False):
             return
 
 
-def _turned(hand: Hand, door: Door, place: Array, flip: float) -> Array:
-    """Return the rotation (3, 3) of a hand that closes along the door and leans as far as a place needs."""
+def _sweep_rotation(hand: Hand, door: Door, place: Array, flip: float) -> Array:
+    """Return the rotation (3, 3) of a hand that closes along the door, leaned to reach a position (3,)."""
     closing = flip * door.along
     lean = reach_lean(hand, place)
-    return leaning(closing, lean - (lean @ closing) * closing)
+    return leaned_rotation(closing, lean - (lean @ closing) * closing)
 
 
 def _sweep_open(hand: Hand, name: str) -> Steps:
     articulation, _ = hand.sim.world.articulation(name)
-    up = (articulation.handle.length / 2 - GRIP_BELOW) * UP
-    flip = np.sign(door_now(hand, name).along @ EASY_CLOSING) or 1.0
+    up = (articulation.handle.length / 2 - HANDLE_GRIP_DEPTH) * UP
+    flip = _closing_sign(door_geometry(hand, name).along)
 
     def grip(ahead: float = 0.0) -> tuple[Array, Array]:
-        door = door_now(hand, name, ahead)
-        return door.handle + up, _turned(hand, door, door.handle + up, flip)
+        door = door_geometry(hand, name, ahead)
+        return door.handle + up, _sweep_rotation(hand, door, door.handle + up, flip)
 
     def over() -> Array:
-        return grip()[0] - HOVER * grip()[1][:, 2]
+        return grip()[0] - HOVER_HEIGHT * grip()[1][:, 2]
 
     yield from hand.move(over, lambda: grip()[1], OPEN, tolerance=0.02, turn_tolerance=0.1)
     yield from hand.move(lambda: grip()[0], lambda: grip()[1], OPEN, tolerance=0.006, speed=0.8, timeout=60)
     yield from hand.close()
     way = np.sign(articulation.open_q - articulation.closed_q)
-    for _ in range(STEPS):
-        if wanted(door_now(hand, name).q, articulation, True) or length(hand.position - grip()[0]) > LOST:
+    for _ in range(MAX_SWEEP_STEPS):
+        if (
+            door_is_at_goal(door_geometry(hand, name).q, articulation, opening=True)
+            or length(hand.position - grip()[0]) > DROP_DISTANCE
+        ):
             break
-        yield hand.toward(*grip(way * LEAD), CLOSED)
+        yield hand.toward(*grip(way * SWEEP_LEAD), CLOSED)
 
 
 def _sweep_shut(hand: Hand, name: str) -> Steps:
     articulation, _ = hand.sim.world.articulation(name)
     way = float(np.sign(articulation.closed_q - articulation.open_q))
-    flip = np.sign(door_now(hand, name).along @ EASY_CLOSING) or 1.0
+    flip = _closing_sign(door_geometry(hand, name).along)
 
     def pose(gap: float, height: float = 0.0, ahead: float = 0.0) -> tuple[Array, Array]:
-        door = door_now(hand, name, ahead)
-        place = door.edge - PUSH_IN * door.along + gap * door.outward + (height - PUSH_BELOW) * UP
-        return place, _turned(hand, door, place, flip)
+        door = door_geometry(hand, name, ahead)
+        place = door.edge - PANEL_PUSH_INSET * door.along + gap * door.outward + (height - PANEL_PUSH_DEPTH) * UP
+        return place, _sweep_rotation(hand, door, place, flip)
 
     yield from rise(hand, CLOSED, 0.26)
     for height, tolerance in ((0.12, 0.03), (0.0, 0.02)):
-        target, turn = pose(BEFORE, height)
+        target, turn = pose(PANEL_APPROACH_GAP, height)
         yield from hand.move(target, turn, CLOSED, tolerance=tolerance, turn_tolerance=0.15)
-    shut = pressed(lambda: wanted(hand.sim.world.articulation(name)[1], articulation, False))
-    for _ in range(STEPS):
-        if shut() or length(hand.position - pose(TOUCHING)[0]) > LOST + BEFORE:
+    shut = sustained(lambda: door_is_at_goal(_joint_position(hand, name), articulation, opening=False))
+    for _ in range(MAX_SWEEP_STEPS):
+        if shut() or length(hand.position - pose(PANEL_CONTACT_GAP)[0]) > DROP_DISTANCE + PANEL_APPROACH_GAP:
             break
-        yield hand.toward(*pose(TOUCHING, 0.0, way * LEAD), CLOSED)
-    back = hand.position + 0.05 * door_now(hand, name).outward
+        yield hand.toward(*pose(PANEL_CONTACT_GAP, 0.0, way * SWEEP_LEAD), CLOSED)
+    back = hand.position + 0.05 * door_geometry(hand, name).outward
     yield from hand.move(back, hand.rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=40)

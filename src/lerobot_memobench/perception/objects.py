@@ -21,7 +21,7 @@ from lerobot_memobench.perception.geometry import View, depth_at_height, rays, v
 from lerobot_memobench.perception.visual_encoder import resized
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
-from lerobot_memobench.sim.object_slots import classes, in_slots
+from lerobot_memobench.sim.object_slots import classes, fill_slots
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 
 Array = NDArray[np.float64]
@@ -129,7 +129,7 @@ class ObjectLocalizer:
             joint = one.joint if self.detector.kinds[one.kind] in PARTS else 0.0
             lit = float(one.lit > LIT)
             rows.append([1.0, self._class[one.kind], *one.position, *one.axis, 0.0, 0.0, 0.0, joint, lit])
-        slots = torch.from_numpy(in_slots(np.array(rows).reshape(-1, WIDTH)))
+        slots = torch.from_numpy(fill_slots(np.array(rows).reshape(-1, WIDTH)))
         return upright(slots.unflatten(0, (SLOTS, WIDTH))).flatten()
 
     def objects(self, found: Mapping[str, Detections], views: Mapping[str, View]) -> list[DetectedObject]:

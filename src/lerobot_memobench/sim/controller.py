@@ -1,13 +1,12 @@
-"""Operational-space control of the arm, with the numbers of robosuite's OSC_POSE controller.
+"""Operational-space control of the arm with the parameters of robosuite's OSC_POSE controller.
 
-One control step sets a goal from a 7-D action and then holds it over the physics steps. The torques are those that
-robosuite 1.4.1 would command (a test holds them equal to its controller's along a trajectory), without the work that
-the published stack does around them: a second `mj_forward` per physics step, string look-ups, full-model Jacobians and
-mass matrix copies, pseudo-inverses of matrices that are never singular in reach.
+A control step sets a goal from a 7-D action and holds it over the physics steps. The torques equal those of robosuite
+1.4.1 (tested along a trajectory) without the overhead of the published stack: a second `mj_forward` per physics step,
+string look-ups, full-model Jacobians, mass matrix copies, and pseudo-inverses of matrices that are regular in reach.
 
-`make_controller` takes a control step as one compiled call where that gives the numpy controller's bits: Python and
-numpy take a third of a control step's time. What numba compiles calls the same libraries in the same order, and the
-first step of a process is taken both ways: a difference or a failure leaves the work to numpy, without a word.
+`make_controller` compiles a control step into one call if that reproduces the bits of the numpy controller, because
+Python and numpy take a third of a control step's time. The compiled code calls the same libraries in the same order.
+The first step of a process runs both ways; after a difference or a failure the process uses numpy.
 
 Source: robosuite 1.4.1 `controllers/osc.py`, `config/osc_pose.json`; Khatib 1987.
 """
@@ -29,30 +28,28 @@ _log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 
-CLOSING = np.array([-1.0, 1.0])
-"""Sign of the fingers' commands that closes them."""
-
-
+CLOSING_SIGNS = np.array([-1.0, 1.0])
+"""Signs of the finger commands that close the gripper."""
 KP, NULLSPACE_KP = 150.0, 10.0
-"""Gains of the published controller, which is critically damped."""
+"""Gains of the published, critically damped controller."""
 KD, NULLSPACE_KD = 2 * np.sqrt(KP), 2 * np.sqrt(NULLSPACE_KP)
 POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5
 """Metres and radians per unit of action."""
 GRIPPER_SPEED = 0.01
-"""Change of the gripper's command (−1 open … 1 closed, ideal range) per physics step."""
+"""Change of the gripper command (−1 open … 1 closed) per physics step."""
 
 MUJOCO = tuple(int(part) for part in mujoco.__version__.split(".")[:2])
-MASS_BY_DATA = MUJOCO >= (3, 10)
+FULLM_READS_DATA = MUJOCO >= (3, 10)
 """`mujoco.mj_fullM` takes (model, data, result); before MuJoCo 3.10 it took (model, result, data.qM)."""
 NEWEST_MUJOCO = (4, 0)
-"""The newest MuJoCo whose functions are called by address here. No later one is: its arguments may be others."""
+"""Newest MuJoCo version whose functions are called by address; signatures of later versions may differ."""
 
 
 class OSCController:
-    """Turn 7-D actions into joint torques and finger targets of one model.
+    """Convert 7-D actions into joint torques and finger targets of one model.
 
     Args:
-        model: a compiled scene that holds the arm of `sim.robot`.
+        model: compiled scene with the arm of `sim.robot`.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -61,7 +58,7 @@ class OSCController:
         self._qpos = model.jnt_qposadr[joints]
         self._dof = model.jnt_dofadr[joints]
         first = int(self._dof[0])
-        # The arm comes first in the model, so that its rows are plain slices (cheaper than index arrays).
+        # The arm comes first in the model, so its rows are slices, which are cheaper than index arrays.
         self._dofs = slice(first, first + len(joints))
         self._qposs = slice(int(self._qpos[0]), int(self._qpos[0]) + len(joints))
         self._site = model.site(robot.GRIP_SITE).id
@@ -79,15 +76,15 @@ class OSCController:
         self.gripper: Array = np.zeros(2)
 
     def reset(self, data: mujoco.MjData) -> None:
-        """Hold the present pose, gripper command at mid-range."""
+        """Hold the present pose with the gripper command at mid-range."""
         self.goal_position = data.site_xpos[self._site].copy()
         self.goal_rotation = data.site_xmat[self._site].reshape(3, 3).copy()
         self.gripper = np.zeros(2)
 
     def set_goal(self, data: mujoco.MjData, action: Array) -> None:
-        """Set the pose to reach: the present one moved by ``action[:6]``, which is clipped to [−1, 1].
+        """Set the goal to the present pose moved by ``action[:6]``, clipped to [−1, 1].
 
-        A zero rotation keeps the former goal's orientation, as the published controller does.
+        A zero rotation keeps the previous goal's orientation, as in the published controller.
         """
         delta = np.clip(action[:6], -1.0, 1.0)
         self.goal_position = data.site_xpos[self._site] + delta[:3] * POSITION_SCALE
@@ -103,7 +100,7 @@ class OSCController:
         """
         dofs = self._dofs
         mujoco.mj_jacSite(self._model, data, self._jac[:3], self._jac[3:], self._site)
-        if MASS_BY_DATA:
+        if FULLM_READS_DATA:
             mujoco.mj_fullM(self._model, data, self._mass)
         else:
             mujoco.mj_fullM(self._model, self._mass, data.qM)
@@ -115,8 +112,8 @@ class OSCController:
         force = KP * (self.goal_position - data.site_xpos[self._site]) - KD * twist[:3]
         torque = KP * orientation_error(self.goal_rotation, present) - KD * twist[3:]
 
-        # All three systems are symmetric and positive definite. LAPACK is called directly: at these sizes numpy's
-        # checks around it cost five times the solution.
+        # All three systems are symmetric and positive definite. Call LAPACK directly: at these sizes numpy's checks
+        # cost five times the solution.
         mass_inverse_jt = dposv(mass, jacobian.T)[1]
         inertia_inverse = jacobian @ mass_inverse_jt
         wrench = np.concatenate([dposv(inertia_inverse[:3, :3], force)[1], dposv(inertia_inverse[3:, 3:], torque)[1]])
@@ -134,12 +131,12 @@ class OSCController:
         data.ctrl[self._fingers] = self._finger_bias + self._finger_scale * self.gripper
 
     def gripper_change(self, gripper_action: float) -> Array:
-        """Return by how much the fingers' command moves in one physics step, (2,)."""
-        change: Array = CLOSING * (GRIPPER_SPEED * np.sign(gripper_action))
+        """Return the change (2,) of the finger commands in one physics step."""
+        change: Array = CLOSING_SIGNS * (GRIPPER_SPEED * np.sign(gripper_action))
         return change
 
     def advance(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:
-        """Hold the goal over physics steps; ``data`` must hold, and then holds, what `torques` needs."""
+        """Hold the goal over physics steps; before and after, ``data`` is in the state that `torques` requires."""
         for _ in range(substeps):
             self.apply(data, gripper_action)
             mujoco.mj_step2(self._model, data)
@@ -147,7 +144,7 @@ class OSCController:
 
 
 def orientation_error(desired: Array, present: Array) -> Array:
-    """Return half the summed cross products of the frames' axes, (3,): robosuite's small-angle rotation error."""
+    """Return robosuite's small-angle rotation error (3,): half the sum of cross products of the frames' axes."""
     product = desired @ present.T
     return 0.5 * np.array([product[2, 1] - product[1, 2], product[0, 2] - product[2, 0], product[1, 0] - product[0, 1]])
 
@@ -155,8 +152,8 @@ def orientation_error(desired: Array, present: Array) -> Array:
 def rotation_matrix(rotation_vector: Array) -> Array:
     """Return the rotation (3, 3) about a vector by its length, rad.
 
-    By way of a quaternion in single precision, as robosuite's: in double precision the torques would part from its
-    controller's in the sixth digit.
+    The computation uses a single-precision quaternion like robosuite; in double precision the torques would differ in
+    the sixth digit.
     """
     angle = float(np.linalg.norm(rotation_vector))
     if angle < 1e-9:
@@ -165,7 +162,7 @@ def rotation_matrix(rotation_vector: Array) -> Array:
     quaternion = np.array([np.cos(angle / 2), *vector], dtype=np.float32)
     scale = np.sqrt(2.0 / float(quaternion @ quaternion))
     quaternion = (quaternion.astype(np.float64) * scale).astype(np.float32)
-    # Twice the products of the quaternion's parts; only the diagonal's sums are in double precision.
+    # Doubled products of the quaternion's components; only the diagonal's sums are in double precision.
     p = np.outer(quaternion, quaternion)
     d = p.diagonal().astype(np.float64)
     return np.array(
@@ -182,37 +179,37 @@ def rotation_matrix(rotation_vector: Array) -> Array:
 
 
 class _Process:
-    """What this process has found out: None before the first step that was taken both ways, then whether they agree."""
+    """Result of the first step of this process, which runs both ways: None before it, then whether the bits agree."""
 
     agrees: bool | None = None
 
 
 def make_controller(model: mujoco.MjModel) -> OSCController:
-    """Return the fastest controller of a model that works here; all command the same bits."""
+    """Return the fastest controller that works on this machine; all return the same bits."""
     if _Process.agrees is not False:
         try:
             return CompiledController(model)
-        except Exception as error:  # no numba, no place for what it compiles, another BLAS, another libc: many names
-            _give_up(error)
+        except Exception as error:  # no cache folder for numba, another BLAS or libc, ...: many exception types
+            _fall_back(error)
     return OSCController(model)
 
 
-def _give_up(reason: object) -> None:
+def _fall_back(reason: object) -> None:
     _Process.agrees = False
-    _log.debug("control steps are taken by numpy: %s", reason)
+    _log.debug("use the numpy controller: %s", reason)
 
 
 class CompiledController(OSCController):
     """`OSCController` with a compiled `advance`.
 
     Raises:
-        ImportError, RuntimeError, AttributeError: numba is not installed or cannot keep what it compiles, numpy has
-            another BLAS, or MuJoCo is newer than `NEWEST_MUJOCO`.
+        RuntimeError, AttributeError: numba has no cache folder, numpy uses another BLAS, or MuJoCo is newer than
+            `NEWEST_MUJOCO`.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
         if MUJOCO > NEWEST_MUJOCO:
-            raise RuntimeError(f"MuJoCo {mujoco.__version__} is not known here")
+            raise RuntimeError(f"MuJoCo {mujoco.__version__} is newer than {NEWEST_MUJOCO}")
         from lerobot_memobench.sim import osc_kernel
 
         super().__init__(model)
@@ -220,7 +217,7 @@ class CompiledController(OSCController):
         self._scratch = osc_kernel.scratch(model.nv)
         low, high = self._torque_limits
         self._constants = osc_kernel.Arm(
-            mass_by_data=MASS_BY_DATA,
+            mass_by_data=FULLM_READS_DATA,
             site=self._site,
             dof=self._dofs.start,
             qpos=self._qposs.start,
@@ -238,8 +235,9 @@ class CompiledController(OSCController):
         )
 
     def advance(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:
-        """Do what `OSCController.advance` does."""
-        # What MuJoCo cannot bear, its bindings raise; a call by address ends the process. Memory is all it may lack.
+        """Advance as `OSCController.advance`."""
+        # MuJoCo's bindings raise on its fatal errors; a call by address would end the process. The only fatal error
+        # possible here is exhausted memory.
         if _Process.agrees is False or 2 * data.maxuse_arena > data.narena:
             super().advance(data, gripper_action, substeps)
         elif _Process.agrees is None:
@@ -250,10 +248,10 @@ class CompiledController(OSCController):
     def _advance(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:
         from lerobot_memobench.sim import osc_kernel
 
-        # Asked for anew each time: a copied simulation has its own memory.
+        # Read the addresses in each call: a copied simulation has its own memory.
         state = osc_kernel.State(
             data.qpos, data.qvel, data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3),
-            data.M if MASS_BY_DATA else data.qM, data.qfrc_bias, data.ctrl,
+            data.M if FULLM_READS_DATA else data.qM, data.qfrc_bias, data.ctrl,
         )  # fmt: skip
         gripper = self.gripper.copy()
         osc_kernel.advance(
@@ -264,19 +262,19 @@ class CompiledController(OSCController):
         self.gripper = gripper
 
     def _advance_both_ways(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:
-        """Advance by numpy and compiled, and decide for the process; numpy is right where they part."""
-        before, numpys = self.gripper, copy.copy(data)
-        super().advance(numpys, gripper_action, substeps)
+        """Advance with numpy and compiled code, and decide for the process; numpy's result is the reference."""
+        before, reference = self.gripper, copy.copy(data)
+        super().advance(reference, gripper_action, substeps)
         after, self.gripper = self.gripper, before
         try:
             self._advance(data, gripper_action, substeps)
-            _Process.agrees = _bits(data, self.gripper) == _bits(numpys, after)
-            reason: object = "what is compiled gives other numbers"
+            _Process.agrees = _bits(data, self.gripper) == _bits(reference, after)
+            reason: object = "the compiled step differs from numpy's"
         except Exception as error:  # numba compiles at the first call
             _Process.agrees, reason = False, error
         if not _Process.agrees:
-            _give_up(reason)
-            mujoco.mj_copyData(data, self._model, numpys)
+            _fall_back(reason)
+            mujoco.mj_copyData(data, self._model, reference)
             self.gripper = after
 
 

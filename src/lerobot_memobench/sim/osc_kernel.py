@@ -1,9 +1,9 @@
-"""The loop of `OSCController.advance`, compiled: the same operations in the same order by the same libraries.
+"""Compiled loop of `OSCController.advance`: the same operations in the same order by the same libraries.
 
-MuJoCo, numpy's BLAS and scipy's LAPACK are called at their addresses, so that every bit is that of the Python loop.
-Memory that they are told of belongs to the caller: what is made in here may be freed while its address is in use.
+MuJoCo, numpy's BLAS and scipy's LAPACK are called by address, so the result equals the Python loop to the bit. All
+memory passed to them belongs to the caller, because arrays created here may be freed while their address is in use.
 
-To import this needs numba and a place where it may keep what it compiled; `functions` needs numpy's own BLAS.
+The import requires a cache folder for numba; `functions` requires numpy's bundled BLAS.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 _BY_ROWS, _AS_IS, _TRANSPOSED = np.int32(101), np.int32(111), np.int32(112)
-"""CBLAS's words for the layout of a matrix."""
+"""CBLAS constants for matrix layout and transposition."""
 _DOUBLE = 8
 _INT = 4
 
 
 class Functions(NamedTuple):
-    """Addresses of what is called."""
+    """Addresses of the called C functions."""
 
     step1: int
     step2: int
@@ -38,7 +38,7 @@ class Functions(NamedTuple):
 
 
 class Arm(NamedTuple):
-    """What an arm's controller knows for good: MuJoCo's calls, first velocity and position, gains, limits, motors."""
+    """Constants of a controller: MuJoCo signature, indices of site, velocities and positions, gains, limits, motors."""
 
     mass_by_data: bool
     site: int
@@ -58,7 +58,7 @@ class Arm(NamedTuple):
 
 
 class State(NamedTuple):
-    """The simulation's own memory: positions, velocities, pose of the grip site, mass matrix, bias forces, controls."""
+    """Views of the simulation: positions, velocities, pose of the grip site, mass matrix, bias forces, controls."""
 
     qpos: Array
     qvel: Array
@@ -70,7 +70,7 @@ class State(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of intermediate results, made by `scratch`."""
+    """Buffers for intermediate results, created by `scratch`."""
 
     jacobian: Array
     mass: Array
@@ -88,12 +88,12 @@ class Scratch(NamedTuple):
 
 
 def functions() -> Functions:
-    """Return the addresses, of the functions that numpy, scipy and MuJoCo's bindings themselves call.
+    """Return the addresses of the functions that numpy, scipy and MuJoCo's bindings call.
 
     Raises:
-        AttributeError: numpy was built with another BLAS, or the libraries cannot be asked.
+        AttributeError: numpy was built with another BLAS, or a symbol is missing.
     """
-    # A module's library answers for those that it was linked with.
+    # An extension module resolves symbols of its linked libraries.
     physics, blas = (
         ctypes.CDLL(importlib.import_module(name).__file__)
         for name in ("mujoco._functions", "numpy._core._multiarray_umath")
@@ -114,7 +114,7 @@ def functions() -> Functions:
 
 
 def scratch(nv: int) -> Scratch:
-    """Return memory for a model of so many degrees of freedom."""
+    """Return buffers for a model with ``nv`` degrees of freedom."""
     empty = np.empty
     return Scratch(
         empty((6, nv)), empty((nv, nv)), (empty((3, 3)), empty((6, 6)), empty((7, 7))), empty(6), empty((3, 3)),
@@ -124,7 +124,7 @@ def scratch(nv: int) -> Scratch:
 
 
 def _call_of(_typing: Any, address: Any, arguments: Any) -> Any:
-    """Call a C function that returns nothing. Unlike a function of ctypes it can be kept in numba's cache."""
+    """Call a C function without return value. Unlike ctypes functions it can be stored in numba's cache."""
 
     def generate(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
         pointer, packed = values
@@ -141,7 +141,7 @@ _call: Any = intrinsic(_call_of)
 
 @njit(nogil=True)
 def _times(f, matrix, transposed, vector, out):  # type: ignore[no-untyped-def]
-    """out = matrix @ vector, or its transpose's."""
+    """out = matrix @ vector, or matrix.T @ vector."""
     rows, columns = matrix.shape
     _call(
         f.gemv,
@@ -166,7 +166,7 @@ def _solve(f, s, matrix, factor, b):  # type: ignore[no-untyped-def]
     rows = matrix.shape[0]
     for k in range(rows):
         for j in range(rows):
-            factor[j, k] = matrix[k, j]  # LAPACK goes by columns
+            factor[j, k] = matrix[k, j]  # LAPACK is column-major
     s.sizes[0], s.sizes[1] = rows, b.size // rows
     n = s.sizes.ctypes.data
     _call(
@@ -177,7 +177,7 @@ def _solve(f, s, matrix, factor, b):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _clip(value, low, high):  # type: ignore[no-untyped-def]
-    """Return a value within limits; what is not a number stays so."""
+    """Return a value clipped to limits; NaN is unchanged."""
     return low if value < low else high if value > high else value
 
 
@@ -231,11 +231,11 @@ def advance(f, model, data, arm, position, rotation, gripper, moved, x, s, subst
         model, data: addresses of MuJoCo's structures.
         arm: `Arm`.
         position, rotation: the goal, (3,) and (3, 3).
-        gripper: the fingers' command, (2,), brought up to date in place.
-        moved: its change per physics step, (2,).
+        gripper: finger commands, (2,), updated in place.
+        moved: change of the finger commands per physics step, (2,).
         x: `State`.
         s: `Scratch`.
-        substeps: how many physics steps.
+        substeps: number of physics steps.
     """
     for _ in range(substeps):
         _torques(f, model, data, arm, position, rotation, x, s)

@@ -1,4 +1,4 @@
-"""Draw a task's initial state from its regions and `init` atoms."""
+"""Sample a task's initial state from its regions and `init` atoms."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
-ATTEMPTS = 500
-"""Draws before a task's regions count as too crowded."""
-PENETRATION = 0.0015
-"""Depth of contact that is rest, not overlap, m."""
-GAP = 0.0005
-"""Height over its support at which a thing is set down, m."""
+MAX_DRAWS = 500
+"""Maximum number of draws without overlap-free placement."""
+MAX_CONTACT_DEPTH = 0.0015
+"""Largest contact depth of objects at rest; deeper contacts are overlaps, m."""
+DROP_HEIGHT = 0.0005
+"""Initial height of an object above its support, m."""
 
 Pose = NDArray[np.float64]
 """Position and quaternion wxyz, (7,)."""
@@ -30,7 +30,7 @@ Pose = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Placement:
-    """Where everything starts."""
+    """Initial poses and joint positions."""
 
     poses: dict[str, Pose]
     """World pose of each fixture and object."""
@@ -39,27 +39,27 @@ class Placement:
 
 
 def placing_atoms(task: Task, assets: Iterable[str]) -> dict[str, Atom]:
-    """Return the atom of `init` that places each thing, in the order of `init`.
+    """Return the placing `init` atom of each instance, in the order of `init`.
 
     Raises:
-        MemobenchError: one is not placed.
+        MemobenchError: an instance has no placing atom.
     """
     places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
     missing = [name for name in assets if name not in places]
     if missing:
         raise MemobenchError(
-            f"task {task.name} does not say where {missing[0]!r} starts: add (On {missing[0]} <region>) to its :init"
+            f"task {task.name} has no start for {missing[0]!r}; add (On {missing[0]} <region>) to its :init"
         )
     return places
 
 
 class Placer:
-    """Draw placements of one task and write them into a simulation.
+    """Sample placements of one task and write them into a simulation.
 
     Args:
-        task: the task whose `init` atoms say where things stand.
-        model: the simulation's own model: fixtures are moved in it.
-        data: state that is written and used to look for overlap.
+        task: task whose `init` atoms define the placement.
+        model: model of the simulation; the poses of fixtures are changed.
+        data: state that is written and checked for overlaps.
         assets: sizes and joints by instance.
     """
 
@@ -69,21 +69,21 @@ class Placer:
         self._order = self._sorted()
 
     def _sorted(self) -> list[str]:
-        """Things after what they stand on or in."""
+        """Return the instances, each after its support."""
         done: list[str] = []
         waiting = list(self._assets)
         while waiting:
             ready = [name for name in waiting if self._support(name) in (None, *done)]
             if not ready:
                 raise MemobenchError(
-                    f"task {self._task.name}: {', '.join(waiting)} stand on each other in a circle; check its :init"
+                    f"task {self._task.name}: {', '.join(waiting)} support each other in a cycle; check its :init"
                 )
             done += ready
             waiting = [name for name in waiting if name not in ready]
         return done
 
     def _support(self, name: str) -> str | None:
-        """The instance that ``name`` stands on or in; None for the table."""
+        """Return the instance that supports or contains ``name``; None for the table."""
         place = self._places[name].args[1]
         if place in self._assets:
             return place
@@ -96,7 +96,7 @@ class Placer:
         return max(owners, key=len)
 
     def _joints(self) -> dict[str, float]:
-        """Closed and off, unless an `init` atom says otherwise."""
+        """Return initial joint positions: closed and off unless an `init` atom differs."""
         wanted = {atom.args[0]: atom.predicate for atom in self._task.init if len(atom.args) == 1}
         joints = {}
         for name, asset in self._assets.items():
@@ -107,25 +107,25 @@ class Placer:
         return joints
 
     def place(self, seed: int) -> Placement:
-        """Draw the placement of a seed; see `draw`."""
+        """Sample the placement of a seed; see `draw`."""
         return self.draw(np.random.default_rng([seed, zlib.crc32(self._task.scene_name.encode())]))
 
     def draw(self, rng: np.random.Generator) -> Placement:
-        """Draw until nothing overlaps; return the last draw, and leave it written in model and data.
+        """Draw until there is no overlap; write the placement into model and data, and return it.
 
         Raises:
-            MemobenchError: when no draw of `ATTEMPTS` is free of overlap.
+            MemobenchError: each of `MAX_DRAWS` draws has an overlap.
         """
         pair = ("", "")
-        for _ in range(ATTEMPTS):
+        for _ in range(MAX_DRAWS):
             placement = self._draw_once(rng)
-            self.write(placement)
+            write(placement, self._model, self._data, self._assets)
             overlap = self._overlap()
             if overlap is None:
                 return placement
             pair = overlap
         raise MemobenchError(
-            f"task {self._task.name}: {pair[0]} and {pair[1]} overlapped in each of {ATTEMPTS} draws of the initial "
+            f"task {self._task.name}: {pair[0]} and {pair[1]} overlapped in each of {MAX_DRAWS} draws of the initial "
             "state; move their regions apart"
         )
 
@@ -136,10 +136,12 @@ class Placer:
             asset, atom = self._assets[name], self._places[name]
             support = self._support(name)
             if support is None:
-                poses[name] = self._on_table(self._task.regions[atom.args[1]], TABLE_TOP - asset.bottom + GAP, rng)
+                poses[name] = self._on_table(
+                    self._task.regions[atom.args[1]], TABLE_TOP - asset.bottom + DROP_HEIGHT, rng
+                )
             elif atom.args[1] == support:
                 below, above = poses[support], np.empty(3)
-                height = self._assets[support].supports - asset.bottom + GAP
+                height = self._assets[support].supports - asset.bottom + DROP_HEIGHT
                 mujoco.mju_rotVecQuat(above, [0.0, 0.0, height], below[3:])
                 poses[name] = np.concatenate([below[:3] + above, below[3:]])
             else:
@@ -147,7 +149,7 @@ class Placer:
         return Placement(poses, joints)
 
     def _on_table(self, region: Region, height: float, rng: np.random.Generator) -> Pose:
-        """Draw a pose evenly from one of a region's ranges."""
+        """Draw a pose uniformly from a random range of a region."""
         x1, y1, x2, y2 = region.ranges[int(rng.integers(len(region.ranges)))]
         x, y, yaw = rng.uniform(x1, x2), rng.uniform(y1, y2), rng.uniform(*region.yaw)
         return np.array([x, y, height, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
@@ -157,25 +159,21 @@ class Placer:
     ) -> Pose:
         """Draw a pose on top of a fixture's site, or on the floor of its region for `In`."""
         asset = self._assets[name]
-        self.write(Placement(poses, joints))
+        write(Placement(poses, joints), self._model, self._data, self._assets)
         site = self._model.site(atom.args[1]).id
         half = self._model.site_size[site]
         rotation = self._data.site_xmat[site].reshape(3, 3)
         room = np.maximum(half[:2] - asset.radius, 0.0)
         x, y = rng.uniform(-room, room)
-        z = (-half[2] if atom.predicate == "in" else half[2]) - asset.bottom + GAP
+        z = (-half[2] if atom.predicate == "in" else half[2]) - asset.bottom + DROP_HEIGHT
         position = self._data.site_xpos[site] + rotation @ np.array([x, y, z])
         return np.concatenate([position, [1.0, 0.0, 0.0, 0.0]])
 
-    def write(self, placement: Placement) -> None:
-        """Write a placement into the model (fixtures) and data (objects, joints); velocities stay."""
-        write(placement, self._model, self._data, self._assets)
-
     def _overlap(self) -> tuple[str, str] | None:
-        """Return the names of the first two bodies whose geoms stand in each other."""
+        """Return the names of the first two overlapping bodies."""
         mujoco.mj_collision(self._model, self._data)
         for contact in self._data.contact[: self._data.ncon] if self._data.ncon else ():
-            if contact.dist < -PENETRATION:
+            if contact.dist < -MAX_CONTACT_DEPTH:
                 bodies = [self._model.geom_bodyid[geom] for geom in contact.geom]
                 roots = [self._model.body(self._model.body_rootid[body]).name for body in bodies]
                 return roots[0], roots[1]
@@ -183,7 +181,7 @@ class Placer:
 
 
 def write(placement: Placement, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]) -> None:
-    """Write a placement into a model (fixtures) and data (objects, joints); velocities stay."""
+    """Write a placement into a model (fixtures) and data (objects, joints); keep velocities."""
     for name, pose in placement.poses.items():
         body = model.body(name)
         if assets[name].kind == "fixture":

@@ -1,4 +1,4 @@
-"""Rendering: qualities of frames, what draws them, and the renderers that a thread keeps."""
+"""Render frames: qualities, renderers, and the renderer cache of each thread."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Quality:
-    """What a frame is drawn with.
+    """Render settings of a quality level.
 
-    ``shadow_map``: its side in pixels; 0 leaves shadows out. ``smooth``: whether a pixel is the mean of four.
-    ``whole_arm``: the arm's meshes with all their faces, not thinned.
+    Attributes:
+        shadow_map: side of the shadow map, pixels; 0 disables shadows.
+        smooth: whether a pixel is the mean of four.
+        whole_arm: whether the arm is drawn with its original meshes.
     """
 
     shadow_map: int
@@ -36,11 +38,11 @@ class Quality:
 
 
 QUALITIES = {"fast": Quality(0), "default": Quality(1024), "high": Quality(2048, smooth=True, whole_arm=True)}
-"""Textures and light are the same in all. ``fast`` leaves out shadows. ``high`` is for pictures and videos: it smooths
-edges, sharpens shadows and draws the arm whole, at ten times the cost."""
+"""Textures and lights are equal. ``fast`` omits shadows. ``high`` is for figures and videos: smooth edges, sharper
+shadows and the original arm meshes, at ten times the cost."""
 
-ROOM = ("room", "kitchen_table")
-"""Bodies that cast no shadow: what theirs would fall on is under or behind them."""
+SHADOWLESS_BODIES = ("room", "kitchen_table")
+"""Bodies that cast no shadow because nothing is below or behind them."""
 
 
 @dataclass(frozen=True)
@@ -55,29 +57,29 @@ class RenderSettings:
         if self.quality not in QUALITIES:
             raise MemobenchError(f"render quality {self.quality!r} is unknown; {nearest(self.quality, QUALITIES)}")
         if self.height < 1 or self.width < 1:
-            raise MemobenchError(f"frames of {self.height}×{self.width} pixels cannot be drawn; both must be 1 or more")
+            raise MemobenchError(f"frames of {self.height}×{self.width} pixels cannot be drawn; use sizes of 1 or more")
 
 
 class Renderer(Protocol):
-    """What draws the frames of a scene at one size and quality."""
+    """Draws frames of a scene at one size and quality."""
 
     def draw(
         self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight] = ()
     ) -> Image:
-        """Return what a camera sees, (height, width, 3) uint8, first row on top."""
+        """Return a camera's image, (height, width, 3) uint8, first row on top."""
         ...
 
 
 @dataclass(frozen=True)
 class Supersampled:
-    """Draw frames of twice the width and height, and take the mean of four pixels."""
+    """Draw frames at twice the width and height, and average four pixels."""
 
     renderer: Rasterizer
 
     def draw(
         self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight] = ()
     ) -> Image:
-        """Return what a camera sees; see `Renderer`."""
+        """Return a camera's image; see `Renderer`."""
         fine = self.renderer.draw(model, data, camera, highlights)
         height, width, channels = fine.shape
         total = fine.reshape(height // 2, 2, width // 2, 2, channels).sum(axis=(1, 3), dtype=np.uint16)
@@ -85,33 +87,31 @@ class Supersampled:
 
 
 CACHED_RENDERERS = 4
-"""Renderers kept per thread: each holds its scene's textures and background, some 40 MB."""
+"""Renderers cached per thread; each holds textures and backgrounds of its scene, some 40 MB."""
 
 
-class _Thread(threading.local):
-    """The renderers of a thread; each serves one thread at a time."""
+class _RendererCache(threading.local):
+    """Renderers of a thread; a renderer serves one thread at a time."""
 
     def __init__(self) -> None:
         self.renderers: OrderedDict[tuple[Any, RenderSettings], Renderer] = OrderedDict()
 
 
-_thread = _Thread()
+_cache = _RendererCache()
 
 
 def get_renderer(
     key: Any, model: mujoco.MjModel, settings: RenderSettings, draw_list: DrawList | None = None
 ) -> Renderer:
-    """Return this thread's renderer for a scene, made at its first frame.
-
-    Simulations of the same scene share it: meshes and textures are the scene's, poses come with each frame's data.
+    """Return this thread's renderer of a scene, created on first use and shared by simulations of the scene.
 
     Args:
-        key: the scene's name.
-        model: a compiled scene.
+        key: cache key of the scene.
+        model: compiled scene.
         settings: size and quality of frames.
-        draw_list: what there is to draw, where it is not all visual geoms of the model.
+        draw_list: triangles to draw; by default all visual geoms of the model.
     """
-    renderers = _thread.renderers
+    renderers = _cache.renderers
     full = (key, settings)
     if full not in renderers:
         while len(renderers) >= CACHED_RENDERERS:
@@ -124,19 +124,19 @@ def get_renderer(
 def get_rasterizer(
     key: Any, model: mujoco.MjModel, settings: RenderSettings, draw_list: DrawList | None = None
 ) -> Rasterizer:
-    """Return this thread's renderer for a scene that also maps pixels to geoms.
+    """Return this thread's renderer of a scene that also maps pixels to geoms.
 
-    It is the one of `get_renderer`; where a pixel is the mean of four, another of the same size.
+    It is the renderer of `get_renderer`, except for supersampled qualities, which use a separate one of equal size.
     """
     settings = replace(settings, quality="fast") if QUALITIES[settings.quality].smooth else settings
     return cast("Rasterizer", get_renderer(key, model, settings, draw_list))
 
 
 def make_renderer(model: mujoco.MjModel, settings: RenderSettings, draw_list: DrawList | None = None) -> Renderer:
-    """Return a renderer of one's own for a scene; see `get_renderer`."""
+    """Return a new renderer of a scene; arguments as in `get_renderer`."""
     quality = QUALITIES[settings.quality]
     if draw_list is None:
-        draw_list = build_draw_list(model, ROOM, _whole_arm_meshes() if quality.whole_arm else None)
+        draw_list = build_draw_list(model, SHADOWLESS_BODIES, _whole_arm_meshes() if quality.whole_arm else None)
     from lerobot_memobench.sim.raster.rasterizer import Rasterizer  # loads numba
 
     fine = 2 if quality.smooth else 1
@@ -146,6 +146,6 @@ def make_renderer(model: mujoco.MjModel, settings: RenderSettings, draw_list: Dr
 
 @cache
 def _whole_arm_meshes() -> dict[str, Triangles]:
-    """Return the meshes of the whole arm by name."""
+    """Return the original meshes of the arm by name."""
     arm = whole_arm()
     return {arm.mesh(mesh).name: mesh_in_file(arm, mesh) for mesh in range(arm.nmesh)}

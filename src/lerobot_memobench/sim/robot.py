@@ -1,8 +1,8 @@
-"""The arm of the published stack: robosuite's Panda on the RethinkMount with the PandaGripper.
+"""Load the arm of the published stack: robosuite's Panda on the RethinkMount with the PandaGripper.
 
-The kinematics, masses, collision geometry and actuators are robosuite's own files, untouched. Only what is drawn is
-thinned: the visual meshes have 182,000 faces, most of which are never a pixel at 256×256, and a frame with all of them
-costs three times one without. Frames of quality ``high`` are drawn from the whole ones (`whole_arm`).
+Kinematics, masses, collision geometry and actuators are robosuite's original files. Only visual meshes are simplified:
+their 182,000 faces are mostly smaller than a pixel at 256×256 and would triple the cost of a frame. Frames of quality
+``high`` use the original meshes (`whole_arm`).
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from lerobot_memobench.io import cache_folder, draft_of
 
 ROBOSUITE = "1.4.1"
 INSTALL_ROBOSUITE = f"pip install --no-deps robosuite=={ROBOSUITE}"
-"""robosuite is none of our requirements: pip would also install what it requires, a second `cv2` and a keyboard library
-that has to be compiled."""
+"""robosuite is not a declared requirement: pip would also install its dependencies, a second `cv2` and a keyboard
+library that must be compiled."""
 ARM_SHA256 = "477a3b019b26022236d3c82372d29d86dc784d1f2bade46103e232c12467e48f"
-"""Of the composed MJCF, without folders, and its meshes."""
+"""SHA-256 of the composed MJCF without folder names, and its meshes."""
 
 BASE_POSITION = (-0.66, 0.0, 0.0)
-"""Foot of the mount, m: x = −0.16 − table length / 2 (robosuite's offset for a table of 1 m)."""
+"""Base of the mount, m: x = −0.16 − table length / 2 (robosuite's offset for a table of 1 m)."""
 
 ARM_START = (0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.22675220, np.pi / 4)
 """Joint angles at reset, rad (LIBERO's mounted Panda)."""
@@ -40,8 +40,8 @@ GRIPPER_START = (0.020833, -0.020833)
 """Finger positions at reset, m."""
 
 GRIPPER_OPEN = (0.04, -0.04)
-"""Finger positions of the open hand, m. They creep towards it for seconds: fingers that stand there from the start, as
-in the strict suite, do not tell how long ago they were closed."""
+"""Finger positions of the open hand, m. Opening fingers approach them for seconds; strict episodes start there, so that
+the finger positions do not reveal the time since they were closed."""
 
 ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
@@ -51,11 +51,10 @@ GRIP_SITE = "gripper0_grip_site"
 HAND_BODY = "robot0_right_hand"
 WRIST_CAMERA = "robot0_eye_in_hand"
 
-FACES_PER_SQUARE_METRE, LEAST_FACES, MOST_FACES = 6_000, 24, 700
-"""Density at which a visual mesh is drawn (a link of the arm has about 0.1 m²), and what one may have at least and at
-most."""
-HAND_FACES = 4
-"""How much denser the gripper is drawn: the wrist camera sees it from near."""
+FACE_DENSITY, MIN_FACES, MAX_FACES = 6_000, 24, 700
+"""Face density of simplified visual meshes (a link has about 0.1 m²), and bounds of the number of faces per mesh."""
+GRIPPER_DENSITY_FACTOR = 4
+"""Factor of the gripper's face density, because the wrist camera is close to it."""
 
 Vertices = NDArray[np.float64]
 """(N, 3) points, m."""
@@ -67,20 +66,20 @@ def robosuite_version() -> str:
     """Return the installed version of robosuite.
 
     Raises:
-        MemobenchError: it is not installed, or has another arm.
+        MemobenchError: robosuite is missing or has another version.
     """
     try:
         found = importlib.metadata.version("robosuite")
     except importlib.metadata.PackageNotFoundError:
         found = ""
     if found != ROBOSUITE:
-        there = f"robosuite {found}" if found else "none"
-        raise MemobenchError(f"the arm is that of robosuite {ROBOSUITE}, found {there}; run: {INSTALL_ROBOSUITE}")
+        installed = f"robosuite {found}" if found else "none"
+        raise MemobenchError(f"the arm requires robosuite {ROBOSUITE}, found {installed}; run: {INSTALL_ROBOSUITE}")
     return found
 
 
 def _robosuite_xml() -> str:
-    """Compose the arm's MJCF with robosuite, quietly: it warns about macro files that nobody needs here."""
+    """Compose the arm's MJCF with robosuite, without its warnings about unused macro files."""
     logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -99,7 +98,7 @@ def _robosuite_xml() -> str:
 
 
 def _build() -> dict[str, np.ndarray]:
-    """Return the MJCF text and, for each visual mesh, its thinned vertices and faces."""
+    """Return the MJCF text and, for each visual mesh, its simplified vertices and faces."""
     xml = _robosuite_xml()
     if arm_hash(xml) != ARM_SHA256:
         raise MemobenchError(
@@ -109,19 +108,19 @@ def _build() -> dict[str, np.ndarray]:
     drawn = set(re.findall(r'group="1"[^>]*\bmesh="([^"]+)"', xml))
     drawn |= set(re.findall(r'\bmesh="([^"]+)"[^>]*group="1"', xml))
     for name, file in re.findall(r'<mesh name="([^"]+)" file="([^"]+)"', xml):
-        # A mesh that is also collided with (a link drawn and felt by one file) keeps its own shape.
+        # Keep the shape of a mesh that is both visual and collision geometry.
         if name not in drawn or not ("vis" in name or "pedestal" in name):
             continue
         vertices, faces = read_mesh(Path(file))
-        density = FACES_PER_SQUARE_METRE * (HAND_FACES if name.startswith("gripper0") else 1)
-        target = max(LEAST_FACES, min(MOST_FACES, int(density * area(vertices, faces))))
+        density = FACE_DENSITY * (GRIPPER_DENSITY_FACTOR if name.startswith("gripper0") else 1)
+        target = max(MIN_FACES, min(MAX_FACES, int(density * area(vertices, faces))))
         vertices, faces = simplify(vertices, faces, target)
         arrays[f"v:{name}"], arrays[f"f:{name}"] = vertices, faces
     return arrays
 
 
 def arm_hash(xml: str) -> str:
-    """Return the hash of an MJCF text, without folders, and of the mesh files that it names."""
+    """Return the hash of an MJCF text without folder names and of its mesh files."""
     digest = hashlib.sha256(re.sub(r'file="[^"]*/', 'file="', xml).encode())
     for file in re.findall(r'<mesh name="[^"]+" file="([^"]+)"', xml):
         digest.update(Path(file).read_bytes())
@@ -129,7 +128,7 @@ def arm_hash(xml: str) -> str:
 
 
 def _cache_file() -> Path:
-    """Where the thinned arm is kept between processes, named by all that it depends on."""
+    """Return the cache file of the simplified arm, named by a hash of everything it depends on."""
     source = Path(__file__).read_bytes()
     versions = robosuite_version() + importlib.metadata.version("fast-simplification")
     key = hashlib.sha256(source + versions.encode()).hexdigest()[:16]
@@ -138,7 +137,7 @@ def _cache_file() -> Path:
 
 @cache
 def _arrays() -> dict[str, np.ndarray]:
-    """Load the thinned arm from the cache, or build it; a cache that cannot be written costs time, nothing else."""
+    """Load the simplified arm from the cache, or build it; an unwritable cache only costs time."""
     path = _cache_file()
     with contextlib.suppress(OSError, ValueError, KeyError, EOFError):
         with np.load(path, allow_pickle=False) as stored:
@@ -154,12 +153,12 @@ def _arrays() -> dict[str, np.ndarray]:
 
 
 def robot_xml() -> str:
-    """Return the MJCF of the arm and robosuite's physics options, its visual meshes with all their faces."""
+    """Return the MJCF of the arm and robosuite's physics options, with the original visual meshes."""
     return str(_arrays()["xml"])
 
 
 def robot_spec() -> mujoco.MjSpec:
-    """Return a fresh spec that holds the arm and robosuite's physics options, for a scene to be added to."""
+    """Return a new spec with the arm and robosuite's physics options, as the base of a scene."""
     spec = mujoco.MjSpec.from_string(robot_xml())
     _thin(spec)
     hide_helpers(spec)
@@ -167,7 +166,7 @@ def robot_spec() -> mujoco.MjSpec:
 
 
 def _thin(spec: mujoco.MjSpec) -> None:
-    """Give the arm of a scene the thinned meshes."""
+    """Replace the arm's visual meshes in a scene by the simplified ones."""
     arrays = _arrays()
     for mesh in spec.meshes:
         if f"v:{mesh.name}" in arrays:
@@ -177,29 +176,29 @@ def _thin(spec: mujoco.MjSpec) -> None:
 
 
 def hide_helpers(spec: mujoco.MjSpec) -> None:
-    """Draw nothing of the arm of a scene that a camera does not see, and let nothing touch what is drawn alone."""
+    """Hide the arm's debugging sites, and disable contacts of its visual geoms."""
     for geom in spec.geoms:
         if geom.meshname and "vis" not in geom.meshname and geom.group == 1:
             geom.contype, geom.conaffinity = 0, 0
-    # robosuite draws the grip site and its axes for debugging; a camera of the published stack does not see them.
+    # Cameras of the published stack do not show robosuite's grip site and axes.
     for site in spec.sites:
         site.group = 4
 
 
 @cache
 def whole_arm() -> mujoco.MjModel:
-    """Return the arm alone, its visual meshes with all their faces. It is compiled once, in less than a second."""
+    """Return the arm alone with its original visual meshes; compiled once, in less than a second."""
     return mujoco.MjModel.from_xml_string(robot_xml())
 
 
-# --- meshes: read and thinned out, since a face costs the same whether it is a pixel or not ---
+# --- reading and simplifying meshes ---
 
 
 def read_mesh(path: Path) -> tuple[Vertices, Faces]:
     """Read the points and triangles of an OBJ or binary STL file, equal points merged.
 
     Raises:
-        MemobenchError: for any other kind of file.
+        MemobenchError: the file has another format.
     """
     corners: NDArray[np.float64]
     faces: NDArray[np.integer]
@@ -222,7 +221,7 @@ def read_mesh(path: Path) -> tuple[Vertices, Faces]:
 
 
 def weld(vertices: Vertices, faces: Faces, cell: float) -> tuple[Vertices, Faces]:
-    """Merge the points that share a cell of a grid, m, and drop the faces that collapse."""
+    """Merge points that share a grid cell of size ``cell``, m, and drop collapsed faces."""
     grid = np.round(vertices / cell).astype(np.int64)
     _, first, index = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     faces = index.reshape(-1)[faces].astype(np.int32)
@@ -237,10 +236,10 @@ def area(vertices: Vertices, faces: Faces) -> float:
 
 
 def simplify(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices, Faces]:
-    """Reduce a mesh to about ``target`` faces by quadric edge collapse; smaller meshes come back as they are.
+    """Reduce a mesh to about ``target`` faces by quadric edge collapse; return smaller meshes unchanged.
 
-    CAD meshes are many loose shells, at whose seams no edge may collapse: points much nearer to each other than the
-    faces to come are merged first.
+    CAD meshes consist of many separate shells, and edges at their seams cannot collapse. Points much closer than the
+    resulting edge length are therefore merged first.
     """
     if len(faces) <= target:
         return vertices, faces
@@ -248,7 +247,7 @@ def simplify(vertices: Vertices, faces: Faces, target: int) -> tuple[Vertices, F
     vertices, faces = weld(vertices, faces, side / 6)
     if len(faces) <= target:
         return vertices, faces
-    import fast_simplification  # only the first scene on a machine needs it
+    import fast_simplification  # needed for the first scene on a machine only
 
     points, triangles = fast_simplification.simplify(vertices.astype(np.float32), faces, target_count=target, agg=5)
     return points.astype(np.float64), triangles.astype(np.int32)

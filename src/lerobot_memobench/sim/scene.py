@@ -1,4 +1,4 @@
-"""Compile a task's scene: kitchen, arm, fixtures, objects; once per task and process, seeds change only state."""
+"""Compile a task's scene: kitchen, arm, fixtures, objects. Scenes are compiled once; seeds change the state only."""
 
 from __future__ import annotations
 
@@ -27,57 +27,56 @@ AGENTVIEW = "agentview"
 AGENTVIEW_POSITION = (0.6586131746834771, 0.0, 1.6103500240372423)
 AGENTVIEW_QUATERNION = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
 AGENTVIEW_ANGLE = 45.0
-"""Its field of view, degrees."""
+"""Vertical field of view of the agentview camera, degrees."""
 
 PHYSICS_STEP = 0.002
 SUBSTEPS = round(1 / (CONTROL_HZ * PHYSICS_STEP))
 
 ARENA_BYTES = 32 * 2**20
-"""Room for contacts and constraints of one simulation."""
+"""Memory for contacts and constraints of one simulation."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A compiled scene. The model is shared: change a copy only."""
+    """A compiled scene. The model is shared; modify copies only."""
 
     key: tuple[str, ...]
     model: mujoco.MjModel
     assets: dict[str, Asset]
-    """Every fixture but the table, then every object, by instance name; in LIBERO's world objects go first."""
+    """Instance name -> asset: fixtures without the table, then objects; in LIBERO's world objects come first."""
     stand_ins: tuple[str, ...] = ()
-    """Classes that are boxes, because the user does not have the paper's scans of them."""
+    """Classes replaced by boxes because the paper's scans are not installed."""
     drawing: Callable[[], tuple[mujoco.MjModel, DrawList]] | None = None
-    """Returns a model with lights, of the same bodies and joints, and what to draw of it, where ``model`` has no
-    visual geoms."""
+    """Returns a visual model with equal bodies and joints, and its draw list; None if ``model`` has visual geoms."""
     opaque_group: int = VISUAL_GROUP
-    """Group of the geoms of ``model`` that hide things behind them."""
+    """Group of the opaque geoms of ``model``."""
 
 
 def scene_key(task: Task) -> tuple[str, ...]:
-    """Return the name of a task's scene. Variants of a task (another referent) share it: they differ in goal."""
+    """Return the cache key of a task's scene, which variants of a task share."""
     return task.name, task.suite, task.bddl_text, task.world
 
 
 def build_scene(task: Task) -> Scene:
-    """Return the compiled scene of a task in this package's own world."""
+    """Return the compiled scene of a task in the world `memobench`."""
     spec, assets = scene_spec(task)
     return Scene(scene_key(task), spec.compile(), assets)
 
 
 def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
-    """Return a task's scene as a specification that may still be changed or saved, and its assets by instance.
+    """Return a task's scene as an editable specification, and its assets by instance.
 
     Raises:
-        MemobenchError: the task is in another world than this package's own.
+        MemobenchError: the task is not in the world `memobench`.
     """
     if task.world != MEMOBENCH:
         raise MemobenchError(
-            f"the scene of task {task.name} is not written as MJCF in the world {task.world!r}; take world=memobench"
+            f"the scene of task {task.name} cannot be written as MJCF in the world {task.world!r}; use world=memobench"
         )
     spec = robot.robot_spec()
     spec.modelname = "memobench"
     spec.option.timestep = PHYSICS_STEP
-    # robosuite's files reserve room for 5,000 contacts, 1.3 GB of addresses per simulation; no scene uses 1 MB.
+    # robosuite's files reserve memory for 5,000 contacts, 1.3 GB per simulation; no scene uses 1 MB.
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
     build_kitchen(spec)
     place, turn = list(AGENTVIEW_POSITION), list(AGENTVIEW_QUATERNION)
@@ -93,44 +92,42 @@ def scene_spec(task: Task) -> tuple[mujoco.MjSpec, dict[str, Asset]]:
     return spec, assets
 
 
-# --- strict scenes: detents and rolling friction ---
+# --- strict scenes: detents, rolling friction and sealed drawers ---
 #
-# In the published scenes a drawer that was pushed shut stands up to 5 mm deeper than one that nobody has touched, and a
-# door or a knob rests wherever it was let go: a close look shows what has happened. In the strict suite each has a
-# detent, as furniture does: a spring that is over its dead centre near the closed end and presses against the stop,
-# which is where the joint starts. Away from the closed end it is slack, and everything moves as published.
+# Detents: in the published scenes a drawer that was pushed closed is up to 5 mm deeper than an untouched one, and doors
+# and knobs rest where they are released, so images reveal past events. In the strict suite each joint has a detent like
+# furniture: an over-centre spring near the closed end presses the joint against its stop, where it starts. Away from
+# the closed end the spring is slack and motion is as published.
 #
-# In the published scenes an artichoke in a drawer, or a biscuit on its edge, rolls on until something stops it; at the
-# back of a shut drawer no hand from above can take it. In the strict suite, where things are hidden and found, rolling
-# friction brings them to rest within a second.
+# Rolling friction: in the published scenes an artichoke in a drawer, or a biscuit on its edge, rolls until it hits
+# something; at the back of a drawer it cannot be grasped from above. In the strict suite, which hides objects, rolling
+# friction stops them within a second.
 #
-# In the published scenes a drawer has a play of 1.5 mm, through which the wrist camera sees its content. In the strict
-# suite a board behind the front fills the opening.
+# Seals: in the published scenes the wrist camera sees the content of a drawer through gaps of 1.5 mm. In the strict
+# suite a board behind the front closes the opening.
 
-LEVER = 0.05
+DETENT_LEVER = 0.05
 """Distance from a hinge to the spring's moving end, m."""
-OFFSET, SLACK = 0.5, 2.5
-"""Of the spring, in distances from dead centre to the closed end: from its fixed end to the way of the moving one, and
-the length from which on it does not press."""
-STIFF_STOP = (0.004, 1.0)
-"""`solref` of the stop: twice the physics step, the stiffest that is stable, so that pressing moves it by microns."""
-ROLLING = 0.002
-"""Rolling friction, m: how far from under the middle a surface holds a thing that rolls."""
-
+DETENT_OFFSET, DETENT_SLACK = 0.5, 2.5
+"""Distance from the spring's fixed end to the path of the moving end, and the spring's rest length, in units of the
+distance from dead centre to the closed end."""
+STIFF_STOP_SOLREF = (0.004, 1.0)
+"""`solref` of the stop: twice the physics step, the stiffest stable value; the spring moves the joint by microns."""
+ROLLING_FRICTION = 0.002
+"""Rolling friction coefficient, m."""
 
 DEAD_CENTRE = {"drawer": 0.009, "door": 0.035, "knob": 0.09}
 """Distance of the spring's dead centre from the closed end, m or rad."""
-_PRESS = {"drawer": 5.0, "door": 0.45, "knob": 0.15}
-"""Force of the spring at the closed end, N or Nm: more than the joint's friction, from wherever it counts as closed or
-off."""
+_DETENT_FORCE = {"drawer": 5.0, "door": 0.45, "knob": 0.15}
+"""Force of the spring at the closed end, N or Nm; exceeds the joint's friction at every closed position."""
 
 
 def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
-    """Give every drawer, door and knob of a scene a stop where it starts, and the spring that keeps it there."""
+    """Add to each drawer, door and knob a stop at its initial position and a spring that holds it there."""
     for asset in assets.values():
         for articulation in asset.articulations.values():
             joint = spec.joint(articulation.joint)
-            joint.solref_limit = list(STIFF_STOP)
+            joint.solref_limit = list(STIFF_STOP_SOLREF)
             if articulation.kind == "drawer":
                 joint.range = [joint.range[0], articulation.closed_q]
             _add_spring(spec, spec.body(asset.name), joint, articulation)
@@ -139,29 +136,29 @@ def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
 def _add_spring(
     spec: mujoco.MjSpec, fixture: mujoco.MjsBody, joint: mujoco.MjsJoint, articulation: Articulation
 ) -> None:
-    """Add the spring: it runs from beside the way of a point of the moving part to that point."""
-    travel, press = DEAD_CENTRE[articulation.kind], _PRESS[articulation.kind]
-    lever = 1.0 if articulation.kind == "drawer" else LEVER
+    """Add the spring from a fixed point near the path of a point of the moving part to that point."""
+    travel, press = DEAD_CENTRE[articulation.kind], _DETENT_FORCE[articulation.kind]
+    lever = 1.0 if articulation.kind == "drawer" else DETENT_LEVER
     reach = travel * lever
     dead_centre = articulation.closed_q + np.sign(articulation.open_q - articulation.closed_q) * travel
-    point, place = _way(joint, lever, dead_centre)
-    fixed = joint.parent.pos + place + OFFSET * reach * np.array([0.0, 0.0, 1.0])
+    point, place = _moving_point(joint, lever, dead_centre)
+    fixed = joint.parent.pos + place + DETENT_OFFSET * reach * np.array([0.0, 0.0, 1.0])
     ends = {"fixed": (fixture, fixed), "moving": (joint.parent, point)}
     tendon = spec.add_tendon(name=f"{joint.name}_detent", group=SITE_GROUP)
     for end, (body, position) in ends.items():
         name = f"{joint.name}_detent_{end}"
         body.add_site(name=name, pos=position.tolist(), size=[0.001] * 3, group=SITE_GROUP)
         tendon.wrap_site(name)
-    closed = float(np.hypot(1.0, OFFSET))
-    pushes = (SLACK - closed) / closed * reach * lever
+    closed = float(np.hypot(1.0, DETENT_OFFSET))
+    pushes = (DETENT_SLACK - closed) / closed * reach * lever
     stiffness = press / pushes
-    # Newer MuJoCo takes the coefficients of a polynomial.
+    # Newer MuJoCo versions expect polynomial coefficients.
     tendon.stiffness = stiffness if np.ndim(tendon.stiffness) == 0 else [stiffness, 0.0, 0.0]
-    tendon.springlength = [SLACK * reach, 1.0]
+    tendon.springlength = [DETENT_SLACK * reach, 1.0]
 
 
-def _way(joint: mujoco.MjsJoint, lever: float, q: float) -> tuple[Array, Array]:
-    """Return the point that moves, in the moving part's frame, and where it is at ``q`` in its parent's, (3,), m."""
+def _moving_point(joint: mujoco.MjsJoint, lever: float, q: float) -> tuple[Array, Array]:
+    """Return the spring's moving end in the moving part's frame, and its position at ``q`` in the parent's, (3,), m."""
     axis = np.asarray(joint.axis)
     if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
         return np.zeros(3), q * axis
@@ -170,16 +167,16 @@ def _way(joint: mujoco.MjsJoint, lever: float, q: float) -> tuple[Array, Array]:
 
 
 def stop_rolling(spec: mujoco.MjSpec, names: Iterable[str]) -> None:
-    """Give what the bodies of objects touch something to hold them by as they roll."""
+    """Add rolling friction to the geoms of objects."""
     for name in names:
         for geom in spec.body(name).find_all(mujoco.mjtObj.mjOBJ_GEOM):
             if geom.contype or geom.conaffinity:
                 geom.condim = 6
-                geom.friction = [*geom.friction[:2], ROLLING]
+                geom.friction = [*geom.friction[:2], ROLLING_FRICTION]
 
 
 def seal_drawers(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
-    """Add the boards that close the play of drawers: they are seen, and touched by nothing."""
+    """Add visual boards that close the gaps of drawers."""
     for asset in assets.values():
         for body, (centre, half) in asset.seals.items():
             spec.body(body).add_geom(

@@ -1,4 +1,4 @@
-"""One running scene: reset, step, look, ask."""
+"""Simulate one task: reset, step, render, and evaluate atoms."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.controller import CLOSING, make_controller
+from lerobot_memobench.sim.controller import CLOSING_SIGNS, make_controller
 from lerobot_memobench.sim.raster.drawlist import DrawList, Image
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
-from lerobot_memobench.sim.world import Start
+from lerobot_memobench.sim.world import StartState
 from lerobot_memobench.sim.worlds import KINDS, get_scene
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -35,22 +35,22 @@ NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
 
 class InvalidActionError(MemobenchError):
-    """An action that cannot be carried out: no numbers, of another shape, or not finite."""
+    """Invalid action: not numeric, wrong shape, or not finite."""
 
 
 class UnstablePhysicsError(MemobenchError):
-    """MuJoCo itself warns of its state: it has begun the scene anew, or left out what it had no room for."""
+    """MuJoCo reported a warning: it reset the scene, or exhausted its memory."""
 
 
 def as_action[F: np.floating](action: ArrayLike, dtype: type[F]) -> NDArray[F]:
-    """Return an action as an array (7,), finite.
+    """Return an action as a finite array (7,).
 
     Raises:
-        InvalidActionError: it is none.
+        InvalidActionError: the action is not numeric, has another shape, or is not finite.
     """
     try:
         array: NDArray[F] = np.asarray(action, dtype=dtype)
-    except (TypeError, ValueError):  # words, ragged lists, tensors of another device
+    except (TypeError, ValueError):  # text, ragged lists, tensors of another device
         raise InvalidActionError(
             f"an action is {reprlib.repr(action)}; expected {ACTION_DIM} numbers, as an array ({ACTION_DIM},)"
         ) from None
@@ -58,31 +58,31 @@ def as_action[F: np.floating](action: ArrayLike, dtype: type[F]) -> NDArray[F]:
         raise InvalidActionError(f"an action has shape {array.shape}; expected ({ACTION_DIM},)")
     if not np.isfinite(array).all():
         raise InvalidActionError(
-            f"an action holds a value that is not finite: {array.tolist()}; check the policy's output"
+            f"an action contains a value that is not finite: {array.tolist()}; check the policy's output"
         )
     return array
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that decides how a simulation goes on; see `Simulation.snapshot`."""
+    """Complete state of a simulation; see `Simulation.snapshot`."""
 
     physics: Array
     goal_position: Array
     goal_rotation: Array
     gripper: Array
     goes_on: bool
-    """Whether it continues the state before it (`Start.mark_step`)."""
+    """Whether the state continues its predecessor (`StartState.mark_step`)."""
 
 
 class Simulation:
-    """The scene of one task, stepped at 20 Hz.
+    """Simulate the scene of one task at 20 Hz.
 
-    After `reset` and after each `step`, positions, contacts and velocities-dependent terms in `data` belong to the
-    present state, so whatever is asked of the simulation is a function of `state()` and of where the fixtures stand.
+    After `reset` and each `step`, positions, contacts and velocity-dependent terms in `data` match the present state.
+    All queries are functions of `state()` and the fixtures' poses.
 
     Args:
-        task: what stands where; its goal does not matter here.
+        task: task that defines the scene; its goal is not used.
         render: size and quality of frames.
     """
 
@@ -93,14 +93,14 @@ class Simulation:
         self._scene = scene
         self._strict = task.suite == STRICT
         self.model: mujoco.MjModel = copy.copy(scene.model)
-        # robosuite's force and torque sensors cost time in every physics step, and nobody reads them.
+        # Disable robosuite's unused force and torque sensors, which cost time in each physics step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
         self.stand_ins, self.opaque_group = scene.stand_ins, scene.opaque_group
         kind = KINDS[task.world]
         self.world = kind.predicates(task, self.model, self.data, scene.assets)
-        self._start = Start(self.model, self.data, tuple(task.objects), self.world.joints)
+        self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
         self._at_home: Snapshot | None = None
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
@@ -117,12 +117,12 @@ class Simulation:
     # --- life -----------------------------------------------------------------------------------------------
 
     def reset(self, seed: int, settling: Callable[[Callable[[Atom], bool]], None] | None = None) -> None:
-        """Draw the initial state of a seed and let it settle for the stabilisation steps.
+        """Sample the initial state of a seed and run the stabilisation steps.
 
-        Equal seeds of equal tasks give bit-equal states, whatever was simulated before.
+        Equal seeds of equal tasks give bit-equal states, independent of earlier simulation.
 
         Args:
-            seed: of the scene.
+            seed: seed of the scene.
             settling: called with `holds` after each stabilisation step.
         """
         self._at_home = None
@@ -144,7 +144,7 @@ class Simulation:
         self.begin_execution()
 
     def begin_execution(self) -> None:
-        """Take the present state as the one with which the atoms of `SINCE_START` compare."""
+        """Store the present state as the reference of the atoms in `SINCE_START`."""
         self._start.mark_scene()
         self._begun = self.snapshot()
 
@@ -155,8 +155,8 @@ class Simulation:
             action: (7,) pose delta (±1 is ±5 cm, ±0.5 rad) and gripper (−1 open, +1 closed); clipped to [−1, 1].
 
         Raises:
-            InvalidActionError: it is none. Nothing has changed then.
-            UnstablePhysicsError: MuJoCo does not trust its state any more. Only `reset` helps then.
+            InvalidActionError: the action is invalid; the state is unchanged.
+            UnstablePhysicsError: MuJoCo reported a warning; call `reset` before further steps.
         """
         action = as_action(action, np.float64)
         time = self.data.time
@@ -164,7 +164,7 @@ class Simulation:
         self._controller.set_goal(self.data, action)
         self._controller.advance(self.data, float(action[6]), SUBSTEPS)
         self._check_physics(time)
-        closing = action[6] > 0.0  # a hand must be able to leave the detent by closing
+        closing = action[6] > 0.0  # closing the hand leaves the detent
         if self._at_home is not None and self._begun is not None and not closing and self._start.in_detent():
             if self._start.nearly_as_begun():
                 self._put_back(self._begun)
@@ -172,24 +172,24 @@ class Simulation:
                 self._put_back(self._at_home, arm_only=True)
 
     def _check_physics(self, time: float) -> None:
-        """Raise what MuJoCo has warned of since ``time``: it goes on from the model's initial state without a word."""
+        """Raise for MuJoCo's warnings; without the check it silently continues from the model's initial state."""
         counts = self.data.warning.number
         if counts.any():
             kind = int(counts.argmax())
-            said = mujoco.mju_warningText(kind, int(self.data.warning.lastinfo[kind])).split(".")[0]
+            warning = mujoco.mju_warningText(kind, int(self.data.warning.lastinfo[kind])).split(".")[0]
             counts[:] = 0
-            raise UnstablePhysicsError(f"the physics broke down {time:.2f} s after the scene was set up: {said}")
+            raise UnstablePhysicsError(f"the physics broke down {time:.2f} s after the scene was set up: {warning}")
 
     def _put_back(self, start: Snapshot, arm_only: bool = False) -> None:
-        """Restore a snapshot to the bit, except for the time: the whole scene, or arm, fingers and controller.
+        """Restore a snapshot to the bit, except for the time: the whole scene, or arm, fingers and controller only.
 
-        Joint angles too, not only the hand's pose: seven joints can hold one pose in many ways, and which one it is
-        would show where the arm has come from.
+        Joint angles are restored, not only the hand's pose: the arm is redundant, and its configuration would reveal
+        its earlier motion.
         """
         time, qpos, qvel = self.data.time, self.data.qpos.copy(), self.data.qvel.copy()
         self.restore(start)
         if arm_only:
-            others = max(self._finger_qpos) + 1  # the arm comes first in the model, its fingers last of it
+            others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
             self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
             mujoco.mj_step1(self.model, self.data)
         self.data.time = time
@@ -211,13 +211,17 @@ class Simulation:
         return np.concatenate([[self.data.time], self.data.qpos, self.data.qvel])
 
     def set_state(self, state: Array, fixture_poses: dict[str, Array] | None = None) -> None:
-        """Show a recorded state: what is asked and rendered afterwards belongs to it.
+        """Set a recorded state for queries and rendering.
 
-        The state shown before it counts as the one before (`Start.mark_step`).
+        The previously set state counts as its predecessor (`StartState.mark_step`).
 
         Args:
-            state: (state_dim,) as `state()` returns it.
-            fixture_poses: where the fixtures stood, as `fixture_poses()` returns it; as they are when left out.
+            state: (state_dim,) as returned by `state()`.
+            fixture_poses: as returned by `fixture_poses()`; unchanged by default.
+
+        Raises:
+            MemobenchError: the state has another shape.
+            UnstablePhysicsError: MuJoCo reported a warning.
         """
         state = np.asarray(state, dtype=np.float64)
         if state.shape != (self.state_dim,):
@@ -235,7 +239,7 @@ class Simulation:
         self._check_physics(float(state[0]))
 
     def fixture_poses(self) -> dict[str, Array]:
-        """Return position and quaternion wxyz (7,) of each fixture: they differ by seed and are not in `state()`."""
+        """Return position and quaternion wxyz (7,) of each fixture; they vary by seed and are not part of `state()`."""
         return {
             name: np.concatenate([self.model.body(name).pos, self.model.body(name).quat])
             for name, asset in self.assets.items()
@@ -243,7 +247,7 @@ class Simulation:
         }
 
     def snapshot(self) -> Snapshot:
-        """Return all that decides how the simulation goes on, controller and solver warm start included."""
+        """Return the complete state, including controller and solver warm start."""
         physics = np.empty(self.physics_dim)
         mujoco.mj_getState(self.model, self.data, physics, self._full)
         controller = self._controller
@@ -251,10 +255,11 @@ class Simulation:
         return Snapshot(physics, position, rotation, controller.gripper.copy(), self._start.goes_on)
 
     def restore(self, snapshot: Snapshot, *, replayed: bool = False) -> None:
-        """Go to a snapshot of this simulation, bit for bit.
+        """Restore a snapshot of this simulation, bit for bit.
 
         Args:
-            replayed: the present state is the one before the snapshot, as when it was taken.
+            snapshot: state returned by `snapshot`.
+            replayed: whether the present state precedes the snapshot, as in the original episode.
         """
         self._start.mark_step(goes_on=replayed and snapshot.goes_on)
         mujoco.mj_setState(self.model, self.data, snapshot.physics, self._full)
@@ -264,33 +269,33 @@ class Simulation:
         mujoco.mj_step1(self.model, self.data)
 
     def end_prompt(self, start: Snapshot, hidden: Sequence[tuple[str, str]] = ()) -> None:
-        """Undo what a demonstration prompt has done since ``start``; what it hid lies at rest in its drawer.
+        """Restore the state before a demonstration prompt, except for hidden objects, which rest in their drawers.
 
-        Drawers and bystanders go back to the bit as well: a drawer that holds something settles a nanometre from an
-        empty one, and a bottle that was brushed tells which way the hand went.
+        Drawers and other objects are restored to the bit: a drawer with content settles a nanometre from an empty one,
+        and a displaced bottle would reveal the hand's path.
 
         Args:
-            start: to go back to.
-            hidden: thing and place, as the episode's variant says; the scene's own task is the published variant.
+            start: state before the prompt.
+            hidden: pairs of object and region of the episode's variant; ``self.task`` is the published variant.
         """
         self.highlights = ()
-        lies = [self.data.body(thing).xpos - self._moves_with(place) for thing, place in hidden]
-        turned = [self.data.body(thing).xquat.copy() for thing, _ in hidden]
+        offsets = [self.data.body(name).xpos - self._region_position(region) for name, region in hidden]
+        rotations = [self.data.body(name).xquat.copy() for name, _ in hidden]
         self.restore(start)
-        for (thing, place), lay, quaternion in zip(hidden, lies, turned, strict=True):
-            joint = self.model.joint(int(self.model.body(thing).jntadr[0]))
-            where, speed = int(joint.qposadr[0]), int(joint.dofadr[0])
-            self.data.qpos[where : where + 7] = np.concatenate([self._moves_with(place) + lay, quaternion])
-            self.data.qvel[speed : speed + 6] = 0.0
+        for (name, region), offset, quaternion in zip(hidden, offsets, rotations, strict=True):
+            joint = self.model.joint(int(self.model.body(name).jntadr[0]))
+            qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
+            self.data.qpos[qpos : qpos + 7] = np.concatenate([self._region_position(region) + offset, quaternion])
+            self.data.qvel[dof : dof + 6] = 0.0
         mujoco.mj_step1(self.model, self.data)
 
-    def _moves_with(self, place: str) -> Array:
-        """Return where a drawer's region (3,) is now; the origin for a region of the table, which does not move."""
+    def _region_position(self, place: str) -> Array:
+        """Return the present position (3,) of a drawer's region; zeros for a region of the table, which is fixed."""
         site = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, place)
         return self.data.site_xpos[site].copy() if site >= 0 else np.zeros(3)
 
     def scene_hash(self) -> str:
-        """Return a short hash of the present state and of where the fixtures stand."""
+        """Return a short hash of the present state and the fixtures' poses."""
         digest = hashlib.sha256(self.state().tobytes())
         for name, pose in sorted(self.fixture_poses().items()):
             digest.update(name.encode() + pose.tobytes())
@@ -299,7 +304,7 @@ class Simulation:
     # --- observation ----------------------------------------------------------------------------------------
 
     def render(self, camera: str = "agentview") -> Image:
-        """Return what a camera (`agentview` or `wrist`) sees, (height, width, 3) uint8, upright."""
+        """Return the image of a camera (`agentview` or `wrist`), (height, width, 3) uint8, upright."""
         model, data, draw_list = self._drawing()
         for asset, geom in self._glowing:
             lit = self.holds(Atom("turnon", (asset.name,)))
@@ -308,15 +313,15 @@ class Simulation:
         return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
 
     def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
-        """Return the id of the geom that each pixel of a camera's picture shows, (height, width), -1 for none."""
+        """Return the id of the visible geom at each pixel of a camera's image, (height, width), -1 for none."""
         model, data, draw_list = self._drawing()
         rasterizer = get_rasterizer(self._scene.key, model, self.render_settings, draw_list)
         return rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
 
     def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData, DrawList | None]:
-        """Return the model to draw, its present state, and what to draw of it, None for all that is visual.
+        """Return model, data and draw list for rendering; None as draw list selects all visual geoms.
 
-        They are those that move, or the scene's drawing in the same pose.
+        Return the simulated model, or the scene's separate visual model in the same pose.
         """
         if self._scene.drawing is None:
             return self.model, self.data, None
@@ -349,7 +354,7 @@ class Simulation:
 
     @property
     def at_detent(self) -> bool:
-        """Whether the hand is where home's detent catches it once it rests; there is one in strict scenes alone."""
+        """Whether the hand is within the detent at home, which catches it at rest; strict scenes only."""
         return self._at_home is not None and self._start.at_detent()
 
     def gripper_opening(self) -> float:
@@ -358,8 +363,8 @@ class Simulation:
         return float(fingers[0] - fingers[1])
 
     def gripper_command(self) -> float:
-        """Return what the fingers are told, from −1 (open) to 1 (closed): an action changes it by a quarter."""
-        return float(self._controller.gripper @ CLOSING) / 2
+        """Return the gripper command, from −1 (open) to 1 (closed); a control step changes it by a quarter."""
+        return float(self._controller.gripper @ CLOSING_SIGNS) / 2
 
     def body_pose(self, name: str) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of an instance or body."""
@@ -367,7 +372,7 @@ class Simulation:
         return body.xpos.copy(), body.xmat.reshape(3, 3).copy()
 
     def asset_pose(self, name: str) -> tuple[Array, Array]:
-        """Return position (3,) and rotation (3, 3) of an instance's frame as its `Asset` has it: upright, z is up."""
+        """Return position (3,) and rotation (3, 3) of an instance's `Asset` frame, with z up."""
         position, rotation = self.body_pose(name)
         upright = self.assets[name].upright
         if upright is None:
@@ -395,9 +400,9 @@ def _mjcf_camera(camera: str) -> str:
 
 
 def axis_angle(quaternion: Array) -> Array:
-    """Return the rotation vector (3,) of a quaternion wxyz as robosuite and openpi compute it.
+    """Return the rotation vector (3,) of a quaternion wxyz, computed as in robosuite and openpi.
 
-    The sign of the quaternion is kept: the hand's stays continuous through a half turn, a canonical form would jump.
+    The sign of the quaternion is kept: the result is continuous through a half turn, unlike a canonical form.
     """
     w = float(np.clip(quaternion[0], -1.0, 1.0))
     norm = np.sqrt(1.0 - w * w)

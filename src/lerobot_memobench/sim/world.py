@@ -1,7 +1,7 @@
-"""Answer the atoms of the task language from the simulator's state.
+"""Evaluate the atoms of the task language on the simulator's state.
 
-`World` knows the predicates of the present, whose meaning is LIBERO's, so that results compare (paper, section 3.1).
-`Start` knows those that compare the present with how the execution began: is the hand home, is the scene as it was?
+`World` evaluates predicates of the present state with LIBERO's semantics (paper, section 3.1). `StartState` evaluates
+predicates that compare the present state with the start of the execution.
 """
 
 from __future__ import annotations
@@ -25,40 +25,44 @@ from lerobot_memobench.tasks.task import Task
 ON_DISTANCE = 0.03
 """Horizontal distance of origins below which one object counts as on another, m."""
 IN_SLACK = 0.01
-"""How far under a region's lower bound an origin still counts as in it, m."""
+"""Distance below a region's lower bound at which an origin still counts as inside, m."""
 ON_SITE_BELOW, ON_SITE_ABOVE = 0.005, 0.10
-"""Heights around a site's top between which an origin counts as on it, m."""
+"""Distances below and above a site's top between which an origin counts as on it, m."""
 
 DETENT_DISTANCE = 0.02
-"""How far from where it was the grip site is caught, m: twice what learned policies miss it by."""
+"""Largest distance of the grip site from home for the detent, m; twice the error of learned policies."""
 DETENT_ANGLE = 0.1
-"""How far the hand may be turned from how it was, rad."""
+"""Largest rotation of the hand from home for the detent, rad."""
 DETENT_OPENING = 0.01
-"""How far each finger may be from where it was, m: a hand that holds something is not caught."""
+"""Largest distance of each finger from home for the detent, m; excludes a hand that holds an object."""
 DETENT_SPEED = (0.03, 0.15)
-"""How fast the hand may be, m/s and rad/s: learned policies hover at 2 cm/s. An action of 0.2 leaves in a step."""
+"""Largest speed of the hand for the detent, m/s and rad/s; learned policies hover at 2 cm/s. An action of 0.2 leaves
+the detent in one step."""
 SAME_STATE = 1e-4
-"""Difference of positions and velocities (m, rad, m/s, rad/s) below which two states are equal. States that were read
-from a file are rounded."""
+"""Largest difference of positions and velocities (m, rad, m/s, rad/s) between equal states; states in files are
+rounded."""
 PLACE_DISTANCE = 0.01
-"""Distance of an object from its start below which it is in place, m: two pixels."""
+"""Largest distance of an object in place from its start, m; two pixels."""
 LIFTED_HEIGHT = 0.02
-"""Height of an object above its start from which it is lifted, m: more than a push raises it."""
+"""Height above its start from which an object is lifted, m; more than a push raises it."""
 DETENT_SHIFT, DETENT_TURN = 0.001, 0.02
-"""Distance (m) and angle (rad) of an object from its start up to which home's detent puts it back."""
+"""Largest distance (m) and angle (rad) of an object from its start for the detent to restore it."""
 
 
 class World:
-    """What is true of one simulation, asked atom by atom.
+    """Evaluate predicates of the present state of one simulation.
 
-    Positions and contacts must belong to the present state (after `mujoco.mj_step1` or `mujoco.mj_forward`).
+    Positions and contacts must match the present state (after `mujoco.mj_step1` or `mujoco.mj_forward`).
+
+    Attributes:
+        joints: name in atoms -> articulation and address in qpos, of each drawer, door and knob.
     """
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
         self._instances = {name: index for index, name in enumerate(assets)}
         self._table = len(self._instances)
-        # Which instance each geom belongs to: the root of its body's tree, −1 for robot and room.
+        # Owner of each geom: the instance at the root of its body's tree, −1 for robot and room.
         roots = {model.body(name).id: index for name, index in self._instances.items()}
         self._owner = np.full(model.ngeom, -1)
         for geom in range(model.ngeom):
@@ -78,8 +82,7 @@ class World:
         """Return whether an atom is true now.
 
         Raises:
-            MemobenchError: when the atom names something that is not in the scene, or asks a thing that cannot be
-                opened or switched.
+            MemobenchError: a name is not in the scene, or the predicate does not apply to it.
         """
         match atom.predicate:
             case "in":
@@ -90,7 +93,7 @@ class World:
             case "open" | "close" | "turnon" | "turnoff":
                 return self._articulated(atom.predicate, atom.args[0])
         raise MemobenchError(
-            f"the simulator cannot answer {atom.predicate!r}: it knows in, on, open, close, turnon, turnoff"
+            f"the simulator cannot answer {atom.predicate!r}; available: in, on, open, close, turnon, turnoff"
         )
 
     def touching(self, a: str, b: str) -> bool:
@@ -102,7 +105,7 @@ class World:
         return bool(np.any((owners[:, 0] != owners[:, 1]) & np.isin(owners, list(pair)).all(axis=1)))
 
     def articulation(self, name: str) -> tuple[Articulation, float]:
-        """Return the joint behind a drawer, door or knob, and its position, m or rad."""
+        """Return the articulation of a drawer, door or knob, and its position, m or rad."""
         if name not in self.joints:
             raise MemobenchError(
                 f"{name!r} of task {self._task.name} cannot be opened or switched; {nearest(name, self.joints)}"
@@ -171,15 +174,14 @@ class World:
         return max((name for name in self._instances if region.startswith(f"{name}_")), key=len)
 
 
-class Start:
+class StartState:
     """Compare the present state with the start of the execution.
 
-    Any tolerance within which a pose or a place may differ can carry a number from one event to the next. Strict scenes
-    have none: home has a detent, which puts back the arm (`in_detent`) and, if the scene is nearly as it began
-    (`nearly_as_begun`), everything else.
+    A tolerance of poses could store a count between events. Strict scenes have none: a detent at home restores the arm
+    (`in_detent`) and, if the scene is nearly in its start state (`nearly_as_begun`), the whole scene.
 
     Args:
-        model, data: of the simulation; poses must belong to the present state.
+        model, data: model and data of the simulation; poses must match the present state.
         objects: names of the objects.
         joints: name in atoms -> articulation and address in qpos, of each door, drawer and knob.
     """
@@ -196,16 +198,16 @@ class Start:
         self._model = model
         self._fingers = [int(model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
         arm = np.arange(max(self._fingers) + 1)  # arm and fingers are first in the model, with one position a joint
-        self._arm_part = np.concatenate([arm, model.nq + arm])
-        self._left: NDArray[np.float64] | None = None
+        self._arm_indices = np.concatenate([arm, model.nq + arm])
+        self._previous: NDArray[np.float64] | None = None
         self._bodies = {name: int(model.body(name).id) for name in objects}
         self._joints = joints
         self.mark_hand()
         self.mark_scene()
 
     def mark_hand(self) -> None:
-        """Take the arm's present state as its home."""
-        self._arm, self._left = self._state_now()[self._arm_part], None
+        """Store the arm's present state as home."""
+        self._arm, self._previous = self._current_state()[self._arm_indices], None
         self._position, self._rotation, self._opening = self._hand()
 
     @property
@@ -214,21 +216,21 @@ class Start:
         return self._position, self._rotation
 
     def mark_step(self, goes_on: bool = True) -> None:
-        """Note the state in which a step begins: a hand that leaves home in it was there.
+        """Store the state at the beginning of a step: a hand that leaves home in the step still counts as home.
 
         Args:
-            goes_on: whether the state continues the one before; False after a restore.
+            goes_on: whether the present state precedes the next one; False for a restore.
         """
-        self._left = self._state_now() if goes_on else None
+        self._previous = self._current_state() if goes_on else None
 
     @property
     def goes_on(self) -> bool:
-        """Whether the state continues the one before."""
-        return self._left is not None
+        """Whether the present state continues its predecessor."""
+        return self._previous is not None
 
     def mark_scene(self) -> None:
-        """Take the present state of the scene as the one in which the execution begins."""
-        self._begun = self._state_now()
+        """Store the present state of the scene as the start of the execution."""
+        self._start_state = self._current_state()
         self._places = {name: self._data.xpos[body].copy() for name, body in self._bodies.items()}
         self._turns = {name: self._data.xquat[body].copy() for name, body in self._bodies.items()}
 
@@ -240,9 +242,9 @@ class Start:
         """
         match atom.predicate, atom.args:
             case "handhome", ():
-                return self._is_or_was(self._arm, self._arm_part)
+                return self._is_or_was_equal(self._arm, self._arm_indices)
             case "asbegun", ():
-                return self._is_or_was(self._begun)
+                return self._is_or_was_equal(self._start_state)
             case "ajar", (name,):
                 return self._is_ajar(name)
             case "lifted", (name,):
@@ -251,14 +253,14 @@ class Start:
         return self._shift(name) <= PLACE_DISTANCE
 
     def nearly_as_begun(self) -> bool:
-        """Return whether objects and joints are so near their start that home's detent puts them back."""
+        """Return whether all objects and joints are close enough to their start for the detent to restore them."""
         return all(self._shift(name) <= DETENT_SHIFT and self._turn(name) <= DETENT_TURN for name in self._bodies) and (
             all(self._joint_shift(name) <= DEAD_CENTRE[self._joints[name][0].kind] for name in self._joints)
         )
 
-    def _is_or_was(self, state: NDArray[np.float64], part: Any = ...) -> bool:
-        """Whether a part of the state is, or was at the beginning of the step, equal to ``state``."""
-        states = [self._state_now()] if self._left is None else [self._state_now(), self._left]
+    def _is_or_was_equal(self, state: NDArray[np.float64], part: Any = ...) -> bool:
+        """Return whether part of the state equals ``state`` now or did at the beginning of the step."""
+        states = [self._current_state()] if self._previous is None else [self._current_state(), self._previous]
         return any(bool(np.abs(one[part] - state).max() <= SAME_STATE) for one in states)
 
     def _is_ajar(self, name: str) -> bool:
@@ -270,29 +272,29 @@ class Start:
         return self._joint_shift(name) > DEAD_CENTRE[joint.kind] and not open_or_on
 
     def _shift(self, name: str) -> float:
-        """Distance of an object from its start, m."""
+        """Return the distance of an object from its start, m."""
         return float(np.linalg.norm(self._data.xpos[self._bodies[name]] - self._places[name]))
 
     def _turn(self, name: str) -> float:
-        """Angle of an object from its start, rad."""
+        """Return the angle of an object from its start, rad."""
         cosine = abs(float(self._data.xquat[self._bodies[name]] @ self._turns[name]))
         return 2.0 * float(np.arccos(min(cosine, 1.0)))
 
     def _joint_shift(self, name: str) -> float:
-        """Distance of a joint from its start, m or rad."""
+        """Return the distance of a joint from its start, m or rad."""
         address = self._joints[name][1]
-        return abs(float(self._data.qpos[address] - self._begun[address]))
+        return abs(float(self._data.qpos[address] - self._start_state[address]))
 
-    def _state_now(self) -> NDArray[np.float64]:
-        """Positions and velocities of everything."""
+    def _current_state(self) -> NDArray[np.float64]:
+        """Return positions and velocities of the whole scene."""
         return np.append(self._data.qpos, self._data.qvel)
 
     def in_detent(self) -> bool:
-        """Return whether the open hand has come to rest near its home, so that the detent catches it."""
+        """Return whether the open hand is near home and at rest, so that the detent catches it."""
         return self.at_detent() and bool(np.all(self._speed() <= DETENT_SPEED))
 
     def at_detent(self) -> bool:
-        """Return whether the open hand is so near its home that the detent would catch it at rest."""
+        """Return whether the open hand is close enough to home for the detent, at any speed."""
         position, rotation, opening = self._hand()
         cosine = (np.trace(self._rotation.T @ rotation) - 1.0) / 2.0
         return bool(
@@ -302,14 +304,14 @@ class Start:
         )
 
     def _speed(self) -> NDArray[np.float64]:
-        """Speed of the grip site, m/s and rad/s, (2,)."""
-        velocity = np.empty(6)  # the turning first
+        """Return the speed of the grip site (2,), m/s and rad/s."""
+        velocity = np.empty(6)  # angular part first
         site = mujoco.mjtObj.mjOBJ_SITE
         mujoco.mj_objectVelocity(self._model, self._data, site, self._grip, velocity, 0)
         return np.array([np.linalg.norm(velocity[3:]), np.linalg.norm(velocity[:3])])
 
     def _hand(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Position (3,), rotation (3, 3) of the grip site and finger positions (2,)."""
+        """Return position (3,) and rotation (3, 3) of the grip site, and finger positions (2,)."""
         data = self._data
         rotation = data.site_xmat[self._grip].reshape(3, 3).copy()
         return data.site_xpos[self._grip].copy(), rotation, data.qpos[self._fingers].copy()

@@ -1,4 +1,4 @@
-"""Choose by a task's world what makes its scene, places its things and answers its predicates."""
+"""Select scene builder, placement and predicates by a task's world."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from lerobot_memobench.sim.world import World
 from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, Task
 
 CACHED_SCENES = 4
-"""Compiled scenes kept per process: evaluation takes one task after the other, each scene has some MB."""
+"""Compiled scenes cached per process, some MB each; evaluation runs tasks one after another."""
 
 
 class Places(Protocol):
-    """Write where everything starts into a simulation."""
+    """Places fixtures and objects in a simulation."""
 
     def place(self, seed: int) -> Placement:
-        """Draw the placement of a seed, leave it written in model and data, and return it."""
+        """Sample the placement of a seed, write it into model and data, and return it."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What makes a world.
+    """Components of a world.
 
     Attributes:
         build: compiles a task's scene.
-        placer: places the things of a simulation: task, model, data, assets -> placer.
-        predicates: answers atoms of a simulation: task, model, data, assets -> world.
-        check: raises where a file that its scenes are built of is missing or another one.
+        placer: returns the placer of a simulation from task, model, data, assets.
+        predicates: returns the evaluator of atoms of a simulation from task, model, data, assets.
+        check: raises `MemobenchError` if an asset file is missing or has unexpected content.
     """
 
     build: Callable[[Task], Scene]
@@ -56,13 +56,12 @@ _scenes: OrderedDict[tuple[str, ...], Scene] = OrderedDict()
 
 
 def get_scene(task: Task) -> Scene:
-    """Return the compiled scene of a task in its world, from this process's cache where it is there."""
+    """Return the compiled scene of a task in its world, cached per process."""
     key = scene_key(task)
     if key in _scenes:
         _scenes.move_to_end(key)
         return _scenes[key]
-    found = KINDS[task.world].build(task)
-    _scenes[key] = found
+    scene = _scenes[key] = KINDS[task.world].build(task)
     while len(_scenes) > CACHED_SCENES:
         _scenes.popitem(last=False)
-    return found
+    return scene

@@ -1,9 +1,9 @@
-"""BDDL problems in LIBERO's dialect: how a task's scene, instruction and goal are written down.
+"""Parse BDDL problems in LIBERO's dialect: the scene, instruction and goal of a task.
 
 A file holds ``(define (problem NAME) (:domain ..) (:language ..) (:regions ..) (:fixtures ..) (:objects ..)
-(:obj_of_interest ..) (:init ..) (:goal ..))``. Keywords and predicates are read in any case; names keep theirs, and a
-reference that differs from the declared name only in case means that name. Anything unknown is an error that tells
-file and line; but a region on an undeclared target is let pass until it is used.
+(:obj_of_interest ..) (:init ..) (:goal ..))``. Keywords and predicates are case-insensitive. Names keep their case;
+references to them ignore it. Unknown items raise an error with file and line, except a region on an undeclared target,
+which raises only when it is used.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _KINDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "inplace": (("object",),),
     "lifted": (("object",),),
 }
-"""Predicate -> what each of its arguments may be; the others speak of what can be opened or switched."""
+"""Predicate -> allowed kinds of each argument; other predicates take a joint (`_JOINTED`)."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,8 @@ class Region:
     Attributes:
         name: name inside the file; atoms use ``full_name``.
         target: fixture (or object) that carries the region.
-        ranges: rectangles (x1, y1, x2, y2) in metres relative to the target's centre; empty for a site of the
-            target itself.
-        yaw: interval (low, high) in radians from which the yaw of what starts here is drawn.
+        ranges: rectangles (x1, y1, x2, y2) relative to the target's centre, m; empty for a site of the target.
+        yaw: interval (low, high) of the initial yaw, rad.
     """
 
     name: str
@@ -66,16 +65,16 @@ class Region:
 
     @property
     def full_name(self) -> str:
-        """The name by which atoms refer to the region: ``<target>_<name>``."""
+        """Name used in atoms: ``<target>_<name>``."""
         return f"{self.target}_{self.name}"
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What a BDDL file says; names in ``init`` and ``goal`` are declared. Mappings keep the file's order.
+    """A parsed BDDL file; names in ``init`` and ``goal`` are declared. Mappings keep the file's order.
 
     Attributes:
-        unplaced: region whose target is not declared -> the sentence that says so when it is used.
+        unplaced: region on an undeclared target -> error message for atoms that use it.
     """
 
     name: str
@@ -98,7 +97,11 @@ class Problem:
         return "region" if name in self.regions else None
 
     def resolve(self, formula: Formula, where: str) -> Formula:
-        """Return ``formula`` with its names spelt as declared; one that is not, or does not fit, raises."""
+        """Return ``formula`` with names in their declared spelling.
+
+        Raises:
+            MemobenchError: a name is not declared, or its kind does not fit the predicate.
+        """
         declared = {name.lower(): name for name in (*self.objects, *self.fixtures, *self.regions)}
         spelling: dict[str, str] = {}
         for atom in atoms(formula):
@@ -114,7 +117,7 @@ class Problem:
         return rename(formula, spelling)
 
     def _check_unplaced(self, name: str) -> None:
-        """Raise where a name means a region on what is not declared: as it is written, or as it should have been."""
+        """Raise if a name refers to a region on an undeclared target, with or without a typing error in the target."""
         for region, problem in self.unplaced.items():
             if name.lower().endswith(f"_{region.name}".lower()):
                 raise MemobenchError(problem)
@@ -130,18 +133,19 @@ class Problem:
 
 
 def parse_bddl(text: str, path: object = "<text>") -> Problem:
-    """Read a BDDL problem; ``path`` is only named in errors.
+    """Parse a BDDL problem; ``path`` appears in error messages only.
 
-    Raises ``MemobenchError`` with file, line, what was found and what was expected.
+    Raises:
+        MemobenchError: with file, line, the unexpected item and the expected one.
     """
-    # Comments become spaces, so that offsets and line numbers stay those of the file.
+    # Replace comments by spaces to preserve offsets and line numbers.
     blanked = re.sub(r";[^\n]*", lambda match: " " * len(match.group()), text)
     reader = Reader(str(path), blanked)
     root = reader.read()
     name, nodes = _problem(reader, root)
     sections = _sections(reader, root, nodes)
     problem = _declared(reader, name, sections)
-    # Goal and starting state are read last, against what is declared.
+    # Goal and initial state refer to the declarations, so they are parsed last.
     goals = _items(sections, ":goal")
     if len(goals) != 1:
         raise reader.error(sections[":goal"], f"{len(goals)} formulas in :goal", "exactly one")
@@ -149,7 +153,7 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
 
 
 def _problem(reader: Reader, root: Node) -> tuple[str, list[Node]]:
-    """Return the problem's name and the nodes of its sections."""
+    """Return the problem's name and its section nodes."""
     expected = "(define (problem NAME) ...)"
     head, rest = reader.head(root, expected)
     if head != "define" or not rest:
@@ -180,7 +184,7 @@ def _items(sections: dict[str, Node], key: str) -> list[Node]:
 
 
 def _declared(reader: Reader, name: str, sections: dict[str, Node]) -> Problem:
-    """Return the problem with all that it declares; starting state and goal are still empty."""
+    """Return the problem with its declarations; initial state and goal are empty."""
     names = _Names(reader)
     fixtures = _declarations(reader, _items(sections, ":fixtures"), names)
     objects = _declarations(reader, _items(sections, ":objects"), names)
@@ -209,7 +213,7 @@ def _domain(reader: Reader, node: Node | None) -> str:
 
 
 def _language(reader: Reader, node: Node) -> str:
-    """The free text as written, white space joined; it may hold commas, dots and balanced parentheses."""
+    """Return the free text with white space collapsed; it may contain commas, dots and balanced parentheses."""
     assert node.items is not None
     language = " ".join(reader.text[node.items[0].end : node.end - 1].split())
     if not language:
@@ -218,7 +222,7 @@ def _language(reader: Reader, node: Node) -> str:
 
 
 def _declarations(reader: Reader, nodes: list[Node], names: _Names) -> dict[str, str]:
-    """Read ``a b - class c - class`` into {instance: class}."""
+    """Parse ``a b - class c - class`` into {instance: class}."""
     expected = "names, '-' and a class, such as 'bowl_1 bowl_2 - akita_black_bowl'"
     declared: dict[str, str] = {}
     waiting: list[Node] = []
@@ -254,22 +258,22 @@ def _of_interest(reader: Reader, nodes: list[Node], names: _Names) -> tuple[str,
 
 
 class _Names:
-    """Declared names, found again in any case; no two may differ in case alone."""
+    """Case-insensitive registry of declared names; rejects names that differ only in case."""
 
     def __init__(self, reader: Reader) -> None:
         self._reader = reader
         self._declared: dict[str, tuple[str, str]] = {}
 
-    def declare(self, node: Node, name: str, what: str) -> None:
-        """Add a name that stands at ``node``; ``what`` it is, for the message when it comes again."""
+    def declare(self, node: Node, name: str, kind: str) -> None:
+        """Add the name declared at ``node``; ``kind`` describes it in the error for a second declaration."""
         if name.lower() in self._declared:
             first = " ".join(self._declared[name.lower()])
-            expected = f"another name, since {first} is there"
+            expected = f"another name, because {first} exists"
             raise self._reader.error(node, f"the name {name!r} declared again", expected)
-        self._declared[name.lower()] = (what, name)
+        self._declared[name.lower()] = (kind, name)
 
     def spelling(self) -> dict[str, str]:
-        """Return lower case -> name as declared, of all names so far."""
+        """Return lower-case name -> declared name."""
         return {key: name for key, (_, name) in self._declared.items()}
 
 
@@ -277,9 +281,9 @@ class _Names:
 
 
 def _regions(reader: Reader, nodes: list[Node], names: _Names) -> tuple[dict[str, Region], dict[Region, str]]:
-    """Return full name -> region, and declare these names; and the regions on what is not declared.
+    """Declare the regions; return full name -> region, and unplaced region -> error message.
 
-    LIBERO's files hold some of those, which nothing uses. Each comes with the sentence for who does.
+    LIBERO's files contain unused regions on undeclared targets.
     """
     regions: dict[str, Region] = {}
     unplaced: dict[Region, str] = {}
@@ -295,7 +299,7 @@ def _regions(reader: Reader, nodes: list[Node], names: _Names) -> tuple[dict[str
 
 
 def _region(reader: Reader, node: Node, targets: Mapping[str, str]) -> tuple[Region, str | None]:
-    """Return a region, and what is wrong with its target."""
+    """Return a region, and the error message for an undeclared target."""
     items = reader.sequence(node, _REGION)
     if not items:
         raise reader.error(node, "an empty list ()", _REGION)
@@ -318,7 +322,7 @@ def _region(reader: Reader, node: Node, targets: Mapping[str, str]) -> tuple[Reg
 
 
 def _clause(reader: Reader, clause: Node, name: str, seen: set[str]) -> tuple[str, Node]:
-    """Return a clause's keyword and its one value; ``seen`` holds the keywords before it and takes this one."""
+    """Return a clause's keyword and value; add the keyword to ``seen``, which rejects duplicates."""
     key, values = reader.head(clause, "(:target ...), (:ranges ...) or (:yaw_rotation ...)")
     if key in seen:
         raise reader.error(clause, f"a second {key} in region {name!r}", "one")
@@ -332,7 +336,7 @@ def _clause(reader: Reader, clause: Node, name: str, seen: set[str]) -> tuple[st
 
 
 def _target(reader: Reader, clause: Node, value: Node, name: str, targets: Mapping[str, str]) -> tuple[str, str | None]:
-    """Return a target as it is declared; one that is not as it is written, with the sentence that says so."""
+    """Return a target in its declared spelling; for an undeclared one the given spelling and the error message."""
     given = reader.word(value, "the name of a fixture or object")
     if given.lower() in targets:
         return targets[given.lower()], None
@@ -363,7 +367,7 @@ def _yaw(reader: Reader, clause: Node, value: Node, name: str) -> tuple[float, f
     return low, high
 
 
-# --- goal and starting state ---
+# --- goal and initial state ---
 
 
 def _formula(reader: Reader, problem: Problem, node: Node, depth: int = 0) -> Formula:
@@ -381,12 +385,12 @@ def _formula(reader: Reader, problem: Problem, node: Node, depth: int = 0) -> Fo
 
 
 def _number(word: str) -> int | str:
-    """Return a word as the whole number that it is, or as it stands."""
+    """Return a word as an integer, or unchanged if it is not one."""
     return int(word) if word.isascii() and word.isdigit() and len(word) < 10 else word
 
 
 def _init(reader: Reader, problem: Problem, section: Node) -> tuple[Atom, ...]:
-    """Return the starting state: atoms only, every object placed once, nothing resting on itself."""
+    """Return the initial state: atoms only, each object placed once, no cycle of supports."""
     found: list[Atom] = []
     support: dict[str, str] = {}
     for node in (section.items or [])[1:]:
@@ -417,7 +421,7 @@ def _init_atom(reader: Reader, problem: Problem, node: Node) -> Atom:
 
 
 def _check_ranges(reader: Reader, problem: Problem, node: Node, thing: str, place: str) -> None:
-    """Raise where ``thing`` starts on a region of the table that does not say where on it."""
+    """Raise if ``thing`` starts on a table region without ranges."""
     region = problem.regions.get(place)
     if region and not region.ranges and "table" in problem.fixtures.get(region.target, ""):
         found = f"{thing!r} on region {region.name!r} without :ranges"
@@ -425,7 +429,7 @@ def _check_ranges(reader: Reader, problem: Problem, node: Node, thing: str, plac
 
 
 def _check_bottom(reader: Reader, section: Node, support: Mapping[str, str]) -> None:
-    """Raise where following what each thing rests on leads in a circle."""
+    """Raise if the supports of a thing form a cycle."""
     for name in support:
         chain, below = [name], support.get(name)
         while below is not None:

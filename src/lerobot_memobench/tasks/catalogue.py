@@ -1,7 +1,7 @@
-"""The catalogue: the benchmark's 30 published and 30 strict tasks, as folders beside this module; loading a folder.
+"""List and load the 30 published and 30 strict tasks, and task folders in the published format.
 
-A folder holds ``task_config.bddl`` and ``task_config.meta.json``. The project's own and folders in the published format
-are read alike; what the published metadata does not say is told from the folder and the instruction.
+A task folder holds ``task_config.bddl`` and ``task_config.meta.json``. Values missing from published metadata are
+inferred from the folder name and the instruction.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from lerobot_memobench.tasks.task import (
 #: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over both suites.
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"
 
-NUMBERS = re.compile(r"(\d+)(?:-(\d+))?")
-"""A task's number, or a range of them, both ends included."""
+TASK_NUMBERS = re.compile(r"(\d+)(?:-(\d+))?")
+"""A task number, or an inclusive range of numbers."""
 
-NUMERIC = re.compile(r"[\d -]*[\d-]")
-"""What can be meant for nothing but these."""
+NUMERIC_ENTRY = re.compile(r"[\d -]*[\d-]")
+"""An entry of digits, spaces and hyphens only; reported as a malformed number or range if it is not one."""
 
 BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
-"""The task that shows in little time what a memory is for: which of three bowls it is, the prompt alone tells."""
+"""Short demonstration task: only the prompt video shows which of three bowls is meant."""
 
 _PROMPT_WORDS: tuple[tuple[str, PromptKind], ...] = (
     ("picked up", "pick"),
@@ -67,43 +67,43 @@ def _folders() -> dict[str, Path]:
 
 
 def suite_of(name: str) -> str | None:
-    """Return the suite of a task of the catalogue, None for a name that is not in it."""
+    """Return the suite of a catalogue task, None for an unknown name."""
     return _folders()[name].parent.parent.name if name in _folders() else None
 
 
 def check_suite(suite: str) -> str:
-    """Return the name of a suite; an unknown one is an error."""
+    """Return ``suite``; raise `MemobenchError` if it is unknown."""
     check_choice("suite", suite, SUITES)
     return suite
 
 
 def task_names(memory_types: str | Iterable[str] | None = None, suite: str | None = PUBLISHED) -> list[str]:
-    """Return the names of a suite's tasks, or of those of one or several memory types, in catalogue order.
+    """Return the names of a suite's tasks in catalogue order, optionally of some memory types only.
 
-    ``suite=None`` stands for both suites, the published one first.
+    ``suite=None`` selects both suites, the published one first.
     """
-    there = [name for name in _folders() if suite is None or suite_of(name) == check_suite(suite)]
+    names = [name for name in _folders() if suite is None or suite_of(name) == check_suite(suite)]
     if memory_types is None:
-        return there
+        return names
     wanted = [memory_types] if isinstance(memory_types, str) else list(memory_types)
     for memory_type in wanted:
         if memory_type not in MEMORY_TYPES:
             raise MemobenchError(f"found the memory type {memory_type!r}, expected one of {', '.join(MEMORY_TYPES)}")
-    return [name for name in there if _folders()[name].parent.name in wanted]
+    return [name for name in names if _folders()[name].parent.name in wanted]
 
 
 def task_index(name: str) -> int:
-    """Return the stable number of a task: its position in ``task_names(suite=None)``."""
+    """Return the stable index of a task: its position in ``task_names(suite=None)``."""
     return list(_folders()).index(task_folder(name).name)
 
 
 def task_number(name: str) -> int:
-    """Return the short number of a task: its place in its own suite's catalogue order, from 1 on."""
+    """Return the number of a task within its suite, in catalogue order from 1."""
     return task_names(suite=task_folder(name).parent.parent.name).index(name) + 1
 
 
 def task_folder(name: str) -> Path:
-    """Return the folder of a task of the catalogue; an unknown name is an error that tells the nearest known ones."""
+    """Return the folder of a catalogue task; an unknown name raises `MemobenchError` with the nearest names."""
     if name not in _folders():
         raise MemobenchError(f"found no task named {name!r} in the catalogue, {nearest(name, _folders())}")
     return _folders()[name]
@@ -111,15 +111,15 @@ def task_folder(name: str) -> Path:
 
 @cache
 def get_task(name: str) -> Task:
-    """Return a task of the catalogue; errors as of `task_folder`."""
+    """Return a catalogue task; raises as `task_folder`."""
     return load_task(task_folder(name))
 
 
 def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str]:
-    """Return the task names of a suite meant by "all", memory types, names, or several of them separated by commas.
+    """Return the task names selected by "all", memory types, names, numbers, or a comma-separated list of these.
 
-    A number (`task_number`) or a range, such as ``12`` or ``3-7``, stands for tasks of the suite. Names that hold
-    commas themselves are recognised. The order given is kept and repetitions are dropped.
+    A number (`task_number`) or a range, such as ``12`` or ``3-7``, selects tasks of the suite. Names that contain
+    commas are recognised. The given order is kept; repetitions are dropped.
     """
     check_suite(suite)
     if not isinstance(spec, str):
@@ -143,8 +143,8 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
             if not word:
                 given = "nothing" if not spec.strip() else f"an empty entry in {spec!r}"
                 raise MemobenchError(
-                    f"found {given} among the tasks; expected names, numbers or memory types with one comma between "
-                    "two of them, or 'all'"
+                    f"found {given} among the tasks; expected 'all', or names, numbers or memory types separated by "
+                    "single commas"
                 )
             hint = nearest(word, ["all", *MEMORY_TYPES, *task_names(suite=suite)])
             raise MemobenchError(
@@ -155,37 +155,36 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
 
 
 def _check_all_alone(entries: list[str]) -> None:
-    """Refuse "all" beside others, of which one of the two cannot be meant."""
+    """Raise if "all" is combined with other entries."""
     if len(entries) > 1 and "all" in [entry.strip() for entry in entries]:
         raise MemobenchError(
-            f"found 'all' beside others among the tasks, {','.join(entries)!r}; 'all' stands alone: name it, or the "
-            "others"
+            f"found 'all' with other entries among the tasks, {','.join(entries)!r}; name either 'all' or the others"
         )
 
 
 def _expand(word: str, suite: str) -> list[str]:
-    """Return the tasks that a word means, none for an unknown one."""
+    """Return the tasks selected by one entry, none for an unknown entry."""
     if word == "all" or word in MEMORY_TYPES:
         return task_names(None if word == "all" else word, suite)
-    if NUMERIC.fullmatch(word) is not None:
-        names, numbers = task_names(suite=suite), NUMBERS.fullmatch(word)
+    if NUMERIC_ENTRY.fullmatch(word) is not None:
+        names, numbers = task_names(suite=suite), TASK_NUMBERS.fullmatch(word)
         first, last = (0, 0) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
         if not 1 <= first <= last <= len(names):
-            backwards = "that range runs backwards; " if first > last else ""
-            wrong = "that is no whole range; " if numbers is None else backwards
+            reversed_range = "the range is reversed; " if first > last else ""
+            problem = "this is not a complete range; " if numbers is None else reversed_range
             raise MemobenchError(
-                f"found {word} among the tasks; {wrong}those of the {suite} suite are numbered 1 to {len(names)}, "
-                "a range is such as 3-7 (`memobench tasks` lists them)"
+                f"found {word} among the tasks; {problem}tasks of the {suite} suite are numbered 1 to {len(names)}, "
+                "an example of a range is 3-7 (`memobench tasks` lists them)"
             )
         return names[first - 1 : last]
     own = suite_of(word)
     if own not in (None, suite):
-        raise MemobenchError(f"{word!r} is a task of the {own} suite; say suite={own}, or --suite {own}")
+        raise MemobenchError(f"{word!r} is a task of the {own} suite; set suite={own}, or --suite {own}")
     return [] if own is None else [word]
 
 
 def task_record(task: Task, state_dim: int) -> dict[str, Any]:
-    """Return the item of ``memobench tasks --json``; ``state_dim`` (1 + nq + nv) is the compiled model's."""
+    """Return the entry of ``memobench tasks --json``; ``state_dim`` is 1 + nq + nv of the compiled model."""
     return {
         "name": task.name,
         "memory_type": task.memory_type,
@@ -214,14 +213,14 @@ def _by_class(instances: dict[str, str]) -> dict[str, list[str]]:
     return grouped
 
 
-# --- task folders, of the catalogue or in the published format ---
+# --- task folders ---
 
 
 def find_tasks(folder: str | Path) -> list[Path]:
-    """Return the task folders in a tree: the folder itself, or all below it that hold a task file, sorted.
+    """Return the sorted task folders in a tree, the folder itself included.
 
     Raises:
-        MemobenchError: there is no such folder, or no task in it.
+        MemobenchError: the folder does not exist or contains no task.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -233,15 +232,18 @@ def find_tasks(folder: str | Path) -> list[Path]:
 
 
 def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
-    """Load a task folder, of the catalogue or in the published format.
+    """Load a task folder.
 
-    ``require_metadata=False`` lets a folder without a metadata file load as a task without checkpoints; a
-    metadata file that is there is always read in full. Where the metadata does not say it, the memory type is
-    the parent folder's name if that is one of the four; else ``procedural`` or ``object`` for an instruction
-    that speaks of a prompt or video (procedural when it also speaks of a procedure, sequence or steps),
-    ``temporal`` when the goal holds a latch, and ``spatial`` otherwise.
+    A memory type missing from the metadata is the parent folder's name if it is one of the four. Otherwise it is
+    ``procedural`` or ``object`` for an instruction that mentions a prompt or video (``procedural`` if it also mentions
+    a procedure, sequence or steps), ``temporal`` if the goal contains a latch, else ``spatial``.
 
-    Raises ``MemobenchError`` that names file, place, what was found and what was expected.
+    Args:
+        folder: task folder.
+        require_metadata: False loads a folder without a metadata file as a task without checkpoints.
+
+    Raises:
+        MemobenchError: with file, place, the value found and the value expected.
     """
     folder = Path(folder).resolve()
     if not folder.is_dir():
@@ -302,9 +304,9 @@ def _infer_prompt(memory_type: MemoryType, problem: Problem, checkpoints: tuple[
 
 
 def _infer_referent(problem: Problem, checkpoints: tuple[Checkpoint, ...]) -> str | None:
-    """The object that the prompt is about, from the first checkpoint that names objects (else from the goal).
+    """Return the prompt's object, from the first checkpoint that names objects, else from the goal.
 
-    Of its objects it is the first that could be mistaken for another of its class, else the first.
+    Prefer the first object with siblings of its class, which could be confused, over the first object.
     """
     siblings = Counter(problem.objects.values())
     for formula in (*(checkpoint.goal for checkpoint in checkpoints), problem.goal):

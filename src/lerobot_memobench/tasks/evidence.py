@@ -1,8 +1,8 @@
-"""A scene with each of a task's variants: only the past differs. Which variant did an execution choose to act on?
+"""Determine which variant an execution acts on, and the chance level of a policy without memory.
 
-The instruction of most variants is the same, so the right answer follows from the past alone, from the demonstration
-prompt. A policy without the past that cannot look before it chooses gives the same answer in all variants. Its rate of
-right ones is the chance.
+Episodes run one scene with each variant of a task, so only the past differs. Most variants share an instruction: the
+demonstration prompt alone determines the correct answer. A policy without memory gives the same answer in all variants;
+its success rate is the chance level.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from lerobot_memobench.tasks.task import REFERENTS, Task
 
 
 def scene_and_variant(task: Task, episode: int) -> tuple[int, int]:
-    """Return which scene an episode has, from 0 on, and which variant: each scene goes through all of them."""
+    """Return scene index (from 0) and variant of an episode; consecutive episodes cycle through a scene's variants."""
     choices = task.random_variants
     return episode // len(choices), choices[episode % len(choices)]
 
 
 def check_referent(prefix: str, referent: str) -> None:
-    """Refuse to run each variant where the published one alone is asked for; ``prefix`` stands before a setting's name.
+    """Check that evidence episodes may use all variants; ``prefix`` precedes setting names in the message.
 
     Raises:
-        MemobenchError: it is.
+        MemobenchError: ``referent`` allows the published variant only.
     """
     if referent == REFERENTS[0]:
         raise MemobenchError(
-            f"{prefix}evidence=true runs each scene with each variant, and {prefix}referent={referent} the published "
-            f"one alone; say referent={REFERENTS[1]}"
+            f"{prefix}evidence=true runs each scene with each variant, but {prefix}referent={referent} allows the "
+            f"published variant only; say referent={REFERENTS[1]}"
         )
 
 
 def chance(task: Task) -> float | None:
-    """Return the best rate without the past: the most frequent goal of each instruction. None where it tells the goal.
+    """Return the best success rate without memory: always choose the most frequent goal of the instruction.
 
-    Two hidden things may have the same goal in several variants: where the other one lies changes nothing.
+    None if the instruction determines the goal. Variants that differ in the other hidden object only share a goal.
     """
     goals: dict[str, Counter[Formula]] = {}
     for variant in _variants(task):
@@ -53,33 +53,33 @@ def _variants(task: Task) -> list[Task]:
 
 
 class Choice:
-    """Follows which variant an execution acts on; call ``step`` once per execution step.
+    """Determine the variant an execution acts on; call ``step`` once per execution step.
 
-    The answer is given by the objects that are lifted and the joints that are moved, in order: when they fit one goal
-    alone, it is chosen; when they fit none, the answer is wrong. Where the goals handle the same things in the same
-    order (one object, several places), the goal that comes true first is chosen, or the only one that still can.
+    The sequence of lifted objects and moved joints decides. If it fits the goal of one variant only, that variant is
+    chosen; if it fits none, the answer is wrong. If goals handle the same objects in the same order (one object,
+    several places), the first goal to become true is chosen, or the only one that is still reachable.
 
     Args:
-        task: the variant that is being run. The execution chooses among those of its instruction; among all of them
-            where the instruction leaves no choice, such as how often something is to be done.
+        task: variant that is run. Candidates are the variants with its instruction, or all variants if the
+            instruction determines the goal (for example a count).
     """
 
     def __init__(self, task: Task) -> None:
         variants = _variants(task)
         same = [one for one in variants if one.language == task.language]
         rivals = same if len({one.goal for one in same}) > 1 else variants
-        # Of variants that share a goal, the one that is run stands for it, else the first.
+        # Variants that share a goal are represented by the one that is run, else by the first.
         self._variants = {one.goal: one.variant_index for one in reversed(rivals)} | {task.goal: task.variant_index}
         self._evaluator = Evaluator(self._variants)
         self._first: int | None = None
         self._fitting = {
-            one.variant_index: handled(one) for one in rivals if one.variant_index in self._variants.values()
+            one.variant_index: handled_atoms(one) for one in rivals if one.variant_index in self._variants.values()
         }
         self._watched = list(dict.fromkeys(atom for order in self._fitting.values() for atom in order))
         self._handled: list[Atom] = []
 
     def step(self, holds: Callable[[Atom], bool]) -> None:
-        """Take in the state after one control step."""
+        """Evaluate the state after one control step."""
         if len(self._fitting) < 2 or self._first is not None:
             return
         for atom in self._watched:
@@ -94,12 +94,12 @@ class Choice:
 
     @property
     def answered(self) -> bool:
-        """Whether an answer was given, though it may be none of the variants'."""
+        """Whether an answer was given, including answers that fit no variant."""
         return self.variant is not None or not self._fitting
 
     @property
     def variant(self) -> int | None:
-        """The variant that was chosen; None where nothing was, or none of them."""
+        """Chosen variant; None without an answer or for an answer that fits no variant."""
         if self._first is not None or not self._fitting:
             return self._first
         if len(self._fitting) == 1:
@@ -109,8 +109,8 @@ class Choice:
         return left[0] if len(left) == 1 else None
 
 
-def handled(task: Task) -> list[Atom]:
-    """Return the objects that a task's checkpoints lift and the joints that they move, in order, each once."""
+def handled_atoms(task: Task) -> list[Atom]:
+    """Return atoms for the objects lifted and joints moved by a task's checkpoints, in order, without repetitions."""
     found = []
     for atom in (atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)):
         if atom.predicate in ("on", "in"):

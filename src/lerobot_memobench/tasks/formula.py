@@ -1,8 +1,7 @@
-"""Formulas of goals and checkpoints: trees of atoms under operators, the published four and the strict suite's five.
+"""Define, build, check, traverse and format formulas of goals and checkpoints: trees of operators over atoms.
 
-What an atom means is the world's business; what operators and latches (``wasopen``, ``wasturnedon``) mean over time
-is `tasks.nodes`'s (the table is in ``docs/benchmark/formulas.md``). Here stand the words of the language; formulas are
-made, checked, from words or from JSON, walked through and written.
+The published tasks use four operators; the strict suite adds five. The simulator evaluates atoms. `tasks.nodes`
+implements operators and latches (``wasopen``, ``wasturnedon``) over time, see ``docs/benchmark/formulas.md``.
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ PREDICATES: dict[str, tuple[str, int]] = {
     "lifted": ("Lifted", 1),
 }
 
-#: Latched predicate -> the predicate of the world that sets it.
+#: Latched predicate -> the simulator predicate that sets it.
 LATCHES: dict[str, str] = {"wasopen": "open", "wasturnedon": "turnon"}
 
-#: Predicates that compare the present with how the execution began; they say nothing of a starting state.
+#: Predicates that compare the present with the start of the execution; invalid in ``:init``.
 SINCE_START = frozenset({"handhome", "asbegun", "ajar", "inplace", "lifted"})
 
 #: Largest number in a formula: more steps than any episode has.
 MAX_NUMBER = 100_000
 
-#: Formulas deeper than this are refused (no task comes near; it keeps recursion bounded on malformed files).
+#: Maximum nesting depth; bounds recursion on malformed files.
 MAX_DEPTH = 40
 
 
@@ -56,14 +55,14 @@ class Atom:
 
 @dataclass(frozen=True)
 class And:
-    """True when all children are; every child is evaluated at every step."""
+    """True when all children are true; every child is evaluated at every step."""
 
     children: tuple[Formula, ...]
 
 
 @dataclass(frozen=True)
 class Or:
-    """True when some child is; every child is evaluated at every step."""
+    """True when any child is true; every child is evaluated at every step."""
 
     children: tuple[Formula, ...]
 
@@ -77,14 +76,14 @@ class Not:
 
 @dataclass(frozen=True)
 class Then:
-    """True once the children have been done in order, and from then on; see ``Evaluator``."""
+    """True from the step in which the last child is done, in order, onwards; see ``Evaluator``."""
 
     children: tuple[Formula, ...]
 
 
 @dataclass(frozen=True)
 class Never:
-    """True as long as the child has not been true in any step so far; false for good from then on."""
+    """True until the child is true in any step, then permanently false."""
 
     child: Formula
 
@@ -99,7 +98,7 @@ class Hold:
 
 @dataclass(frozen=True)
 class Exactly:
-    """True while the child has come true (after a step in which it was false, or at first) ``number`` times so far."""
+    """True while the child has had exactly ``number`` rising edges (the first step counts as one)."""
 
     number: int
     child: Formula
@@ -107,17 +106,14 @@ class Exactly:
 
 @dataclass(frozen=True)
 class When:
-    """Of two children, the first moment of the first decides: true from then on if the second is true in that step.
-
-    False before; false for good when the second is false in that step.
-    """
+    """Latch the value of the second child in the first step in which the first child is true; false before."""
 
     children: tuple[Formula, ...]
 
 
 @dataclass(frozen=True)
 class Round:
-    """True in the step in which the last child comes true after the ones before it, in order; then it begins anew."""
+    """True in the step in which the last child comes true after the earlier ones, in order; then restart."""
 
     children: tuple[Formula, ...]
 
@@ -131,12 +127,12 @@ OPERATORS: dict[str, type[Formula]] = {made.__name__.lower(): made for made in _
 
 
 def is_operator(word: str) -> bool:
-    """Return whether ``word`` is an operator's, in any case."""
+    """Return whether ``word`` names an operator, ignoring case."""
     return word.lower() in OPERATORS
 
 
 def takes_number(word: str) -> bool:
-    """Return whether ``word`` is an operator whose formula follows a number, such as ``Exactly 2``."""
+    """Return whether ``word`` names an operator with a number before its formula, such as ``Exactly 2``."""
     return word.lower() in ("hold", "exactly")
 
 
@@ -144,14 +140,14 @@ def takes_number(word: str) -> bool:
 
 
 def children(formula: Formula) -> tuple[Formula, ...]:
-    """Return the direct parts of ``formula`` (none for an atom)."""
+    """Return the direct children of ``formula``; an atom has none."""
     if isinstance(formula, Atom):
         return ()
     return (formula.child,) if isinstance(formula, Not | Never | Hold | Exactly) else formula.children
 
 
 def atoms(formula: Formula) -> Iterator[Atom]:
-    """Yield the atoms of ``formula`` from left to right, repeated ones as often as they occur."""
+    """Yield the atoms of ``formula`` from left to right, including repetitions."""
     if isinstance(formula, Atom):
         yield formula
     for child in children(formula):
@@ -186,15 +182,15 @@ def format_formula(formula: Formula) -> str:
     return f"({' '.join([type(formula).__name__, *number, *map(format_formula, children(formula))])})"
 
 
-# --- making: every complaint says where ---
+# --- building: every error message names the place ---
 
-#: Operators over a fixed number of formulas; the others take one or more.
+#: Operators with a fixed number of children; the others take one or more.
 _PARTS: dict[type[Formula], int] = {Not: 1, Never: 1, Hold: 1, Exactly: 1, When: 2}
 _WORDS = {1: "exactly one", 2: "exactly two"}
 
 
 def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> Atom:
-    """Return a checked atom; ``where`` (file and line) opens the message of a ``MemobenchError``."""
+    """Return a checked atom; ``where`` (file and line) is the prefix of error messages."""
     key = predicate.lower()
     if key not in PREDICATES:
         hint = nearest(key, [*PREDICATES, *OPERATORS])
@@ -212,7 +208,7 @@ def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> At
 def make_operator(
     operator: str, parts: Sequence[Formula], where: str = "formula", number: int | str | None = None
 ) -> Formula:
-    """Return an operator, one of `OPERATORS` in any case, over its parts; `Hold`, `Exactly` need a number from 1 on."""
+    """Return a checked operator of `OPERATORS` (case-insensitive); `Hold` and `Exactly` need a number from 1."""
     made = OPERATORS[operator.lower()]
     counted = [_checked_number(number, made.__name__, where)] if takes_number(operator) else []
     if not parts:
@@ -235,18 +231,25 @@ def _checked_number(number: Any, after: str, where: str) -> int:
     return number
 
 
-# --- reading JSON, as metadata files write formulas: nested lists, objects, or both ---
+# --- reading JSON formulas of metadata files: nested lists, objects, or both ---
 
 _KEYS = ", ".join(map(repr, OPERATORS))
 
 
 def parse_formula(value: Any, where: str = "formula", depth: int = 0) -> Formula:
-    """Read a formula from nested lists or JSON objects.
+    """Parse a formula from nested lists or JSON objects.
 
-    ``["And", ["On", "a", "b"]]`` and ``{"and": [["on", "a", "b"]]}`` are the same. Words are read in any
-    case, the two shapes may be mixed, and an operator may hold a bare atom instead of a list. A number stands before
-    the formula: ``["exactly", 2, ["open", "a"]]``, ``{"exactly": [2, ["open", "a"]]}``. Raises ``MemobenchError``
-    whose message starts with ``where``. ``depth`` tells how deep within another formula it stands.
+    ``["And", ["On", "a", "b"]]`` and ``{"and": [["on", "a", "b"]]}`` are equal. Words are case-insensitive, both forms
+    may be mixed, and an operator may hold a bare atom instead of a list. A number precedes the formula:
+    ``["exactly", 2, ["open", "a"]]``, ``{"exactly": [2, ["open", "a"]]}``.
+
+    Args:
+        value: lists and objects as read from JSON.
+        where: prefix of error messages.
+        depth: nesting depth within the outermost formula.
+
+    Raises:
+        MemobenchError: ``value`` is not a formula.
     """
     if depth > MAX_DEPTH:
         raise MemobenchError(f"{where}: found a formula nested deeper than {MAX_DEPTH} levels, expected a flatter one")
@@ -255,19 +258,21 @@ def parse_formula(value: Any, where: str = "formula", depth: int = 0) -> Formula
     elif isinstance(value, (list, tuple)) and value and isinstance(value[0], str):
         head, items = value[0], value[1:]
     else:
-        raise MemobenchError(f"{where}: found {short(value)}, expected a formula such as ['on', 'a', 'b']")
+        raise MemobenchError(f"{where}: found {short_repr(value)}, expected a formula such as ['on', 'a', 'b']")
     if is_operator(head):
         numbered = takes_number(head) and items and not isinstance(items[0], (list, tuple, Mapping))
         number, parts = (items[0], items[1:]) if numbered else (None, items)
         return make_operator(head, [parse_formula(item, where, depth + 1) for item in parts], where, number)
     for item in items:
         if not isinstance(item, str) or not item:
-            raise MemobenchError(f"{where}: found {short(item)} as an argument of {head!r}, expected an entity name")
+            raise MemobenchError(
+                f"{where}: found {short_repr(item)} as an argument of {head!r}, expected an entity name"
+            )
     return make_atom(head, items, where)
 
 
 def _from_object(value: Mapping[Any, Any], where: str) -> tuple[str, Sequence[Any]]:
-    """Return the operator of a JSON object and what it holds."""
+    """Return the operator of a JSON object and its operands."""
     if len(value) != 1:
         raise MemobenchError(f"{where}: found an object with {len(value)} keys, expected one of {_KEYS}")
     ((head, rest),) = value.items()
@@ -277,11 +282,11 @@ def _from_object(value: Mapping[Any, Any], where: str) -> tuple[str, Sequence[An
     bare = isinstance(rest, Mapping) or (isinstance(rest, (list, tuple)) and rest and isinstance(rest[0], str))
     items = [rest] if bare else rest
     if not isinstance(items, (list, tuple)):
-        raise MemobenchError(f"{where}: found {short(rest)} under {head!r}, expected a list of formulas")
+        raise MemobenchError(f"{where}: found {short_repr(rest)} under {head!r}, expected a list of formulas")
     return head, items
 
 
-def short(value: Any) -> str:
-    """Return a value as messages show it: as Python writes it, at most 40 characters."""
+def short_repr(value: Any) -> str:
+    """Return the ``repr`` of a value for messages, at most 40 characters."""
     text = repr(value)
     return text if len(text) <= 40 else text[:37] + "..."

@@ -1,13 +1,12 @@
-"""Read a task's metadata file: checkpoints, prompt, variants, and what the project's own catalogue adds.
+"""Read a task's metadata file: checkpoints, prompt, variants, and keys of the strict suite.
 
 Keys (K checkpoints): ``memory`` (K lists of three texts: coarse, intermediate, fine), ``operating_type`` (K lists of
 three labels, 0 Storage, 1 Update, 2 Compression, per text level), ``subtask_goals`` (K formulas). Optional:
-``key_frame`` (K integers), ``timestep_exec_start_idx`` (integer or list of integers), ``demo_summary`` (text). Of this
-project, optional too: ``memory_type``, ``family``, ``prompt`` ({"kind", "target"}), ``variants`` (list of {"memory",
-and optionally "substitute", "order", "subtask_goals", "goal", "demo_summary", "language", "prompt",
-"replaces_published"}), and of the strict suite ``suite``, ``derived_from``, ``drawn``, ``spoilt_as`` (see `Task`). A
-hiding is the prompt {"kind": "hide", "places": [[thing, drawer], ...]}. Other keys are kept in ``Task.metadata``
-untouched.
+``key_frame`` (K integers), ``timestep_exec_start_idx`` (integer or list of integers), ``demo_summary`` (text). Optional
+keys of this project: ``memory_type``, ``family``, ``prompt`` ({"kind", "target"}), ``variants`` (list of {"memory", and
+optionally "substitute", "order", "subtask_goals", "goal", "demo_summary", "language", "prompt", "replaces_published"}),
+and for the strict suite ``suite``, ``derived_from``, ``drawn``, ``spoilt_as`` (see `Task`). A hiding is the prompt
+{"kind": "hide", "places": [[object, drawer], ...]}. ``Task.metadata`` keeps all keys.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any, cast, get_args
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.bddl import Problem
-from lerobot_memobench.tasks.formula import Formula, parse_formula, rename, short
+from lerobot_memobench.tasks.formula import Formula, parse_formula, rename, short_repr
 from lerobot_memobench.tasks.task import (
     OPERATIONS,
     Checkpoint,
@@ -42,21 +41,21 @@ _VARIANT_KEYS = {
     "prompt",
     "replaces_published",
 }
-HOLDS = (
+METADATA_CONTENT = (
     "'memory' (three texts per checkpoint: coarse, intermediate, fine), 'operating_type' (three labels per checkpoint: "
     "0 Storage, 1 Update, 2 Compression), 'subtask_goals' (one formula per checkpoint) and 'key_frame' (-1 per "
     "checkpoint)"
 )
-"""What a metadata file holds, for messages."""
+"""Content of a metadata file, for error messages."""
 
 
 class Metadata:
-    """What a metadata file says of a problem; each method checks its part and raises `MemobenchError`.
+    """Content of a metadata file; each method checks its keys and raises `MemobenchError`.
 
     Args:
-        path: the file, for messages.
-        problem: the BDDL file beside it, which declares the names.
-        data: the file's content; {} where there is no file: a task without checkpoints.
+        path: path of the file, for messages.
+        problem: BDDL problem of the same folder; declares the names.
+        data: content of the file; {} without a file, for a task without checkpoints.
     """
 
     def __init__(self, path: Path, problem: Problem, data: dict[str, Any]) -> None:
@@ -64,30 +63,30 @@ class Metadata:
 
     @classmethod
     def read(cls, path: Path, problem: Problem) -> Metadata:
-        """Read a file that must be there."""
+        """Read a file and check its required keys."""
         data = json_object(path)
         missing = [key for key in _REQUIRED if key not in data]
         if missing:
             lacks = ", ".join(map(repr, missing))
-            raise MemobenchError(f"{path} lacks {lacks}, expected an object that holds {HOLDS}")
+            raise MemobenchError(f"{path} lacks {lacks}, expected an object that holds {METADATA_CONTENT}")
         return cls(path, problem, data)
 
     def _error(self, place: str, found: Any, expected: str) -> MemobenchError:
-        return MemobenchError(f"{self.path}: found {place} = {short(found)}, expected {expected}")
+        return MemobenchError(f"{self.path}: found {place} = {short_repr(found)}, expected {expected}")
 
     def text(self, key: str) -> str:
-        """Return an optional text, "" where it is not given."""
+        """Return an optional text; "" by default."""
         return _text(self.data, key, str(self.path))
 
     def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> Any:
-        """Return an optional word, one of those allowed, or the default where it is not given."""
+        """Return an optional word out of ``allowed``, or the default."""
         value = self.data.get(key, default)
         if value != default and value not in allowed:
             raise self._error(key, value, f"one of {', '.join(allowed)}")
         return value
 
     def flag(self, key: str) -> bool:
-        """Return an optional truth value, False where it is not given."""
+        """Return an optional boolean; False by default."""
         value = self.data.get(key, False)
         if not isinstance(value, bool):
             raise self._error(key, value, "true or false")
@@ -96,7 +95,7 @@ class Metadata:
     # --- checkpoints ---
 
     def checkpoints(self) -> tuple[Checkpoint, ...]:
-        """Return the checkpoints; none where there is no file."""
+        """Return the checkpoints; empty without a file."""
         if not self.data:
             return ()
         goals = self.data["subtask_goals"]
@@ -147,7 +146,7 @@ class Metadata:
     # --- prompt ---
 
     def prompt(self) -> Prompt | None:
-        """Return what the demonstration prompt shows; the file must say it, with null for no prompt."""
+        """Return the demonstration prompt of the key ``prompt``; null means none."""
         value = self.data["prompt"]
         return None if value is None else self._prompt(value, "prompt")
 
@@ -159,7 +158,7 @@ class Metadata:
             raise self._error(f"{place}.kind", kind, f"one of {', '.join(get_args(PromptKind))}")
         target, places = value.get("target"), self._places(value.get("places", []), f"{place}.places")
         if (kind == "hide") != bool(places):
-            raise self._error(f"{place}.places", places, "a list of [thing, drawer] for a hiding, nothing for others")
+            raise self._error(f"{place}.places", places, "a list of [object, drawer] for kind 'hide' only")
         if target is None and kind not in ("routine", "hide"):
             raise self._error(f"{place}.target", target, f"the object that a prompt of kind {kind!r} shows")
         named = None if target is None else self._name(target, f"{place}.target")
@@ -167,10 +166,10 @@ class Metadata:
 
     def _places(self, value: Any, place: str) -> tuple[tuple[str, str], ...]:
         if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
-            raise self._error(place, value, "a list of [thing, drawer]")
+            raise self._error(place, value, "a list of [object, drawer]")
         found = tuple((self._name(thing, place), self._name(drawer, place)) for thing, drawer in value)
         if any(thing not in self.problem.objects or drawer not in self.problem.regions for thing, drawer in found):
-            raise self._error(place, value, "objects in regions, as [thing, drawer]")
+            raise self._error(place, value, "declared objects and regions, as [object, drawer]")
         return found
 
     def _name(self, value: Any, place: str) -> str:
@@ -183,7 +182,7 @@ class Metadata:
     # --- variants ---
 
     def variants(self) -> tuple[Variant, ...]:
-        """Return the variants; the checkpoints must have been read, and found right, before."""
+        """Return the variants; call `checkpoints` before, which validates their keys."""
         value = self.data.get("variants", [])
         if not isinstance(value, list):
             raise self._error("variants", value, "a list of objects")
@@ -227,32 +226,32 @@ class Metadata:
         return tuple(value)
 
     def _check_substituted(self, substitute: Mapping[str, str], place: str) -> None:
-        """Resolve the substituted formulas now, so that ``Task.variant(k)`` cannot fail later."""
+        """Resolve the substituted formulas at load time so that ``Task.variant(k)`` cannot fail later."""
         checkpoints = self._formulas(self.data["subtask_goals"], "subtask_goals")
         for k, goal in enumerate((self.problem.goal, *checkpoints)):
             which = "goal" if k == 0 else f"checkpoint {k - 1}"
             self.problem.resolve(rename(goal, substitute), f"{self.path}, {place} ({which})")
 
 
-# --- files: every complaint names the file and says what should be in it ---
+# --- files ---
 
 
 def read_text(path: Path, holds: str) -> str:
-    """Return a file's text; ``holds`` says what should be in it, for the message when it cannot be read."""
+    """Return a file's text; ``holds`` describes the expected content in error messages."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise MemobenchError(f"{path} is missing, expected a file that holds {holds}") from None
     except UnicodeDecodeError as error:
         raise MemobenchError(
-            f"{path}: found a byte at offset {error.start} that is no UTF-8, expected UTF-8 text"
+            f"{path}: found a byte at offset {error.start} that is not UTF-8, expected UTF-8 text"
         ) from None
     except OSError as error:
         raise MemobenchError(f"{path} cannot be read ({error.strerror}), expected a file that holds {holds}") from None
 
 
 def json_object(path: Path) -> dict[str, Any]:
-    """Return the object that a metadata file holds; a key that stands twice in one is an error."""
+    """Return the JSON object of a metadata file; a duplicate key is an error."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         keys = [key for key, _ in pairs]
@@ -261,7 +260,7 @@ def json_object(path: Path) -> dict[str, Any]:
                 raise MemobenchError(f"{path}: found the key {key!r} twice in one object, expected it once")
         return dict(pairs)
 
-    text = read_text(path, HOLDS)
+    text = read_text(path, METADATA_CONTENT)
     try:
         data = json.loads(text, object_pairs_hook=unique)
     except json.JSONDecodeError as error:
@@ -273,7 +272,7 @@ def json_object(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise MemobenchError(f"{path}: found JSON that cannot be read ({error}), expected an object") from None
     if not isinstance(data, dict):
-        raise MemobenchError(f"{path}: found {short(data)}, expected a JSON object that holds {HOLDS}")
+        raise MemobenchError(f"{path}: found {short_repr(data)}, expected a JSON object that holds {METADATA_CONTENT}")
     return data
 
 
@@ -284,5 +283,5 @@ def _is_int(value: Any) -> bool:
 def _text(data: Mapping[str, Any], key: str, where: str) -> str:
     value = data.get(key, "")
     if not isinstance(value, str):
-        raise MemobenchError(f"{where}: found {key} = {short(value)}, expected text")
+        raise MemobenchError(f"{where}: found {key} = {short_repr(value)}, expected text")
     return value

@@ -1,6 +1,6 @@
-"""Operators over time: one node per place in a formula's tree, with what it remembers of earlier steps.
+"""Evaluate operators over time: one stateful node per node of a formula's tree.
 
-``docs/benchmark/formulas.md`` has the same on one page.
+``docs/benchmark/formulas.md`` summarises the semantics.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from lerobot_memobench.tasks.formula import (
 )
 
 Read = Callable[[Atom], bool]
-"""Answers atoms about the present step, latched ones included."""
+"""Returns the value of an atom in the present step, including latched atoms."""
 
 
 def build(formula: Formula, hold_steps: int) -> Node:
-    """Return the tree of a formula; ``hold_steps`` is what each child of `Then` has to hold."""
+    """Return the evaluation tree of a formula; ``hold_steps``: steps for which each child of `Then` has to hold."""
     if isinstance(formula, Atom):
         return _AtomNode(formula)
     parts = [build(child, hold_steps) for child in children(formula)]
@@ -39,15 +39,15 @@ def build(formula: Formula, hold_steps: int) -> Node:
 
 
 class Node:
-    """One place in a formula's tree.
+    """Evaluation state of one node of a formula's tree.
 
     Args:
         parts: nodes of the formula's children.
-        number: of `Hold` and `Exactly`; of `Then` the steps for which a child has to hold.
+        number: number of `Hold` and `Exactly`; for `Then` the steps for which a child has to hold.
     """
 
     remembers: ClassVar[tuple[str, ...]] = ()
-    """Attributes that carry something from step to step; their class has them as they are at first."""
+    """Names of the state attributes; the class attributes of these names are the initial values."""
 
     def __init__(self, parts: Sequence[Node] = (), number: int = 0) -> None:
         self.parts, self.number = parts, number
@@ -61,31 +61,31 @@ class Node:
 
     @property
     def memory(self) -> tuple[int, ...]:
-        """What of earlier steps decides later values, of this node alone; -1 for what is open."""
+        """State of this node (not its children) that affects later values; -1 for undecided."""
         values = [getattr(self, name) for name in self.remembers]
         return tuple(-1 if value is None else int(value) for value in values)
 
     def value(self, read: Read) -> bool:
-        """Take one step and return what is true in it; ``read`` answers atoms."""
+        """Advance one step and return the value; ``read`` evaluates atoms."""
         raise NotImplementedError
 
     @property
     def settled(self) -> bool | None:
-        """The value that the node has at every later step, whatever happens; None while it is open.
+        """Value of the node at all later steps, whatever happens; None while undecided.
 
-        Never wrong, though not always found as early as could be.
+        Sound but not complete: a decided value may be reported late.
         """
         raise NotImplementedError
 
     def walk(self) -> Iterator[Node]:
-        """Yield this node and all below it."""
+        """Yield this node and its descendants."""
         yield self
         for part in self.parts:
             yield from part.walk()
 
 
 class _AtomNode(Node):
-    """What the world, or a latch, says now."""
+    """Present value of an atom; a latched atom settles once it is set."""
 
     def __init__(self, atom: Atom) -> None:
         super().__init__()
@@ -105,11 +105,11 @@ class _AtomNode(Node):
         return True if self.latched else None
 
 
-# --- And, Or, Not: nothing is remembered. Every part is asked in every step, since a nested operator must see it ---
+# --- And, Or, Not: stateless. Every part is evaluated in every step because a nested operator must see each step ---
 
 
 class _AndNode(Node):
-    """True when all parts are."""
+    """True when all parts are true."""
 
     def value(self, read: Read) -> bool:
         values = [part.value(read) for part in self.parts]
@@ -122,7 +122,7 @@ class _AndNode(Node):
 
 
 class _OrNode(Node):
-    """True when some part is."""
+    """True when any part is true."""
 
     def value(self, read: Read) -> bool:
         values = [part.value(read) for part in self.parts]
@@ -135,7 +135,7 @@ class _OrNode(Node):
 
 
 class _NotNode(Node):
-    """True when the part is not."""
+    """True when the part is false."""
 
     def value(self, read: Read) -> bool:
         return not self.parts[0].value(read)
@@ -146,11 +146,11 @@ class _NotNode(Node):
         return None if found is None else not found
 
 
-# --- Never, Hold, Exactly: how long, how often ---
+# --- Never, Hold, Exactly: durations and counts ---
 
 
 class _NeverNode(Node):
-    """True until the part is once true."""
+    """True until the part has been true."""
 
     remembers = ("broken",)
     broken = False
@@ -182,7 +182,7 @@ class _HoldNode(Node):
 
 
 class _ExactlyNode(Node):
-    """True while the part has come true ``number`` times; counts to one more, all beyond is the same."""
+    """True while the part has had ``number`` rising edges; the count saturates at one more."""
 
     remembers = ("count", "before")
     count, before = 0, False
@@ -201,11 +201,11 @@ class _ExactlyNode(Node):
         return self.count == self.number if found is not None and found == self.before else None
 
 
-# --- Then, Round, When: what comes before what ---
+# --- Then, Round, When: order of events ---
 
 
 class _ThenNode(Node):
-    """Counts how long the current child has held; the next child is first looked at in the step after."""
+    """Count how long the current child has held; evaluate the next child from the following step."""
 
     remembers = ("done", "held")
     done, held = 0, 0
@@ -225,7 +225,7 @@ class _ThenNode(Node):
 
 
 class _RoundNode(Node):
-    """The next part is first looked at in the step after; with a new round all parts begin anew."""
+    """Evaluate the next part from the following step; reset all parts after a complete round."""
 
     remembers = ("done",)
     done = 0
@@ -243,15 +243,15 @@ class _RoundNode(Node):
 
 
 class _WhenNode(Node):
-    """The first moment of the first part decides, by the second part's value in that step."""
+    """Latch the second part's value in the first step in which the first part is true."""
 
     remembers = ("decided",)
     decided: bool | None = None
 
     def value(self, read: Read) -> bool:
-        moment, then = [part.value(read) for part in self.parts]
-        if self.decided is None and moment:
-            self.decided = then
+        condition, outcome = [part.value(read) for part in self.parts]
+        if self.decided is None and condition:
+            self.decided = outcome
         return self.decided is True
 
     @property

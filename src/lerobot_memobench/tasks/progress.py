@@ -1,6 +1,6 @@
-"""Follow an episode step by step: which checkpoints were satisfied when, and whether the goal holds.
+"""Track an episode step by step: steps at which checkpoints are satisfied, and the value of the goal.
 
-Nothing of a simulator: `Evaluator.step` asks ``holds(atom)``. `tasks.nodes` says what operators mean over time.
+Independent of the simulator: `Evaluator.step` calls ``holds(atom)``. `tasks.nodes` implements operators over time.
 Semantics: the benchmark's task files (BDDL goals and metadata goals), paper section on executable checkpoints.
 """
 
@@ -12,21 +12,19 @@ from lerobot_memobench.tasks.formula import LATCHES, Atom, Formula, atoms
 from lerobot_memobench.tasks.nodes import build
 from lerobot_memobench.tasks.task import Task
 
-#: Consecutive evaluations, of which a control step has one, for which a child of ``Then`` must hold before it counts as
-#: done. The authors' evaluation has two per control step.
+#: Consecutive evaluations for which a child of ``Then`` must hold before it is done. There is one evaluation per
+#: control step; the authors' code makes two.
 HOLD_STEPS = 10
 
 
 class Evaluator:
-    """Evaluates formulas together, once per control step, with their memory of earlier steps.
+    """Evaluate several formulas once per control step and keep their state.
 
-    - ``holds`` is asked at most once per distinct atom and step, and never about a latched predicate.
-    - Latches are brought up to date first, for every latched atom of every formula, looked at or not; they
-      stay until ``reset``.
-    - A child of ``Then`` is done once it has held for ``hold_steps`` consecutive steps; only then (from the
-      next step on) the following child is looked at; done stays done. ``Then`` is true when its last child is
-      done. A nested ``Then`` is a child like any other: it has to have been true for ``hold_steps`` steps
-      itself.
+    - ``holds`` is called at most once per distinct atom and step, and never for a latched predicate.
+    - Latches of all formulas are updated first, whether or not their formula evaluates them; ``reset`` clears them.
+    - A child of ``Then`` is done after it has held for ``hold_steps`` consecutive steps. The following child is
+      evaluated from the next step. Done children stay done. ``Then`` is true when its last child is done. A nested
+      ``Then`` must itself be true for ``hold_steps`` steps.
     """
 
     def __init__(self, formulas: Iterable[Formula], hold_steps: int = HOLD_STEPS) -> None:
@@ -38,7 +36,7 @@ class Evaluator:
         self._latched: set[Atom] = set()
 
     def reset(self) -> None:
-        """Forget all earlier steps."""
+        """Clear the state of all formulas."""
         self._latched.clear()
         for node in self._nodes:
             node.reset()
@@ -50,16 +48,16 @@ class Evaluator:
 
     @property
     def memory(self) -> tuple[frozenset[Atom], tuple[tuple[int, ...], ...]]:
-        """What of earlier steps decides later values: latches, and what each operator remembers. Hashable."""
+        """State that determines later values: latches and operator states. Hashable."""
         return self.latched, tuple(node.memory for node in self._remembering)
 
     @property
     def settled(self) -> tuple[bool | None, ...]:
-        """Per formula the value that it has at every later step, whatever happens; None while that is open."""
+        """Per formula its value at all later steps, whatever happens; None while undecided."""
         return tuple(node.settled for node in self._nodes)
 
     def step(self, holds: Callable[[Atom], bool]) -> tuple[bool, ...]:
-        """Take one control step of the world, answered by ``holds``, and return the value of each formula."""
+        """Evaluate one control step and return the value of each formula; ``holds`` evaluates atoms."""
         memo: dict[Atom, bool] = {}
 
         def world(atom: Atom) -> bool:
@@ -78,20 +76,20 @@ class Evaluator:
 
 
 class Progress:
-    """Follows one episode's execution phase; call ``step`` exactly once per control step.
+    """Track the execution phase of one episode; call ``step`` exactly once per control step.
 
     Args:
-        task: with goal and checkpoints.
-        evaluations: of the formulas per control step; with two, each part of `Then` has to hold for five steps.
+        task: task with goal and checkpoints.
+        evaluations: evaluations per control step; with two, each part of `Then` has to hold for five steps.
 
-    Attributes (steps are counted from 1; None until it happens; K checkpoints):
+    Attributes (steps count from 1, None before the event; K checkpoints):
         steps: control steps taken since ``reset``.
-        success: the goal holds now.
-        satisfied: (K,) the checkpoint's predicate holds now.
+        success: whether the goal holds now.
+        satisfied: (K,) whether the checkpoint's predicate holds now.
         first_step: (K,) first step at which the predicate held.
-        ordered_step: (K,) first step at which it held with all earlier checkpoints complete in order; several
+        ordered_step: (K,) first step at which it held after all earlier checkpoints were completed in order; several
             may complete in one step.
-        index: number of checkpoints completed in order so far.
+        index: number of checkpoints completed in order.
     """
 
     def __init__(self, task: Task, evaluations: int = 1) -> None:
@@ -100,7 +98,7 @@ class Progress:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the execution starts anew."""
+        """Restart the execution: clear all state."""
         self._evaluator.reset()
         count = len(self.task.checkpoints)
         self.steps = 0
@@ -112,16 +110,16 @@ class Progress:
 
     @property
     def lost(self) -> bool:
-        """The goal can no longer be reached, whatever is done."""
+        """Whether the goal can no longer be reached."""
         return self._evaluator.settled[0] is False
 
     def settle(self, holds: Callable[[Atom], bool]) -> None:
-        """Take in the state after a control step before the execution: formulas see it, nothing is counted."""
+        """Evaluate a state before the execution: it updates latches and operators but no counter."""
         for _ in range(self._evaluations):
             self._evaluator.step(holds)
 
     def step(self, holds: Callable[[Atom], bool]) -> bool:
-        """Take in the state after one control step, answered by ``holds``; return ``success``."""
+        """Evaluate the state after one control step; ``holds`` evaluates atoms. Return ``success``."""
         self.steps += 1
         for _ in range(self._evaluations):
             self.success, *satisfied = self._evaluator.step(holds)

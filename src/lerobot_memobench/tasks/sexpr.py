@@ -1,4 +1,4 @@
-"""S-expressions with line numbers: the syntax under BDDL."""
+"""Parse S-expressions, the syntax of BDDL, and keep line numbers for error messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 @dataclass
 class Node:
-    """A word (``items`` is None) or a list; its source text runs from ``start`` to ``end``."""
+    """A word (``items`` is None) or a list; ``start`` and ``end`` delimit its source text."""
 
     line: int
     start: int
@@ -29,21 +29,21 @@ class Node:
 
 @dataclass
 class Reader:
-    """Reads one file's text; every complaint goes through ``error``."""
+    """Parse the text of one file; `error` builds all error messages."""
 
     path: str
     text: str = field(repr=False)
 
     def where(self, node: Node) -> str:
-        """Return "file, line n", the start of every message."""
+        """Return the prefix of every message: "file, line n"."""
         return f"{self.path}, line {node.line}"
 
     def error(self, node: Node, found: str, expected: str) -> MemobenchError:
-        """Return (not raise) the error that something was found at ``node`` in place of something else."""
+        """Return (do not raise) the error for an unexpected item at ``node``."""
         return MemobenchError(f"{self.where(node)}: found {found}, expected {expected}")
 
     def read(self) -> Node:
-        """Return the one list in the text. Iterative, so that depth is no danger."""
+        """Return the single top-level list. The parser is iterative, so deep nesting cannot overflow the stack."""
         root = Node(line=1, start=0, items=[])
         stack, line, last = [root], 1, 0
         for match in re.finditer(r"[()]|[^\s()]+", self.text):
@@ -67,17 +67,17 @@ class Reader:
         if len(root.items) != 1 or root.items[0].items is None:
             node = root.items[1] if len(root.items) > 1 else (root.items or [root])[0]
             found = "no text" if not root.items else str(node)
-            raise self.error(node, found, "one list (define (problem NAME) ...) and nothing beside it")
+            raise self.error(node, found, "exactly one list (define (problem NAME) ...)")
         return root.items[0]
 
     def word(self, node: Node, expected: str) -> str:
-        """Return the word at ``node``, or raise where it is a list."""
+        """Return the word at ``node``; raise if it is a list."""
         if node.items is not None:
             raise self.error(node, str(node), expected)
         return node.word
 
     def sequence(self, node: Node, expected: str) -> list[Node]:
-        """Return the items of the list at ``node``, or raise where it is a word."""
+        """Return the items of the list at ``node``; raise if it is a word."""
         if node.items is None:
             raise self.error(node, str(node), expected)
         return node.items

@@ -1,4 +1,4 @@
-"""A task of the benchmark, as data: scene, instruction, goal, checkpoints, and its variants.
+"""Define the data of a task: scene, instruction, goal, checkpoints and variants.
 
 `catalogue.load_task` reads tasks from folders.
 """
@@ -29,38 +29,38 @@ PUBLISHED, STRICT = SUITES
 WORLDS: tuple[World, ...] = get_args(World)
 MEMOBENCH, LIBERO = WORLDS
 REFERENTS = ("fixed", "random")
-#: The referent of strict episodes, whatever is asked for (`Task.drawn`).
+#: Referent of strict episodes, which ignore the referent setting (`Task.drawn`).
 DRAWN = "drawn"
-#: Control steps of a strict task's prompt for each thing that it shows, whichever variant that is. The slowest of some
-#: 700 prompts left a sixth of them; the scene rests meanwhile.
+#: Control steps of a strict task's prompt per object shown, equal for all variants. The slowest of some 700 prompts
+#: used five sixths of them; the scene rests for the remainder.
 STRICT_PROMPT_STEPS: dict[PromptKind, int] = {"highlight": 100, "point": 300, "pick": 300, "routine": 300, "hide": 600}
-#: Classes of failure that only strict tasks have (`Task.spoilt_as`): the event was done too seldom or too often; the
-#: thing was looked for where it is not.
+#: Failure classes of strict tasks only (`Task.spoilt_as`): an event was repeated too rarely or too often; the object
+#: was searched in a wrong place.
 STRICT_FAILURES = ("miscount", "wrong_place")
 LEVELS = ("coarse", "intermediate", "fine")
-#: The level whose operation labels are evaluated (paper: intermediate).
+#: Level of the evaluated operation labels (paper: intermediate).
 DEFAULT_LEVEL = 1
 
 BDDL_FILE = "task_config.bddl"
 METADATA_FILE = "task_config.meta.json"
 
 
-def referent_text(asked: str, drawn: bool) -> str:
-    """Return the referent of episodes for which one was asked: none can be chosen where each draws its own."""
-    return DRAWN if drawn else asked
+def referent_text(requested: str, drawn: bool) -> str:
+    """Return the effective referent: the requested one, or `DRAWN` for tasks that draw it per episode."""
+    return DRAWN if drawn else requested
 
 
 def check_world(prefix: str, world: str, suite: str) -> None:
-    """Refuse an unknown world, and one in which a suite cannot take place; ``prefix`` stands before a setting's name.
+    """Check that a world exists and supports a suite; ``prefix`` precedes setting names in the message.
 
     Raises:
-        MemobenchError: it is refused.
+        MemobenchError: the world is unknown or does not support the suite.
     """
     check_choice(f"{prefix}world", world, WORLDS)
     if (suite, world) == (STRICT, LIBERO):
         raise MemobenchError(
-            f"{prefix}world={LIBERO} was asked for with {prefix}suite={STRICT}, whose detents and sealed drawers are "
-            f"those of world={MEMOBENCH} alone; leave one of the two out"
+            f"{prefix}world={LIBERO} was asked for with {prefix}suite={STRICT}, but only world={MEMOBENCH} has the "
+            "detents and sealed drawers of strict tasks; leave one of the two out"
         )
 
 
@@ -69,9 +69,9 @@ class Checkpoint:
     """A memory checkpoint.
 
     Attributes:
-        goal: predicate that shows the event in the world.
-        operations_by_level: label at the coarse, intermediate and fine level.
-        language: what a memory should say after it, at the three levels.
+        goal: predicate that detects the event.
+        operations_by_level: labels at the coarse, intermediate and fine level.
+        language: reference memory texts after the event, at the three levels.
     """
 
     goal: Formula
@@ -80,16 +80,17 @@ class Checkpoint:
 
     @property
     def operation(self) -> Operation:
-        """The label that is evaluated (intermediate level)."""
+        """Evaluated label (intermediate level)."""
         return self.operations_by_level[DEFAULT_LEVEL]
 
 
 @dataclass(frozen=True)
 class Prompt:
-    """A demonstration prompt: a routine, ``target`` being picked up, pointed at or highlighted, or a hiding.
+    """A demonstration prompt: a routine; picking up, pointing at or highlighting ``target``; or a hiding.
 
     Attributes:
-        places: of a hiding, thing -> drawer in the order shown. The execution begins from the scene as it left it.
+        places: for a hiding, pairs of object and drawer in the order shown; hidden objects stay in place for the
+            execution.
     """
 
     kind: PromptKind
@@ -98,26 +99,24 @@ class Prompt:
 
     @property
     def restores(self) -> bool:
-        """Whether the scene is put back as it was before the execution begins."""
+        """Whether the scene is restored before the execution begins."""
         return self.kind != "hide"
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Another admissible referent, order or number of a task, in the same scene.
+    """An alternative referent, order or count of a task in the same scene.
 
     Attributes:
-        substitute: names replaced, all at once, in goal, checkpoint goals and prompt target.
-        order: position k shows which checkpoint of the published task; its operation labels stay at their
-            positions.
+        substitute: simultaneous replacement of names in goal, checkpoint goals and prompt target.
+        order: index of the published checkpoint at each position; operation labels keep their positions.
         languages: texts per position (coarse, intermediate, fine).
-        goals: checkpoint goals per position in place of substituted and reordered ones.
-        goal: goal in place of the substituted one.
-        demo_summary: what the demonstration does.
-        language: instruction in place of the task's.
-        prompt: what the demonstration prompt shows in place of the substituted one.
-        replaces_published: the published goal is looser than this variant's (it would accept another order),
-            so variant 0 is not drawn.
+        goals: checkpoint goals per position; override substituted and reordered goals.
+        goal: goal; overrides the substituted goal.
+        demo_summary: description of the demonstration.
+        language: instruction; overrides the task's.
+        prompt: demonstration prompt; overrides the substituted prompt.
+        replaces_published: whether the published goal is looser (accepts another order); then variant 0 is not drawn.
     """
 
     languages: tuple[Texts, ...]
@@ -133,28 +132,28 @@ class Variant:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Everything the benchmark knows about a task. Do not change its dicts.
+    """All data of a task. Do not modify its dicts.
 
     Attributes:
-        name: the folder's name.
+        name: name of the folder.
         memory_type: temporal, spatial, object or procedural.
-        family: tasks of the same kind.
-        language: the instruction.
+        family: group of similar tasks.
+        language: instruction.
         objects: instance -> class, in the file's order.
         fixtures: instance -> class, in the file's order.
         regions: full name (``<target>_<region>``) -> region.
-        init: starting state; objects in regions are sampled, others rest on what they name.
-        prompt: what the demonstration prompt shows; None for the published temporal and spatial tasks.
-        variants: the alternatives to the published task: ``variant(k)`` for k >= 1.
-        variant_index: which variant this is.
-        bddl_text: the task file as read.
-        metadata: the metadata file as read.
-        suite: what it belongs to; an episode of the strict suite ends when its goal can no longer be reached.
-        derived_from: the published task in whose scene it takes place; None for a task of its own.
-        drawn: every episode draws its variant by seed, whatever referent is asked for; a variant is not drawn again.
-        spoilt_as: failure class of an episode whose goal could no longer be reached; None for that of its checkpoints.
-        world: assets, placement, contacts and predicates of the scene: `memobench`, the package's own, or `libero`, the
-            paper's. It is a property of an evaluation and never stated in a task's files.
+        init: initial state; objects in regions are sampled, others rest on their support.
+        prompt: demonstration prompt; None for the published temporal and spatial tasks.
+        variants: alternatives to the published task: ``variant(k)`` for k >= 1.
+        variant_index: index of this variant.
+        bddl_text: content of the task file.
+        metadata: content of the metadata file.
+        suite: published or strict; a strict episode ends when its goal can no longer be reached.
+        derived_from: published task with the same scene; None for a task with its own scene.
+        drawn: whether each episode draws its variant by seed and ignores the referent setting; False for a variant.
+        spoilt_as: failure class of an episode with an unreachable goal; None classifies by checkpoints.
+        world: assets, placement, contacts and predicates: `memobench` (this package) or `libero` (the paper). A setting
+            of the evaluation, never of a task's files.
     """
 
     name: str
@@ -182,8 +181,7 @@ class Task:
     spoilt_as: str | None = None
     world: World = "memobench"
 
-    # Two tasks are the same when their files, variant and world are: pickled copies in worker processes stay equal
-    # and hashable.
+    # Compare files, variant and world, so that pickled copies in worker processes are equal and hashable.
     def _key(self) -> tuple[str, str, str, int, str]:
         return self.name, self.bddl_text, json.dumps(self.metadata, sort_keys=True), self.variant_index, self.world
 
@@ -194,10 +192,10 @@ class Task:
         return hash((self.name, self.bddl_text, self.variant_index, self.world))
 
     def in_world(self, world: World) -> Task:
-        """Return the task in another world; scene, instruction, goal and checkpoints stay the same.
+        """Return the task in another world, with equal layout, instruction, goal and checkpoints.
 
         Raises:
-            MemobenchError: it cannot take place there.
+            MemobenchError: the world does not support the task's suite.
         """
         check_world("", world, self.suite)
         published = self.published and self.published.in_world(world)
@@ -205,22 +203,22 @@ class Task:
 
     @property
     def scene_name(self) -> str:
-        """The name by which seeds draw the scene: a strict task's is its published task's, seed for seed."""
+        """Name that seeds the scene; strict tasks share the scenes of their published task."""
         return self.derived_from or self.name
 
     @property
     def title(self) -> str:
-        """What the task asks in all of its variants: its instruction, or its name where they differ in it."""
+        """Instruction shared by all variants, or the task's name if their instructions differ."""
         return self.name.replace("_", " ") if any(one.language for one in self.variants) else self.language
 
     @property
     def idles(self) -> bool:
-        """Whether the robot idles before the execution, which then shows no clock."""
+        """Whether the robot idles before the execution, so that its start time reveals nothing."""
         return self.suite == STRICT
 
     @property
     def prompt_steps(self) -> int | None:
-        """Control steps of the prompt, the same for all variants; None: it takes as many as it needs."""
+        """Fixed number of control steps of the prompt; None for a variable length."""
         if not self.idles:
             return None
         if self.prompt is None:
@@ -230,22 +228,22 @@ class Task:
 
     @property
     def operations(self) -> str:
-        """Operation labels of the checkpoints at the evaluated level, e.g. "SUC"."""
+        """Operation labels of the checkpoints at the evaluated level, such as "SUC"."""
         return "".join(checkpoint.operation for checkpoint in self.checkpoints)
 
     @property
     def num_variants(self) -> int:
-        """Number of variants, the published one (0) included."""
+        """Number of variants, including the published one (0)."""
         return 1 + len(self.variants)
 
     @property
     def random_variants(self) -> tuple[int, ...]:
-        """The k to draw from for a random referent: all, without 0 where a stricter copy replaces it."""
+        """Indices drawn for a random referent: all, except 0 if a stricter variant replaces it."""
         first = 1 if any(variant.replaces_published for variant in self.variants) else 0
         return tuple(range(first, self.num_variants))
 
     def variant(self, k: int) -> Task:
-        """Return the task with instruction, goal, checkpoints, texts and prompt of variant ``k``; 0 is as published."""
+        """Return the task with instruction, goal, checkpoints, texts and prompt of variant ``k``; 0 is published."""
         base = self.published or self
         if k == 0:
             return base

@@ -1,4 +1,4 @@
-"""Pictures of the paper's world are those of MuJoCo's renderer, from LIBERO's files or from what is kept of them."""
+"""Images of the paper's world equal MuJoCo's renderer, with and without the cache."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.sim.libero.looks import drawn
+from lerobot_memobench.sim.libero.looks import drawing_model
 from lerobot_memobench.sim.libero.scene import scene_spec
 from lerobot_memobench.sim.raster.rasterizer import Rasterizer
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
@@ -36,15 +36,15 @@ def test_the_burner_is_red_while_the_stove_is_on() -> None:
 
 @needs_assets
 @pytest.mark.slow
-def test_what_is_kept_draws_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a folder to write to, by the process that fills it, and by one that finds it filled."""
+def test_cached_assets_draw_equal_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a writable cache, with an empty one, and with a filled one."""
     sim = simulate(STOVE)
     closed = tmp_path / "closed"
     closed.touch()
     pictures = []
     for folder in (closed, tmp_path, tmp_path):
         monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
-        model, draw_list = drawn(scene_spec(sim.task, visuals=True))
+        model, draw_list = drawing_model(scene_spec(sim.task, visuals=True))
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         renderer = Rasterizer(model, draw_list, 128, 128, 0)

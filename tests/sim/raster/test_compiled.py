@@ -1,4 +1,4 @@
-"""Functions are compiled where nothing may be kept, too, and no operations are fused."""
+"""Functions compile without a cache folder, too, and no operations are fused."""
 
 from __future__ import annotations
 

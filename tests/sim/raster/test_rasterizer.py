@@ -1,4 +1,4 @@
-"""Pictures kept from frame to frame change no pixel, and the light is that of MuJoCo's own renderer."""
+"""Cached images change no pixel, and the light is that of MuJoCo's renderer."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.raster.drawlist import VISUAL_GROUP, build_draw_list
 from lerobot_memobench.sim.raster.geometry import Shapes, Target, clip_space, draw_triangles
 from lerobot_memobench.sim.raster.highlights import Highlight
-from lerobot_memobench.sim.raster.rasterizer import KEPT_SCENES, Rasterizer
-from lerobot_memobench.sim.rendering import QUALITIES, ROOM, RenderSettings
+from lerobot_memobench.sim.raster.rasterizer import MAX_STILL_STATES, Rasterizer
+from lerobot_memobench.sim.rendering import QUALITIES, SHADOWLESS_BODIES, RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -47,14 +47,14 @@ def states(sims: list[Simulation], joint: str, opened: float) -> Iterator[str]:
 @pytest.mark.parametrize(
     ("task", "quality"), [*((task, "default") for task in SCENES), ("turn_on_the_stove_and_turn_it_off", "fast")]
 )
-def test_frames_depend_on_nothing_that_is_kept(task: str, quality: str) -> None:
+def test_frames_do_not_depend_on_caches(task: str, quality: str) -> None:
     """They are those of a renderer that has drawn nothing, and nearly those of one for which nothing stands still.
 
     Levels of textures are chosen at the ends of what is drawn of a surface, which things in front of it may part.
     """
     settings = RenderSettings(128, 128, quality)
     sims = [Simulation(get_task(task), settings) for _ in range(2)]
-    model, draw_list = sims[0].model, build_draw_list(sims[0].model, ROOM)
+    model, draw_list = sims[0].model, build_draw_list(sims[0].model, SHADOWLESS_BODIES)
     others = {
         most: Rasterizer(model, listed, 128, 128, QUALITIES[quality].shadow_map)
         for most, listed in {0: draw_list, 2: replace(draw_list, still=0)}.items()
@@ -84,13 +84,13 @@ def test_a_state_that_is_not_finite_is_refused(place: float) -> None:
     np.testing.assert_array_equal(sim.render(), expected)
 
 
-def test_no_more_scenes_are_kept_than_are_allowed() -> None:
+def test_the_cache_of_still_states_is_bounded() -> None:
     sim = Simulation(get_task("open_and_close_the_microwave"), RenderSettings(32, 32))
-    rasterizer = Rasterizer(sim.model, build_draw_list(sim.model, ROOM), 32, 32, 64)
-    for seed in range(KEPT_SCENES + 2):
+    rasterizer = Rasterizer(sim.model, build_draw_list(sim.model, SHADOWLESS_BODIES), 32, 32, 64)
+    for seed in range(MAX_STILL_STATES + 2):
         sim.reset(seed)
         rasterizer.draw(sim.model, sim.data, "agentview")
-    assert len(rasterizer._still) == KEPT_SCENES
+    assert len(rasterizer._still) == MAX_STILL_STATES
 
 
 def test_a_triangle_that_reaches_behind_the_camera_ends_at_its_level_edge() -> None:

@@ -1,1 +1,1 @@
-"""Fixtures and objects as code: geometry, textures and the facts about them, without binary files."""
+"""Procedural fixtures and objects: geometry, textures and metadata without binary files."""

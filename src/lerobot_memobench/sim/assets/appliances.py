@@ -1,7 +1,7 @@
-"""The microwave and the stove.
+"""Build the microwave and the stove.
 
-The microwave's door is on the local -y side, hinged on the left and opening to q = -2.094. Its body stands back from
-its origin: in the published scenes a plate starts where the published microwave's door is; here it has room.
+The microwave's door is on the local -y side, hinged on the left, with limit q = -2.094. The body is set back from its
+origin to make room for a plate that starts at the position of the published microwave's door.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from lerobot_memobench.sim.assets.asset import Articulation, Asset, Handle
 from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
 from lerobot_memobench.sim.assets.meshes import Block, Floats, MeshData, Quad, blocks, box, cell_uv, lathe, quads_mesh
-from lerobot_memobench.sim.assets.paint import Canvas, Pixels, drawn, speckle
+from lerobot_memobench.sim.assets.paint import Canvas, Pixels, draw_texture, speckle
 
 DOOR_RANGE = (-2.094, 0.0)
 
@@ -22,7 +22,7 @@ _FRONT, _BACK = 0.000, 0.196  # y of the box without door
 _HIGH = 0.189
 _PLINTH = 0.028  # the door sweeps over a plate on the table
 _BOARD = 0.010
-_FLOOR = _PLINTH + _BOARD  # z of the inside's
+_FLOOR = _PLINTH + _BOARD  # z of the interior floor
 _MIDDLE = (_FRONT + _BACK) / 2
 _INNER_DEPTH = (_BACK - _BOARD - _FRONT) / 2
 _DOOR_THICK = 0.020
@@ -30,7 +30,7 @@ _DOOR_GAP = 0.001
 _HANDLE_OUT = 0.045
 _HANDLE_THICK = 0.012
 _HANDLE_HALF = 0.050
-_PANEL = 0.075  # width of the strip with buttons, at the hinge's other side, part of the door's front
+_PANEL = 0.075  # width of the strip with buttons on the door's front
 
 
 def _shell() -> list[Block]:
@@ -50,7 +50,7 @@ def _shell() -> list[Block]:
 
 
 def _lining() -> list[Block]:
-    """Return thin light boards inside."""
+    """Return thin light boards of the interior."""
     x = _HALF_X - _BOARD
     middle, depth = (_FRONT + _BACK - _BOARD) / 2, (_BACK - _BOARD - _FRONT) / 2
     low, high = _PLINTH + _BOARD, _HIGH - _BOARD
@@ -80,7 +80,7 @@ def _door_mesh() -> MeshData:
         [(0, -thick, hi), (wide, -thick, hi), (wide, 0, hi), (0, 0, hi)],
         [(0, 0, lo), (wide, 0, lo), (wide, -thick, lo), (0, -thick, lo)],
     ]
-    # The image: left half front, right half everything else.
+    # Image layout: left half front, right half all other sides.
     front, back = cell_uv(0, 0, 2, 1), cell_uv(1, 0, 2, 1)
     edge = np.full((4, 2), (0.985, 0.015))
     return quads_mesh(quads, [front, back, edge, edge, edge, edge])
@@ -108,7 +108,7 @@ def _door_texture() -> Pixels:
         canvas.rect(half + 0.06, 0.14, half + 0.35, 0.86, glass)
         canvas.rect(0.975, 0, 1, 0.05, grey)
 
-    return drawn(512, 160, grey, paint)
+    return draw_texture(512, 160, grey, paint)
 
 
 def _handle() -> list[Block]:
@@ -168,7 +168,7 @@ def _door(b: Builder, front: str, metal: str) -> Articulation:
 
 
 def _regions(b: Builder) -> dict[str, str]:
-    """Add the inside and the top, and return their full names."""
+    """Add the regions of interior and top, and return their full names."""
     high = (_HIGH - _BOARD - _FLOOR) / 2
     inside = ((0, _FRONT + _INNER_DEPTH, _FLOOR + high), (_HALF_X - _BOARD, _INNER_DEPTH, high))
     top = ((0, _MIDDLE, _HIGH - 0.001), (_HALF_X, (_BACK - _FRONT) / 2, 0.001))
@@ -179,8 +179,8 @@ def _regions(b: Builder) -> dict[str, str]:
 
 
 # Flat stove with one burner and a knob -----------------------------------------------------------
-# The knob's axis is the origin: it stands on the robot's side, the burner plate on the camera's. At q = 0 (off)
-# the knob's ridge runs along the fixture's x axis; turning it on turns the ridge counter-clockwise from above.
+# The origin is the knob's axis, on the robot's side; the burner plate is on the camera's side. At q = 0 (off) the ridge
+# of the knob is along the fixture's x axis; switching on turns it counter-clockwise from above.
 
 _PLATE = (0.062, 0.250)  # from x to x
 _HALF_WIDTH = 0.095
@@ -247,7 +247,7 @@ def _ridge_mesh() -> MeshData:
 
 def _ridge_texture() -> Pixels:
     # The top face (row 0, column 2) has a white line towards +x, the pointer.
-    return drawn(96, 64, (24, 24, 26), lambda c: c.rect(2 / 3 + 0.13, 0.25, 2 / 3 + 0.2, 0.5, (235, 235, 235)))
+    return draw_texture(96, 64, (24, 24, 26), lambda c: c.rect(2 / 3 + 0.13, 0.25, 2 / 3 + 0.2, 0.5, (235, 235, 235)))
 
 
 def _stove(b: Builder) -> Asset:

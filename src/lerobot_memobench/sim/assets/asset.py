@@ -1,8 +1,8 @@
-"""What is known of a built object or fixture: the numbers that a scene, a predicate or an expert asks for.
+"""Metadata of objects and fixtures, used by scenes, predicates and experts.
 
-Frames: x of an asset points to the agentview camera when it is placed with yaw 0, z points up. The origin of
-an object is its geometric centre; that of a container (bowl, plate, pan) is the centre of its bottom, and
-that of a fixture is on the table top. Units are metres, kilograms and radians.
+Frames: with yaw 0 an asset's x axis points to the agentview camera; z points up. The origin of an object is its
+geometric centre, that of a container (bowl, plate, pan) the centre of its bottom, and that of a fixture is on the
+table top. Units are metres, kilograms and radians.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ Quaternion = tuple[float, float, float, float]
 class Grasp:
     """A top-down grasp: gripper pointing down, its closing axis level.
 
-    ``position``: where the middle between the finger tips goes, in the body's frame [m].
+    ``position``: centre between the finger tips in the body's frame [m].
     ``yaw``: angle of the closing axis about the body's z [rad]; 0 closes along the body's x.
-    ``width``: what is between the fingers [m].
-    ``symmetric``: the grasp may be turned about the body's z axis by any angle, position and axis together.
+    ``width``: width of the grasped part [m].
+    ``symmetric``: whether position and axis may be rotated together about the body's z axis by any angle.
     """
 
     position: tuple[float, float, float]
@@ -39,10 +39,9 @@ class Grasp:
 
 @dataclass(frozen=True)
 class Handle:
-    """A bar to pull or a ridge to turn, in the frame of its site: x along it, y into the fixture.
+    """A bar or ridge in the frame of its site: x along it, y into the fixture.
 
-    ``length``: along x [m]. ``thickness``: the bar's cross-section, y and z [m]. ``clearance``: free space
-    behind the bar [m].
+    ``length``: extent along x [m]. ``thickness``: extents along y and z [m]. ``clearance``: free space behind it [m].
     """
 
     length: float
@@ -52,12 +51,12 @@ class Handle:
 
 @dataclass(frozen=True, kw_only=True)
 class JointRule:
-    """Where a joint counts as open or closed, on or off, and how a moving part is found.
+    """Thresholds of a joint's predicates.
 
-    Drawers and doors are open when q < ``open_below`` and closed when q > ``closed_above``; knobs are on when
-    q >= ``on_at_least`` and off when q < ``off_below``; the others' limits are nan. ``closed_q`` and ``open_q`` are
-    good targets for q (off and on for a knob), m or rad. ``shares_origin``: the moving body has the fixture's origin,
-    so only the handle shows which part it is.
+    Drawers and doors are open for q < ``open_below`` and closed for q > ``closed_above``; knobs are on for
+    q >= ``on_at_least`` and off for q < ``off_below``; inapplicable thresholds are nan. ``closed_q`` and ``open_q``:
+    targets of q (off and on for a knob), m or rad. ``shares_origin``: whether the moving body has the fixture's origin,
+    so that only the handle distinguishes it from other parts.
     """
 
     kind: Literal["drawer", "door", "knob"]
@@ -72,9 +71,9 @@ class JointRule:
 
 @dataclass(frozen=True, kw_only=True)
 class Articulation(JointRule):
-    """A joint that predicates read and experts move.
+    """A joint of a fixture with its handle.
 
-    ``handle_site``: full name of the site at the handle's middle, which moves along.
+    ``handle_site``: full name of the site at the handle's centre, on the moving body.
     """
 
     joint: str
@@ -84,18 +83,18 @@ class Articulation(JointRule):
 
 @dataclass(frozen=True)
 class Asset:
-    """What is known of one built instance.
+    """Metadata of one instance.
 
     ``low`` and ``high``: corners of the bounding box in the body's frame [m], joints at their closed pose.
     ``regions``: region name (``top_region``, ``cook_region``, ...) -> full name of its box site.
-    ``articulations``: region name, or ``""`` for the fixture as a whole -> its joint.
-    ``supports``: height in the body's frame of the surface on which things are put: a bowl's floor, the top
-    of anything else [m]; ``clear_radius``: radius of that surface [m].
-    ``glow``: full names of visual geoms whose rgba is ``glow_on`` while the fixture is on, else ``glow_off``.
-    ``round``: the outline from above is a circle about the origin.
-    ``upright``: from this asset's frame to its body's, where a body stands with another axis than z up; all numbers
-    here are of the asset's frame.
-    ``seals``: body -> centre and half size in its frame of the board behind a drawer's front that closes its play [m].
+    ``articulations``: region name, or ``""`` for the whole fixture -> joint.
+    ``supports``: height of the supporting surface in the body's frame: a bowl's floor, else the top [m];
+    ``clear_radius``: radius of that surface [m].
+    ``glow``: full names of visual geoms with rgba ``glow_on`` while the fixture is on, else ``glow_off``.
+    ``round``: whether the outline from above is a circle about the origin.
+    ``upright``: rotation from the asset's frame to the body's if another body axis than z points up; all values are in
+    the asset's frame.
+    ``seals``: body -> centre and half size of the board that closes a drawer's gaps, in the body's frame [m].
     """
 
     name: str
@@ -129,12 +128,12 @@ class Asset:
 
     @property
     def half_extents(self) -> tuple[float, float]:
-        """Half the size of the smallest origin-centred rectangle around the asset, x and y [m]."""
+        """Half size of the smallest origin-centred rectangle around the asset, x and y [m]."""
         return (max(-self.low[0], self.high[0]), max(-self.low[1], self.high[1]))
 
     @property
     def radius(self) -> float:
-        """Radius about the origin, seen from above, that holds everything [m]."""
+        """Horizontal radius about the origin that encloses the asset [m]."""
         if self.round:
             return max(self.half_extents)
         return float(np.hypot(*self.half_extents))

@@ -1,4 +1,4 @@
-"""Bottles and tubs: surfaces of revolution, some of them flat, with a label that faces +x."""
+"""Build bottles and tubs: surfaces of revolution, some flattened, with a label towards +x."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Asset
 from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
 from lerobot_memobench.sim.assets.meshes import MeshData, lathe
-from lerobot_memobench.sim.assets.paint import BLACK, WHITE, Canvas, Colour, Drawing, Pixels, drawn
+from lerobot_memobench.sim.assets.paint import BLACK, WHITE, Canvas, Colour, Drawing, Pixels, draw_texture
 
 
 @dataclass(frozen=True)
 class Bottle:
-    """A bottle standing on z = 0 before it is centred.
+    """A bottle with its bottom at z = 0 before centring.
 
     ``profile``: (radius, z) from the bottom up [m]; ``scale``: factors of the radius along x and y.
-    ``shoulder``: height to which the body goes; ``neck``: radius of what is above [m].
-    ``paint`` draws the bottle as seen from the front.
+    ``shoulder``: height of the body; ``neck``: radius above the body [m].
+    ``paint`` draws the front view of the bottle.
     """
 
     key: str
@@ -57,7 +57,7 @@ class Bottle:
         if self._is_round:
             b.collision("cylinder", (x, self.shoulder / 2), 0.9 * self.mass, body, friction=GRIP_FRICTION)
         else:
-            # The corners of a box around an ellipse stand out: two crossed boxes are nearer to it.
+            # Two crossed boxes approximate an ellipse better than its bounding box.
             b.collision("box", (x, 0.72 * y, self.shoulder / 2), 0.5 * self.mass, body, friction=GRIP_FRICTION)
             b.collision("box", (0.72 * x, y, self.shoulder / 2), 0.4 * self.mass, body, friction=GRIP_FRICTION)
         rest = (high - self.shoulder) / 2
@@ -66,12 +66,12 @@ class Bottle:
             b.collision("cylinder", (self.neck, rest), 0.1 * self.mass, cap, friction=GRIP_FRICTION)
 
     def _grasps(self, b: Builder, x: float, y: float, high: float) -> None:
-        """Hold the body where the fingers reach it from above, else the neck or cap."""
+        """Add grasps of the body if the fingers reach it from above, else of the neck or cap."""
         middle = high / 2
         reach = high - 0.036
         at = min(reach, self.shoulder - 0.010)
         if high - at > 0.042:
-            # The body begins below the fingers' reach.
+            # The body is below the fingers' reach.
             b.grasp((0, 0, high - 0.022 - middle), ALONG_X, 2 * self.neck, symmetric=True)
         elif self._is_round and 2 * x <= 0.068:
             b.grasp((0, 0, at - middle), ALONG_X, 2 * x, symmetric=True)
@@ -81,8 +81,8 @@ class Bottle:
                     b.grasp((0, 0, at - middle), yaw, width)
 
     def texture(self) -> Pixels:
-        """Return the front's picture wrapped around, so that from +x (and -x) it looks as it was painted."""
-        flat = drawn(160, 256, self.colour, self.paint)
+        """Return the front image wrapped around the bottle, undistorted from +x and -x."""
+        flat = draw_texture(160, 256, self.colour, self.paint)
         angles = 2 * np.pi * ((np.arange(256) + 0.5) / 256 - 0.5)
         seen = np.sin(angles) * np.where(np.cos(angles) < 0, -1.0, 1.0)
         return flat[:, np.clip((0.5 + 0.5 * seen) * 160, 0, 159).astype(int)]

@@ -1,8 +1,7 @@
-"""Builds objects and fixtures into a ``mujoco.MjSpec``.
+"""Build objects and fixtures into a ``mujoco.MjSpec``.
 
-An asset is a function of a `Builder`: it adds visual geoms (group 1, without contacts or mass), collision
-geoms (group 0, which cameras never draw) and sites below one root body, and returns an `Asset`. For frames and
-units see `sim.assets.asset`.
+An asset is a function of a `Builder` that adds visual geoms (group 1, without contacts or mass), invisible collision
+geoms (group 0) and sites below one root body, and returns an `Asset`. For frames and units see `sim.assets.asset`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ VISUAL_GROUP = 1
 COLLISION_GROUP = 0
 SITE_GROUP = 4
 
-# Contacts: stiff enough that things do not sink visibly, slow enough (5 physics steps) to be stable at 2 ms.
+# Contacts are stiff enough to avoid visible sinking, and slow enough (5 physics steps) to be stable at 2 ms.
 SOLREF = (0.01, 1.0)
 SOLIMP = (0.95, 0.99, 0.001, 0.5, 2.0)
 FRICTION = (1.0, 0.02, 0.0005)
@@ -38,17 +37,17 @@ _TYPES: dict[Primitive, mujoco.mjtGeom] = {
 }
 ORIGIN = (0.0, 0.0, 0.0)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-"""No turn, as a quaternion wxyz."""
+"""Identity quaternion wxyz."""
 
 
 class Builder:
-    """Builds one instance of an asset into a shared ``MjSpec``.
+    """Build one instance of an asset into a shared ``MjSpec``.
 
     Bodies, geoms, joints and sites are named ``f"{name}_{suffix}"``.
     """
 
     def __init__(self, spec: mujoco.MjSpec, name: str, class_name: str, variant: int = 0) -> None:
-        """Add the root body ``name`` to the world; the scene places it and frees objects with a joint."""
+        """Add the root body ``name`` to the world; the scene sets its pose and adds free joints of objects."""
         self.spec, self.name, self.class_name, self.variant = spec, name, class_name, variant
         self.body: mujoco.MjsBody = spec.worldbody.add_body(name=name)
         self._counts: dict[str, int] = {}
@@ -64,7 +63,7 @@ class Builder:
         self._counts[kind] = self._counts.get(kind, -1) + 1
         return self.full(f"{kind}{self._counts[kind]}")
 
-    # --- textures, materials and meshes: made once per scene and shared by all that use their key
+    # --- textures, materials and meshes: created once per key and scene
 
     def material(
         self,
@@ -75,7 +74,7 @@ class Builder:
         shininess: float = 0.3,
         emission: float = 0.0,
     ) -> str:
-        """Return the name of the material ``key``, made on first use; ``image`` draws its texture."""
+        """Return the name of the material ``key``, created on first use; ``image`` draws its texture."""
         name = f"memobench_{key}"
         if self.spec.material(name) is not None:
             return name
@@ -92,7 +91,7 @@ class Builder:
         return name
 
     def mesh(self, key: str, make: Callable[[], MeshData], smooth: bool = False) -> str:
-        """Return the name of the mesh ``key``, made on first use; ``smooth`` shades sharp edges as round."""
+        """Return the name of the mesh ``key``, created on first use; ``smooth`` shades sharp edges as round."""
         name = f"memobench_{key}"
         if self.spec.mesh(name) is not None:
             return name
@@ -129,7 +128,7 @@ class Builder:
         """Add a joint limited to ``limits`` [m or rad] to ``body`` and return its full name."""
         name = self.full(suffix)
         kinds = {"slide": mujoco.mjtJoint.mjJNT_SLIDE, "hinge": mujoco.mjtJoint.mjJNT_HINGE}
-        # A spec reads hinge limits in the unit of its compiler option.
+        # The compiler option of the spec defines the unit of hinge limits.
         in_degrees = kind == "hinge" and self.spec.compiler.degree
         body.add_joint(
             name=name,
@@ -147,7 +146,7 @@ class Builder:
     # --- geoms and sites
 
     def visual_mesh(self, mesh: str, material: str, body: mujoco.MjsBody | None = None) -> mujoco.MjsGeom:
-        """Add a mesh that is seen and never touched."""
+        """Add a visual mesh without contacts."""
         return self._seen(body, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, material=material)
 
     def textured_mesh(
@@ -159,14 +158,14 @@ class Builder:
         shininess: float,
         smooth: bool = False,
     ) -> None:
-        """Add a visual mesh with a texture of its own; both are named ``key``."""
+        """Add a visual mesh with its texture; both are named ``key``."""
         mesh = self.mesh(key, make, smooth)
         self.visual_mesh(mesh, self.material(key, image, specular=specular, shininess=shininess))
 
     def visual(
         self, kind: Primitive, size: Vector, material: str, pos: Vector = ORIGIN, quat: Vector = UPRIGHT
     ) -> None:
-        """Add a primitive that is seen and never touched; for round things meshes have fewer faces."""
+        """Add a visual primitive without contacts; for round shapes meshes have fewer faces."""
         self._seen(None, type=_TYPES[kind], size=_size(size), material=material, pos=list(pos), quat=list(quat))
 
     def _seen(self, body: mujoco.MjsBody | None, **given: Any) -> mujoco.MjsGeom:
@@ -183,7 +182,7 @@ class Builder:
         body: mujoco.MjsBody | None = None,
         friction: Vector = FRICTION,
     ) -> mujoco.MjsGeom:
-        """Add a primitive that is touched, weighs ``mass`` and is never seen."""
+        """Add an invisible collision primitive of mass ``mass`` [kg]."""
         return (body or self.body).add_geom(
             name=self._fresh("collision"),
             type=_TYPES[kind],
@@ -208,7 +207,7 @@ class Builder:
         mass: float,
         friction: Vector = FRICTION,
     ) -> None:
-        """Add tilted collision boxes around z, from (radius, z) ``low`` to ``high`` on the wall's middle."""
+        """Add tilted collision boxes around z; the wall's centre line runs from (radius, z) ``low`` to ``high``."""
         (r0, z0), (r1, z1) = low, high
         slant = np.hypot(r1 - r0, z1 - z0)
         along = np.array([(r1 - r0) / slant, 0.0, (z1 - z0) / slant])
@@ -248,7 +247,7 @@ class Builder:
         )
         return name
 
-    # --- facts
+    # --- metadata
 
     def grasp(self, position: Vector, yaw: float, width: float, symmetric: bool = False) -> None:
         """Note a way to hold the object from above."""
@@ -262,7 +261,7 @@ class Builder:
         floor: float | None = None,
         clear: float | None = None,
     ) -> Asset:
-        """Return the facts about an object; ``floor`` and ``clear`` are those of a container's inside."""
+        """Return the metadata of an object; ``floor`` and ``clear``: height and radius of a container's inside [m]."""
         x, y, top = _triple(high)
         return Asset(
             name=self.name,
@@ -286,7 +285,7 @@ class Builder:
         clear: float = 0.0,
         glow: tuple[str, ...] = (),
     ) -> Asset:
-        """Return the facts about a fixture; ``supports`` and ``clear`` tell of its top."""
+        """Return the metadata of a fixture; ``supports`` and ``clear``: height and radius of its top [m]."""
         return Asset(
             name=self.name,
             class_name=self.class_name,
@@ -311,8 +310,8 @@ def _triple(values: Vector) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def turned(axis: Vector, angle: float) -> list[float]:
-    """Return the quaternion (w, x, y, z) of a turn by ``angle`` [rad] about ``axis``."""
+def axis_angle_quaternion(axis: Vector, angle: float) -> list[float]:
+    """Return the quaternion (w, x, y, z) of a rotation by ``angle`` [rad] about ``axis``."""
     quat = np.zeros(4)
     mujoco.mju_axisAngle2Quat(quat, np.asarray(axis, dtype=np.float64), angle)
     return [float(v) for v in quat]

@@ -1,4 +1,4 @@
-"""The wooden cabinet with three drawers that slide out to local -y."""
+"""Build the wooden cabinet with three drawers that open towards local -y."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SHELF = 0.004
 _OPENING = (_HIGH - 2 * _BOARD - 2 * _SHELF) / 3
 _PITCH = _OPENING + _SHELF
 
-# A drawer in the frame of its body, which is the cabinet's at q = 0 but for z: 0 is the drawer's underside.
+# A drawer in the frame of its body: the cabinet's frame at q = 0, with z = 0 at the drawer's underside.
 _HALF_DRAWER_X = _HALF_X - _SIDE - 0.0015
 _FACE = _FRONT - CLOSED  # y of the front's outer face at q = 0
 _PANEL = 0.008
@@ -38,8 +38,8 @@ _WALL_HIGH = 0.050
 _INNER_FRONT = _FACE + _PANEL
 _INNER_BACK = _INNER_FRONT + 0.150
 _SEAL = 0.010
-"""How deep the board behind a front is that fills the opening: no camera sees past it until the drawer is pulled by as
-much and the front's thickness."""
+"""Depth of the board that closes the gaps behind a front; it hides the content until the drawer is pulled by this depth
+plus the thickness of the front."""
 _DRAWER_HIGH = _OPENING - 0.003
 
 _HANDLE_LENGTH = 0.056
@@ -83,7 +83,7 @@ def _panel() -> list[Block]:
 
 
 def _handle() -> list[Block]:
-    """Return a bar along x on two posts; the gripper can also take the bracket by its two ends."""
+    """Return a bar along x on two posts; the gripper can also grasp it by its two ends."""
     z, post = _DRAWER_HIGH / 2, _HANDLE_THICK / 2
     out = _FACE - _HANDLE_OUT
     reach = (_HANDLE_OUT - _HANDLE_THICK) / 2
@@ -94,7 +94,7 @@ def _handle() -> list[Block]:
 
 
 def _add(b: Builder, key: str, parts: list[Block], material: str, body: mujoco.MjsBody) -> None:
-    """Add what is seen of some boards."""
+    """Add the visual mesh of some boards."""
     b.visual_mesh(b.mesh(f"cabinet_{key}", lambda: blocks(parts, tile=0.25)), material, body)
 
 
@@ -129,7 +129,7 @@ def _cabinet(b: Builder) -> Asset:
 
 
 def _fill_drawer(b: Builder, drawer: mujoco.MjsBody) -> None:
-    """Add what is seen and felt of a drawer to its body."""
+    """Add visual and collision geoms of a drawer to its body."""
     dark = partial(wood, (66, 48, 38), (118, 90, 72), seed=6, waves=7)
     light = partial(wood, (150, 118, 84), (196, 164, 124), seed=7, waves=4)
     front = b.material("cabinet_front", dark, specular=0.15, shininess=0.2)

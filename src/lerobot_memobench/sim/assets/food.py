@@ -1,6 +1,6 @@
-"""Vegetables and snacks: tomato, artichoke, broccoli, Brussels sprout, bag of snacks, chestnut, biscuit.
+"""Build vegetables and snacks: tomato, artichoke, broccoli, Brussels sprout, bag of snacks, chestnut, biscuit.
 
-Vegetables fit the gripper across and the drawer in height; their contacts have flat bottoms, so that nothing rolls.
+Vegetables fit into the gripper and the drawers; collision geoms have flat bottoms to prevent rolling.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Asset
 from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
 from lerobot_memobench.sim.assets.meshes import Floats, MeshData, ball, grid_faces, lathe, merged, tube
-from lerobot_memobench.sim.assets.paint import WHITE, Canvas, Colour, Pixels, drawn
+from lerobot_memobench.sim.assets.paint import WHITE, Canvas, Colour, Pixels, draw_texture
 
 
 def _round_contacts(b: Builder, radius: float, half: float, mass: float, foot: float = 0.62) -> None:
-    """Add two cylinders: a wide one around the middle for the fingers, a narrow tall one to stand on."""
+    """Add two collision cylinders: a wide one around the centre for the fingers, a narrow tall one as the base."""
     b.collision("cylinder", (radius, 0.42 * half), 0.6 * mass, friction=GRIP_FRICTION)
     b.collision("cylinder", (foot * radius, half), 0.4 * mass, friction=GRIP_FRICTION)
 
@@ -43,7 +43,7 @@ def _tomato_mesh() -> MeshData:
 
 
 def _calyx_mesh() -> MeshData:
-    """Return six leaves that lie on the tomato's shoulder, and a stub of the stem."""
+    """Return six leaves on the tomato's shoulder, and a stem stub."""
     leaves = []
     for k in range(6):
         long = 0.019 if k % 2 else 0.016
@@ -72,7 +72,7 @@ _ARTICHOKE = (0.0285, 0.0260)
 def _scale(
     angle: float, elevation: float, radii: tuple[float, float], wide: float, long: float, lift: float
 ) -> MeshData:
-    """Return a leaf on an ellipsoid of ``radii`` (sideways, up), seen from both sides, its tip upwards."""
+    """Return a two-sided leaf on an ellipsoid of ``radii`` (sideways, up), with its tip upwards."""
     side, up = radii
 
     def spot(e: float, a: float, out: float) -> Floats:
@@ -179,7 +179,7 @@ _SPROUT = (0.0250, 0.0235)
 
 
 def _sprout_leaf(angle: float, tilt: float, wide: float, out: float) -> MeshData:
-    """Return a leaf that wraps the ball from below and stands off at its edge."""
+    """Return a leaf that wraps the ball from below with a raised edge."""
     radius, half = _SPROUT
     columns, rows = 5, 4
     vertices, uv = [], []
@@ -226,7 +226,7 @@ def _sprout_texture() -> Pixels:
         canvas.rect(0, 0, 0.04, 1, (150, 184, 88))
         canvas.rect(0.96, 0, 1, 1, (150, 184, 88))
 
-    return drawn(96, 96, (108, 156, 58), ribs)
+    return draw_texture(96, 96, (108, 156, 58), ribs)
 
 
 def _sprout(b: Builder) -> Asset:
@@ -287,7 +287,7 @@ def _bag_texture() -> Pixels:
             canvas.oval(x + 0.01, y, x + 0.26, y + 0.11, yellow)
             canvas.oval(x + 0.07, y + 0.03, x + 0.19, y + 0.07, (240, 184, 40))
 
-    half = drawn(128, 200, green, side)
+    half = draw_texture(128, 200, green, side)
     return np.concatenate([half, half], axis=1)
 
 
@@ -322,7 +322,7 @@ def _chestnut_texture() -> Pixels:
             points += [k / 48, 0.70 + 0.03 * float(np.sin(2 * np.pi * 3 * k / 48))]
         canvas.shape((206, 172, 124), *points, 1, 1, 0, 1)
 
-    return drawn(192, 96, (92, 38, 18), paint)
+    return draw_texture(192, 96, (92, 38, 18), paint)
 
 
 def _chestnut(b: Builder) -> Asset:
@@ -374,7 +374,7 @@ def _biscuit_texture() -> Pixels:
             canvas.oval(k / 5 + 0.06, 0.120, k / 5 + 0.14, 0.160, brown)
         canvas.rect(0, 0.475, 1, 0.60, (250, 236, 206))
 
-    return drawn(256, 256, gold, paint)
+    return draw_texture(256, 256, gold, paint)
 
 
 def _biscuit(b: Builder) -> Asset:

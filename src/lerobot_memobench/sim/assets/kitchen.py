@@ -1,4 +1,4 @@
-"""The room: table, floor, walls, light, and a shelf. The table's top is at z = 0.90 m, its middle at x = y = 0."""
+"""Build the room (table, floor, walls, lights) and the shelf. The table top is at z = 0.90 m with centre x = y = 0."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def build_kitchen(spec: mujoco.MjSpec) -> Asset:
 
 
 def _light(spec: mujoco.MjSpec) -> None:
-    """Add the lights: one casts shadows; a second one and the headlight's ambience fill in."""
+    """Add a shadow-casting key light, a fill light and ambient light of the headlight."""
     spec.visual.headlight.ambient = [0.34, 0.34, 0.34]
     spec.visual.headlight.diffuse = [0.16, 0.16, 0.16]
     spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    # Shadow map and clipping planes go by the extent: a map over the table alone has sharp shadows.
+    # Shadow map and clipping planes scale with the extent; a map of the table only has sharp shadows.
     spec.stat.center = [0.0, 0.0, TABLE_TOP]
     spec.stat.extent = 1.0
     spec.visual.map.shadowclip = 1.0
@@ -65,7 +65,7 @@ def _light(spec: mujoco.MjSpec) -> None:
 
 
 def _room(room: Builder) -> None:
-    """Add floor and walls, which are only seen."""
+    """Add visual floor and walls."""
     floor = room.material("floor", lambda: speckle((128, 122, 112), 5, seed=11), specular=0.0)
     wall = room.material("wall", lambda: speckle((146, 146, 124), 5, seed=12, along=0.03), specular=0.0)
     room.visual_mesh(room.mesh("room_floor", lambda: blocks([Block((0, 0, -0.05), (2.5, 2.5, 0.05))], 0.8)), floor)
@@ -78,7 +78,7 @@ def _room(room: Builder) -> None:
 
 
 def _table(b: Builder) -> Asset:
-    """Build the table; its origin is the middle of its top."""
+    """Build the table; its origin is the centre of its top."""
     x, y, thick = TABLE_SIZE[0] / 2, TABLE_SIZE[1] / 2, TABLE_SIZE[2]
     grain = partial(wood, (190, 172, 152), (222, 207, 189), seed=21, size=512, waves=3)
     light = b.material("table", grain, specular=0.05, shininess=0.1)
@@ -109,9 +109,9 @@ def _boards() -> list[Block]:
     y, depth = (_SHELF_FRONT + _SHELF_BACK) / 2, (_SHELF_BACK - _SHELF_FRONT) / 2
     inner = _SHELF_HALF_X - _SHELF_BOARD
     high = (_SHELF_HIGH - _SHELF_BOARD) / 2
-    beside = _SHELF_HALF_X - _SHELF_BOARD / 2
+    side = _SHELF_HALF_X - _SHELF_BOARD / 2
     return [
-        *(Block((s * beside, y, high), (_SHELF_BOARD / 2, depth, high), 2) for s in (-1.0, 1.0)),
+        *(Block((s * side, y, high), (_SHELF_BOARD / 2, depth, high), 2) for s in (-1.0, 1.0)),
         Block((0, y, _SHELF_HIGH - _SHELF_BOARD / 2), (_SHELF_HALF_X, depth, _SHELF_BOARD / 2), 0),
         Block((0, y, _SHELF_MIDDLE - _SHELF_BOARD / 2), (inner, depth, _SHELF_BOARD / 2), 0),
         Block((0, y, _SHELF_BOARD / 2), (inner, depth, _SHELF_BOARD / 2), 0),

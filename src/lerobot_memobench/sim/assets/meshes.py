@@ -1,6 +1,6 @@
-"""Light triangle meshes from a few numbers: surfaces of revolution, boxes, tubes and what is bent from them.
+"""Generate light triangle meshes: surfaces of revolution, boxes, tubes and their deformations.
 
-Texture coordinates: u grows to the right and v downwards in the image (its first row is v = 0).
+Texture coordinates: u increases to the right and v downwards in the image (its first row is v = 0).
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def lathe(
         v = (heights.max() - heights) / np.ptp(heights)
     vertices, rings = _rings(radii, heights, segments, scale)
     faces, uv_faces = _between_rings(rings)
-    # Textures repeat: keep clear of the first and last row, which blend into each other.
+    # Textures repeat: avoid the first and last row, which blend into each other.
     v = 0.008 + 0.984 * v
     u = np.linspace(0.0, 1.0, segments + 1)
     uv = np.stack([np.tile(u, len(v)), np.repeat(v, segments + 1)], axis=1)
@@ -144,9 +144,9 @@ def ball(radii: Sequence[float], segments: int = 16, rings: int = 9) -> MeshData
 
 
 def box(half: Sequence[float]) -> MeshData:
-    """Return a box whose faces take the cells of a 3 x 2 atlas, upright for somebody who looks at that face.
+    """Return a box with the cells of a 3 x 2 atlas on its faces, upright when viewed from outside.
 
-    On the top and bottom faces the image's right is +y, as the agentview camera sees it.
+    On the top and bottom faces the image's right is +y, as in the agentview camera.
     """
     x, y, z = half
     sides = {
@@ -185,7 +185,7 @@ def quads_mesh(quads: Sequence[Quad], uvs: Sequence[Floats]) -> MeshData:
 
 
 def grid_faces(columns: int, rows: int, first: int = 0) -> list[tuple[int, int, int]]:
-    """Return the triangles of a grid whose (rows + 1) × (columns + 1) vertices stand row by row from ``first`` on."""
+    """Return the triangles of a grid with (rows + 1) × (columns + 1) vertices, row by row from index ``first``."""
     faces = []
     for i in range(rows):
         for j in range(columns):
@@ -197,7 +197,7 @@ def grid_faces(columns: int, rows: int, first: int = 0) -> list[tuple[int, int, 
 
 @dataclass(frozen=True)
 class Block:
-    """A box in a set of boards: middle and half sizes [m], and the axis along which the grain runs."""
+    """A box in a set of boards: centre and half sizes [m], and the axis of the grain."""
 
     centre: tuple[float, float, float]
     half: tuple[float, float, float]
@@ -208,7 +208,7 @@ def blocks(parts: Sequence[Block], tile: float = 0.3) -> MeshData:
     """Return many boxes as one mesh; the image repeats every ``tile`` metres, its u along the grain."""
     quads, uvs = [], []
     for number, part in enumerate(parts):
-        # Boards are cut from different places of the plank.
+        # Shift the texture per board.
         shift = np.array([0.37 * number, 0.61 * number])
         for axis in range(3):
             along = part.grain if part.grain != axis else (axis + 1) % 3
@@ -221,7 +221,7 @@ def blocks(parts: Sequence[Block], tile: float = 0.3) -> MeshData:
 
 
 def _block_side(half: Floats, axis: int, sign: float) -> list[Floats]:
-    """Return the corners of the side of a box that looks along an axis or against it."""
+    """Return the corners of the side of a box that faces along or against an axis."""
     corners: list[Floats] = []
     for p, q in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
         corner = np.zeros(3)
@@ -254,7 +254,7 @@ def tube(
 
 
 def _tube_faces(rings: int, sides: int) -> list[list[int]]:
-    """Return the triangles of a tube's wall and of its ends, whose middles stand after the rings."""
+    """Return the triangles of a tube's wall and ends; the end centres follow the rings."""
     faces = []
     for i in range(rings - 1):
         for j in range(sides):

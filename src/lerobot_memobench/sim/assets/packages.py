@@ -11,12 +11,12 @@ import numpy as np
 from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Asset
 from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
 from lerobot_memobench.sim.assets.meshes import Floats, Half, MeshData, Quad, box, cell_uv, quads_mesh
-from lerobot_memobench.sim.assets.paint import BLACK, WHITE, Canvas, Colour, Pixels, atlas, drawn, wrapped
+from lerobot_memobench.sim.assets.paint import BLACK, WHITE, Canvas, Colour, Pixels, atlas, draw_texture, wrapped
 
 
 @dataclass(frozen=True)
 class Package:
-    """A box with a texture; it is held across every horizontal side of up to ``widest``, m."""
+    """A textured box, grasped across every horizontal extent up to ``widest``, m."""
 
     key: str
     half: Half
@@ -29,7 +29,7 @@ class Package:
         b.textured_mesh(self.key, lambda: box(self.half), self.texture, specular=0.25, shininess=0.4)
         b.collision("box", self.half, self.mass, friction=GRIP_FRICTION)
         x, y, z = self.half
-        # A finger reaches about 4 cm below the palm, and should not touch the table.
+        # A finger reaches about 4 cm below the palm and must not touch the table.
         at = max(0.0, z - 0.032)
         for yaw, width in sorted(((ALONG_X, 2 * x), (ALONG_Y, 2 * y)), key=lambda pair: pair[1]):
             if width <= self.widest:
@@ -53,12 +53,12 @@ def _butter_texture() -> Pixels:
         canvas.rect(0.9, 0, 1, 1, blue)
         canvas.text("BUTTER", 0.15, 0.15, 0.85, 0.85, blue)
 
-    end = drawn(64, 32, yellow, lambda c: c.text("BUTTER", 0.08, 0.12, 0.92, 0.88, blue))
-    long = drawn(128, 32, yellow, side)
-    return atlas({"+z": drawn(96, 180, yellow, top), "+x": end, "-x": end, "+y": long, "-y": long}, yellow)
+    end = draw_texture(64, 32, yellow, lambda c: c.text("BUTTER", 0.08, 0.12, 0.92, 0.88, blue))
+    long = draw_texture(128, 32, yellow, side)
+    return atlas({"+z": draw_texture(96, 180, yellow, top), "+x": end, "-x": end, "+y": long, "-y": long}, yellow)
 
 
-# A little shorter than the published one, so that it can be taken by its ends where others lie close beside it.
+# Slightly shorter than the published one, so that it can be grasped by its ends next to close neighbours.
 BUTTER = Package("butter", (0.0358, 0.0195, 0.0090), _butter_texture, 0.06, widest=0.073)
 
 
@@ -87,8 +87,8 @@ def _oatmeal_texture() -> Pixels:
         canvas.rect(0, 0.36, 1, 0.39, WHITE)
         canvas.text("OATMEAL", 0.30, 0.42, 0.70, 0.96, brown, turn=1)
 
-    top = drawn(96, 64, red, lambda c: c.text("OATMEAL", 0.06, 0.1, 0.94, 0.9, WHITE))
-    return wrapped(drawn(160, 224, tan, front), drawn(96, 224, tan, side), top, red)
+    top = draw_texture(96, 64, red, lambda c: c.text("OATMEAL", 0.06, 0.1, 0.94, 0.9, WHITE))
+    return wrapped(draw_texture(160, 224, tan, front), draw_texture(96, 224, tan, side), top, red)
 
 
 OATMEAL = Package("box_of_oatmeal", (0.0240, 0.0480, 0.0690), _oatmeal_texture, 0.18)
@@ -116,8 +116,8 @@ def _cereal_texture() -> Pixels:
         canvas.rect(0, 0.12, 1, 0.52, purple)
         canvas.text("CEREAL", 0.25, 0.55, 0.75, 0.97, purple, turn=1)
 
-    top = drawn(96, 64, yellow, lambda c: c.text("CEREAL", 0.06, 0.1, 0.94, 0.9, purple))
-    return wrapped(drawn(160, 240, yellow, front), drawn(80, 240, yellow, side), top, yellow)
+    top = draw_texture(96, 64, yellow, lambda c: c.text("CEREAL", 0.06, 0.1, 0.94, 0.9, purple))
+    return wrapped(draw_texture(160, 240, yellow, front), draw_texture(80, 240, yellow, side), top, yellow)
 
 
 CEREAL = Package("box_of_cereal", (0.0210, 0.0500, 0.0720), _cereal_texture, 0.16)
@@ -146,8 +146,8 @@ def _flour_texture() -> Pixels:
         canvas.rect(0, 0.10, 1, 0.46, blue)
         canvas.text("FLOUR", 0.28, 0.50, 0.72, 0.96, blue, turn=1)
 
-    top = drawn(96, 64, paper, lambda c: c.text("FLOUR", 0.06, 0.1, 0.94, 0.9, blue))
-    return wrapped(drawn(160, 224, paper, front), drawn(112, 224, paper, side), top, paper)
+    top = draw_texture(96, 64, paper, lambda c: c.text("FLOUR", 0.06, 0.1, 0.94, 0.9, blue))
+    return wrapped(draw_texture(160, 224, paper, front), draw_texture(112, 224, paper, side), top, paper)
 
 
 FLOUR = Package("box_of_flour", (0.0280, 0.0430, 0.0660), _flour_texture, 0.22)
@@ -172,8 +172,8 @@ def _bean_curd_texture() -> Pixels:
         for x in (0.17, 0.83):
             canvas.line((226, 218, 192), 0.012, x, 0.12, x, 1)
 
-    edge = drawn(96, 64, cream, side)
-    faces = {"+z": drawn(128, 128, rim, top), "+x": edge, "-x": edge, "+y": edge, "-y": edge}
+    edge = draw_texture(96, 64, cream, side)
+    faces = {"+z": draw_texture(128, 128, rim, top), "+x": edge, "-x": edge, "+y": edge, "-y": edge}
     return atlas(faces, cream)
 
 
@@ -185,7 +185,7 @@ BEAN_CURD = Package("bean_curd", (0.0250, 0.0300, 0.0175), _bean_curd_texture, 0
 
 @dataclass(frozen=True)
 class Carton:
-    """A gable-top carton, whose slopes begin ``shoulder`` below its top [m]."""
+    """A gable-top carton; its slopes begin ``shoulder`` below its top [m]."""
 
     key: str
     half: Half
@@ -203,17 +203,17 @@ class Carton:
         b.collision("box", (x, y, (base + z) / 2), 0.9 * self.mass, (0, 0, (base - z) / 2), friction=GRIP_FRICTION)
         gable = (0.35 * x, y, shoulder / 2)
         b.collision("box", gable, 0.1 * self.mass, (0, 0, z - shoulder / 2), friction=GRIP_FRICTION)
-        at = z - 0.0325  # the palm all but touches the fin
+        at = z - 0.0325  # the palm nearly touches the fin
         b.grasp((0, 0, at), ALONG_X, 2 * x)
         b.grasp((0, 0, at), ALONG_Y, 2 * y)
         return b.object((-x, -y, -z), self.half)
 
 
 def _carton_mesh(half: Half, shoulder: float) -> MeshData:
-    """Return the carton's mesh: atlas cells as for a box, the slopes take the tops of front and back."""
+    """Return the carton's mesh with atlas cells as for a box; the slopes use the tops of front and back."""
     x, y, z = half
     base, ridge, thin = z - shoulder, z - 0.009, 0.0022
-    # Half depth at each height, and which part of the front's image lies below it.
+    # Half depth, height, and share of the front image below that height.
     outline = [(x, -z, 0.0), (x, base, (base + z) / (2 * z)), (thin, ridge, (ridge + z) / (2 * z)), (thin, z, 1.0)]
     quads: list[Quad] = []
     uvs: list[Floats] = []
@@ -265,7 +265,9 @@ def _milk_texture() -> Pixels:
         for k in range(5):
             canvas.rect(0.15, 0.34 + 0.055 * k, 0.85, 0.36 + 0.055 * k, (240, 190, 186))
 
-    return wrapped(drawn(128, 256, red, front), drawn(128, 256, red, side), drawn(16, 16, red), red)
+    return wrapped(
+        draw_texture(128, 256, red, front), draw_texture(128, 256, red, side), draw_texture(16, 16, red), red
+    )
 
 
 MILK = Carton("milk", (0.0265, 0.0270, 0.0655), _milk_texture, 0.15, 0.032)
@@ -296,7 +298,12 @@ def _carton_of_milk_texture() -> Pixels:
         canvas.rect(0, 0.88, 1, 1, (96, 170, 74))
         canvas.text("MILK", 0.36, 0.28, 0.64, 0.84, navy, turn=1)
 
-    return wrapped(drawn(128, 256, (226, 240, 250), front), drawn(128, 256, sky, side), drawn(16, 16, navy), navy)
+    return wrapped(
+        draw_texture(128, 256, (226, 240, 250), front),
+        draw_texture(128, 256, sky, side),
+        draw_texture(16, 16, navy),
+        navy,
+    )
 
 
 CARTON_OF_MILK = Carton("carton_of_milk", (0.0310, 0.0310, 0.0790), _carton_of_milk_texture, 0.20, 0.036)

@@ -1,4 +1,4 @@
-"""Textures drawn with Pillow: wood, metal and labels. Every function returns a (H, W, 3) uint8 array."""
+"""Draw textures with Pillow: wood, metal and labels, as (H, W, 3) uint8 arrays."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BLACK: Colour = (20, 20, 22)
 
 
 class Canvas:
-    """A drawing whose coordinates run from 0 to 1 both ways, so that labels do not depend on pixels."""
+    """A drawing with coordinates from 0 to 1 in both directions, independent of the image size."""
 
     def __init__(self, width: int, height: int, colour: Colour) -> None:
         self.image = Image.new("RGB", (width, height), colour)
@@ -48,7 +48,7 @@ class Canvas:
         self.draw.line(self.xy(*points), fill=colour, width=max(1, round(width * self.width)), joint="curve")
 
     def text(self, words: str, x0: float, y0: float, x1: float, y1: float, colour: Colour, turn: int = 0) -> None:
-        """Write bold ``words`` as large as the rectangle lets them be, turned by ``turn`` x 90 degrees."""
+        """Write bold ``words`` as large as the rectangle allows, rotated by ``turn`` x 90 degrees."""
         left, top, right, bottom = (round(v) for pair in self.xy(x0, y0, x1, y1) for v in pair)
         wide, high = max(1, right - left), max(1, bottom - top)
         font = ImageFont.load_default(96)
@@ -62,7 +62,7 @@ class Canvas:
         if turn:
             mask = mask.rotate(90 * turn, expand=True)
         factor = min(wide / mask.width, high / mask.height)
-        # Letters may be drawn taller than wide, but only so far that they still look like letters.
+        # Limit the aspect ratio of letters.
         stretch_x = min(wide / mask.width, factor * 1.35)
         stretch_y = min(high / mask.height, factor * 1.35)
         shown = mask.resize(
@@ -77,7 +77,7 @@ class Canvas:
         return np.asarray(self.image, dtype=np.uint8)
 
 
-def drawn(width: int, height: int, colour: Colour, *steps: Drawing) -> Pixels:
+def draw_texture(width: int, height: int, colour: Colour, *steps: Drawing) -> Pixels:
     """Return a canvas after ``steps``."""
     canvas = Canvas(width, height, colour)
     for step in steps:
@@ -102,7 +102,7 @@ def wrapped(front: Pixels, side: Pixels, top: Pixels, colour: Colour) -> Pixels:
 
 
 def wood(dark: Colour, light: Colour, seed: int, size: int = 256, waves: float = 5.0) -> Pixels:
-    """Return a wood texture that repeats without a seam; the grain runs along u."""
+    """Return a seamless wood texture with the grain along u."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[0:size, 0:size] / size
     bend = np.zeros((size, size))
@@ -128,7 +128,7 @@ def _fibre_filter(size: int) -> NDArray[np.float64]:
 
 
 def speckle(base: Colour, spread: float, seed: int, size: int = 64, along: float = 0.0) -> Pixels:
-    """Return a plain colour with fine noise, brushed along u when ``along`` > 0; repeats without a seam."""
+    """Return a seamless plain colour with fine noise, brushed along u if ``along`` > 0."""
     rng = np.random.default_rng(seed)
     noise = rng.normal(size=(size, size))
     if along > 0:

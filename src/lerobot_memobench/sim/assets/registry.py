@@ -1,4 +1,4 @@
-"""Which builder makes which class. A user may register LIBERO's own assets over the project's."""
+"""Register asset builders by class; registered builders override this package's."""
 
 from __future__ import annotations
 
@@ -24,16 +24,15 @@ from lerobot_memobench.sim.assets.builder import Builder
 Build = Callable[[Builder], Asset]
 
 _MODULES = (appliances, bottles, cabinet, food, kitchen, packages, tableware, trinkets)
-"""Where the project's own classes are: each has ``BUILDERS``, class name -> builder."""
+"""Modules with ``BUILDERS``: class name -> builder."""
 
 _builders: dict[str, Build] = {name: build for module in _MODULES for name, build in module.BUILDERS.items()}
 
 
 def register(class_name: str, builder: Build) -> None:
-    """Let ``builder`` make objects or fixtures of ``class_name`` from now on.
+    """Register ``builder`` for objects or fixtures of ``class_name``.
 
-    ``class_name`` may be exact (``cork__3``) or a family (``cork``, and with it every ``cork__k``); exact
-    names go first.
+    ``class_name`` is exact (``cork__3``) or a family (``cork`` for every ``cork__k``); exact names have priority.
     """
     _builders[class_name] = builder
 
@@ -44,7 +43,7 @@ def known_classes() -> list[str]:
 
 
 def build_asset(spec: mujoco.MjSpec, name: str, class_name: str) -> Asset:
-    """Build an instance ``name`` of ``class_name`` into a scene and return the facts about it.
+    """Build an instance ``name`` of ``class_name`` into a scene and return its metadata.
 
     Raises:
         MemobenchError: no builder is registered for the class.

@@ -1,6 +1,6 @@
-"""Bowls, plates, a frying pan and a moka pot.
+"""Build bowls, plates, the frying pan and the moka pot.
 
-The origin of bowls and plates is the centre of the bottom, so that things put into them lie above it.
+The origin of bowls and plates is the centre of the bottom, below their content.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_memobench.sim.assets.asset import ALONG_X, Asset
-from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder, turned
+from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder, axis_angle_quaternion
 from lerobot_memobench.sim.assets.meshes import MeshData, ball, lathe, merged, tube
-from lerobot_memobench.sim.assets.paint import Canvas, Colour, Pixels, drawn
+from lerobot_memobench.sim.assets.paint import Canvas, Colour, Pixels, draw_texture
 
 GLAZE = (0.4, 0.02, 0.0005)
 """Friction of a glazed foot."""
@@ -35,12 +35,12 @@ class Bowl:
     lip: Colour
 
     def _wall(self, z: float) -> float:
-        """Return the outer radius at height ``z``: a wall that bulges a little between foot and rim."""
+        """Return the outer radius at height ``z``; the wall bulges slightly between foot and rim."""
         share = z / self.height
         return self.foot + (self.rim - self.foot) * (share + 0.25 * share * (1 - share))
 
     def mesh(self) -> MeshData:
-        """Return outside from the foot up, over the rim and down the inside."""
+        """Return the mesh: outside from the foot up, over the rim, and down the inside."""
         r, h, w = self.rim, self.height, self.wall
         outside = [(self._wall(share * h), share * h) for share in (0.1, 0.4, 0.7)]
         inside = [(self._wall(share * h) - w, share * h) for share in (0.7, 0.4)]
@@ -63,13 +63,13 @@ class Bowl:
         )
 
     def texture(self) -> Pixels:
-        """Return bands from the inside's middle (top of the image) to the outside's middle."""
+        """Return bands from the centre of the inside (top of the image) to the centre of the outside."""
 
         def paint(canvas: Canvas) -> None:
             canvas.rect(0, 0, 1, 0.475, self.inside)
             canvas.rect(0, 0.455, 1, 0.495, self.lip)
 
-        return drawn(16, 256, self.outside, paint)
+        return draw_texture(16, 256, self.outside, paint)
 
     def build(self, b: Builder) -> Asset:
         """Add the bowl to the scene."""
@@ -145,7 +145,7 @@ def _plate_texture() -> Pixels:
         canvas.rect(0, 0.475, 1, 0.50, blue)
         canvas.rect(0, 0.53, 1, 1, (228, 228, 224))
 
-    return drawn(16, 256, (246, 246, 243), paint)
+    return draw_texture(16, 256, (246, 246, 243), paint)
 
 
 def _plate(b: Builder) -> Asset:
@@ -200,7 +200,7 @@ def _pan_texture() -> Pixels:
         canvas.rect(0, 0.475, 1, 0.515, (150, 153, 155))
         canvas.rect(0, 0.515, 1, 1.0, (48, 50, 51))
 
-    return drawn(16, 256, (48, 50, 51), paint)
+    return draw_texture(16, 256, (48, 50, 51), paint)
 
 
 def _handle_mesh() -> MeshData:
@@ -230,8 +230,8 @@ def _frypan(b: Builder) -> Asset:
     steel = b.material("steel", rgba=(0.72, 0.73, 0.75, 1), specular=0.8, shininess=0.7)
     b.visual_mesh(b.mesh("frypan", _pan_mesh), pan)
     b.visual_mesh(b.mesh("frypan_handle", _handle_mesh), grip)
-    b.visual("box", (0.0055, 0.012, 0.0012), grip, (0, 0.228, 0.0572), turned((1, 0, 0), 0.02))
-    b.visual("box", (0.0112, 0.011, 0.0048), steel, (0, 0.106, 0.0378), turned((1, 0, 0), 0.15))
+    b.visual("box", (0.0055, 0.012, 0.0012), grip, (0, 0.228, 0.0572), axis_angle_quaternion((1, 0, 0), 0.02))
+    b.visual("box", (0.0112, 0.011, 0.0048), steel, (0, 0.106, 0.0378), axis_angle_quaternion((1, 0, 0), 0.15))
     b.collision("cylinder", (_PAN_BASE, 0.0025), 0.13, (0, 0, 0.0025))
     b.ring(14, (_PAN_BASE + 0.002, 0.003), (_PAN - 0.002, _PAN_WALL - 0.001), 0.004, 0.04)
     for y0, z0, y1, z1 in ((0.098, 0.0375, 0.150, 0.0445), (0.150, 0.0445, _PAN_END, 0.0505)):
@@ -242,7 +242,7 @@ def _frypan(b: Builder) -> Asset:
             (0.0105, half, 0.007),
             0.01,
             (0, (y0 + y1) / 2, (z0 + z1) / 2),
-            turned((1, 0, 0), slope),
+            axis_angle_quaternion((1, 0, 0), slope),
             friction=GRIP_FRICTION,
         )
     for y in (0.135, 0.165, 0.195):
@@ -272,7 +272,7 @@ def _moka_body() -> MeshData:
         (0.0180, z + 0.136),
         (0.0, z + 0.138),
     ]
-    # Two faces lie across x, so that the camera sees a facet and not an edge.
+    # Two faces are perpendicular to x, so that the camera sees a facet and not an edge.
     return lathe(profile, segments=8).turned((0, 0, 1), np.pi / 8)
 
 

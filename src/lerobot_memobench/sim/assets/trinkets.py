@@ -1,4 +1,4 @@
-"""Small things that are neither food nor packed: a phone charger, a bottle's cap, a bottle's cork."""
+"""Build small objects: a phone charger, a bottle cap and a cork."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Asset
 from lerobot_memobench.sim.assets.builder import GRIP_FRICTION, Builder
 from lerobot_memobench.sim.assets.meshes import Block, Floats, MeshData, blocks, box, lathe, tube
-from lerobot_memobench.sim.assets.paint import Canvas, Colour, Pixels, atlas, drawn
+from lerobot_memobench.sim.assets.paint import Canvas, Colour, Pixels, atlas, draw_texture
 
 # Charger: a plug lying on its back, prongs to -x, the port to +x, with a coiled cable on top.
 _CHARGER = (0.024, 0.021, 0.019)  # half sizes of the plug
@@ -26,7 +26,7 @@ def _charger_texture() -> Pixels:
         canvas.rect(0.06, 0.06, 0.94, 0.94, (232, 234, 238))
         canvas.shape((40, 150, 70), 0.60, 0.12, 0.28, 0.56, 0.48, 0.56, 0.40, 0.88, 0.72, 0.44, 0.52, 0.44)
 
-    return atlas({"+x": drawn(64, 64, white, port), "+z": drawn(96, 96, white, bolt)}, white)
+    return atlas({"+x": draw_texture(64, 64, white, port), "+z": draw_texture(96, 96, white, bolt)}, white)
 
 
 def _prongs() -> MeshData:
@@ -35,7 +35,7 @@ def _prongs() -> MeshData:
 
 
 def _cable() -> MeshData:
-    """Return a cable from the port that runs down to the table and curls beside the plug."""
+    """Return a cable that runs from the port down to the table and curls next to the plug."""
     x, _, z = _CHARGER
     path = [
         (x - 0.002, 0.0, 0.0),
@@ -61,12 +61,12 @@ def _charger(b: Builder) -> Asset:
     b.collision("box", _CHARGER, 0.06, friction=GRIP_FRICTION)
     b.collision("box", (0.0085, 0.0087, 0.0035), 0.004, (-x - 0.0085, 0, 0))
     b.grasp((0, 0, 0), ALONG_Y, 2 * y)
-    # Lengthwise, by the prongs' ends and the port's side: for a hand that must not close towards a drawer.
+    # Lengthwise grasp for a hand that must not close towards a drawer.
     b.grasp((-0.0085, 0, 0), ALONG_X, 2 * x + 0.017)
     return b.object((-x - 0.017, -y, -z), (x + 0.0235, y + 0.0125, z))
 
 
-# Cap: the screw cap of a bottle (WordNet's cap.n.02, the sense of the data set that the scans come from).
+# Cap: the screw cap of a bottle (WordNet sense cap.n.02, as in the data set of the scans).
 _CAP = (0.0260, 0.0150)  # radius and half height
 
 
@@ -94,7 +94,7 @@ def _cap_texture() -> Pixels:
             canvas.rect(k / 36 - 0.007, 0.31, k / 36 + 0.007, 0.62, (14, 62, 150))
         canvas.rect(0, 0.64, 1, 0.70, (240, 244, 250))
 
-    return drawn(288, 96, blue, paint)
+    return draw_texture(288, 96, blue, paint)
 
 
 def _cap(b: Builder) -> Asset:

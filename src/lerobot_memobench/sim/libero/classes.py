@@ -1,7 +1,7 @@
-"""LIBERO's classes as a table: where the MJCF of each lies, and what LIBERO's Python code adds to it.
+"""Table of LIBERO's classes: MJCF file, and data from LIBERO's Python code.
 
-Numbers are facts of LIBERO's code (`envs/objects`, MIT licence): the turns with which its samplers set things down, the
-ranges of joint positions that count as open, closed, on and off, and where handles are.
+Numbers are facts of LIBERO's code (`envs/objects`, MIT licence): initial rotations of its samplers, joint ranges that
+count as open, closed, on and off, and positions of handles.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ class Part(JointRule):
     """A drawer, door or knob of a fixture.
 
     Attributes:
-        joint: its joint.
-        body: the body that moves.
-        handle: where the middle of its handle is in that body's frame, m.
-        handle_quaternion: from the handle's frame (x along it, y into the fixture) to the body's, wxyz.
+        joint: name of the joint.
+        body: name of the moving body.
+        handle: centre of the handle in that body's frame, m.
+        handle_quaternion: rotation from the handle's frame (x along it, y into the fixture) to the body's, wxyz.
         handle_size: length of the handle, and its thickness along y and z, m.
         clearance: free space behind the handle, m.
-        ranges: `init` predicate -> between which positions LIBERO draws the joint.
+        ranges: `init` predicate -> range of initial joint positions, m or rad.
     """
 
     joint: str
@@ -40,16 +40,16 @@ class Part(JointRule):
 
 @dataclass(frozen=True)
 class LiberoClass:
-    """An object's or fixture's class.
+    """Class of an object or fixture.
 
     Attributes:
-        mjcf: its file below the folder of assets.
-        turns: drawn one after the other when a thing is set down. A fixture is turned as its task states.
-        parts: pairs of the part's region, or "" where the fixture is the part's name, and the part.
-        grasps: how to hold it from above; where there are none, by the sides of the box around it.
-        floor, clear: height and radius of a container's floor, m; nan where things are put on its top.
-        round: whether its outline from above is a circle about its origin.
-        y_up: whether it stands with its y axis up. Grasps are in the frame whose z is up (`scene.Y_UP`).
+        mjcf: path of its file below the assets folder.
+        turns: initial rotations, applied in order; fixtures are rotated as stated by the task.
+        parts: pairs of region and part; the region is "" if atoms use the fixture's name.
+        grasps: top-down grasps; by default at the sides of the bounding box.
+        floor, clear: height and radius of a container's floor, m; nan for objects that support others on their top.
+        round: whether the outline from above is a circle about the origin.
+        y_up: whether the object's y axis points up; grasps are in the frame with z up (`scene.Y_UP`).
     """
 
     mjcf: str
@@ -194,8 +194,8 @@ SCANS: dict[str, tuple[float, float, float]] = {
     "chestnut__2": (0.020, 0.024, 0.018),
     "cork__3": (0.019, 0.019, 0.026),
 }
-"""Classes that the paper's authors scanned -> half extents of the box that stands in where their scan is missing, m:
-those of this package's own object of the class, z up."""
+"""Classes scanned by the paper's authors -> half extents of the box that replaces a missing scan, m. They are those of
+this package's object of the class, z up."""
 
 
 def parts_of(class_name: str) -> tuple[tuple[str, Part], ...]:

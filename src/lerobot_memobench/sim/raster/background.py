@@ -1,4 +1,4 @@
-"""The picture of still rows: its parts are kept, so that shadows of moving rows are all that changes in it."""
+"""Update the cached image of static rows: only shadows of moving rows change it."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 from lerobot_memobench.sim.raster.compiled import compiled
 from lerobot_memobench.sim.raster.geometry import TILE
 
-KEPT = 9
-"""Of a pixel of the background: steady colour (3), colour that a shadow may take (3), place in the shadow map (3)."""
+BACKGROUND_CHANNELS = 9
+"""Values per background pixel: unshadowed colour (3), colour removed by shadow (3), position in the shadow map (3)."""
 
 _0, _1, _HALF, _255 = np.float32(0), np.float32(1), np.float32(0.5), np.float32(255)
 
 
 @compiled
 def shadow_tiles(kept: Any, size: Any, tiles: Any, tile: Any) -> None:
-    """Write down for each pixel of the background in which tile its shadow is looked up.
+    """Compute the shadow-map tile of each background pixel.
 
     Args:
-        kept: (KEPT, pixels).
+        kept: (BACKGROUND_CHANNELS, pixels).
         size: side of the shadow map, texels.
-        tiles: tiles in its side; those of pixels that no shadow can change get the number behind the last tile.
+        tiles: tiles per side; pixels that no shadow can change get the index after the last tile.
         tile: (pixels,), overwritten.
     """
     wide, last = np.float32(size), np.float32(size - 2)
@@ -37,15 +37,15 @@ def shadow_tiles(kept: Any, size: Any, tiles: Any, tile: Any) -> None:
 
 @compiled
 def light_background(kept: Any, tile: Any, touched: Any, triangle: Any, shadow_map: Any, image: Any) -> None:
-    """Colour the pixels of the background whose tile of the shadow map was touched.
+    """Recolour the background pixels whose shadow-map tile was touched.
 
     Args:
-        kept: (KEPT, pixels).
+        kept: (BACKGROUND_CHANNELS, pixels).
         tile: see `shadow_tiles`.
-        touched: by tile, and one more for pixels that no shadow can change.
-        triangle: (pixels,), −1 where the background shows.
+        touched: flag per tile, and one more for pixels that no shadow can change.
+        triangle: (pixels,), −1 where the background is visible.
         shadow_map: (size, size).
-        image: (pixels, 3) uint8, brought up to date.
+        image: (pixels, 3) uint8, updated.
     """
     size = shadow_map.shape[0]
     wide, last = np.float32(size), np.float32(size - 2)

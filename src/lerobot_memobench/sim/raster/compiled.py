@@ -1,8 +1,8 @@
-"""How the functions of this package are compiled: for speed, and to equal bits on every machine.
+"""Compile the functions of this package with bit-equal results on every machine.
 
-Only additions, products, quotients and square roots are used, which IEEE 754 fixes to the bit, and none may be fused,
-put in another order or replaced by a reciprocal. A compiled function calls none of another file: numba's cache
-notices changes of the file of a function alone.
+Kernels use additions, products, quotients and square roots only, which IEEE 754 defines to the bit. Fusing, reordering
+and reciprocal approximations are disabled. A compiled function must not call one of another file, because numba's cache
+checks changes of a function's own file only.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from numba import njit
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
-    "fastmath": {"nnan", "ninf", "nsz"},  # infinities and NaN never come up; these flags change no other bit
+    "fastmath": {"nnan", "ninf", "nsz"},  # infinities and NaN do not occur; these flags change no other bit
 }
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function at its first call, kept for later processes where there is a place for it."""
+    """Compile a function at its first call; cache it on disk if possible."""
     try:
         made: Callable[..., Any] = njit(cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # neither next to the source nor in the user's cache folder may be written
+    except RuntimeError:  # neither the source folder nor the user's cache folder is writable
         made = njit(**_OPTIONS)(function)
     return made

@@ -1,7 +1,7 @@
-"""What a camera can see of a model, as one list of triangles.
+"""Collect the visual geoms of a model as one list of triangles.
 
-All visual geoms of a scene become rows of one list; where each stands and what it is made of is a small table that is
-filled for every frame. The list is made once per scene; drawing it needs no model, but for the table.
+Each visual geom is a row of the list. A small table with pose, colour and material of each row is updated per frame;
+the list is built once per scene.
 """
 
 from __future__ import annotations
@@ -13,45 +13,44 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.mirror import Mirror, find_mirror
 from lerobot_memobench.sim.raster.shapes import Triangles, box_cells, pieces_of, triangles_of
 from lerobot_memobench.sim.raster.textures import cube_coordinates, flat_coordinates, layers_of
 
 VISUAL_GROUP = 1
-"""Geoms of this group are seen; the others are for contacts."""
-ROWS = 5
-"""Lines of four numbers per row in the table: three of the pose, colour, material."""
+"""Group of visible geoms; other groups are for contacts."""
+TABLE_LINES = 5
+"""Lines of four numbers per row of the table: pose (3), colour, material."""
 
-PIECE = 2000
-"""Most triangles of a mesh in a row of a scene that is drawn as by MuJoCo: rows out of sight cost nothing."""
+MAX_PIECE_TRIANGLES = 2000
+"""Largest number of mesh triangles per row in scenes drawn as by MuJoCo; rows outside the image are skipped."""
 
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
-"""A geom of this colour shows its material's, as in MuJoCo."""
+"""A geom of this colour takes its material's colour, as in MuJoCo."""
 _NO_MATERIAL = (0.5, 64.0, 0.0, 0.0)
-"""MuJoCo's specular, shininess exponent and emission of a geom without a material, and no texture."""
+"""MuJoCo's specular, shininess exponent and emission of a geom without material, and no texture layer."""
 
 VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("uv", "<f4", 2), ("row", "<f4")])
 
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
-"""(height, width, 3), first row on top."""
+"""Image (height, width, 3), first row on top."""
 
 
 @dataclass(frozen=True)
 class DrawList:
-    """The triangles of a scene, row by row.
+    """Triangles of a scene, sorted by rows.
 
-    A row is a geom; one with a cube texture has a row for each side of the cube, a large mesh one for each piece.
+    A row is a geom, one side of a geom with a cube texture, or one piece of a large mesh.
 
     Attributes:
-        vertices: structured array of `VERTEX`, in the frames of their rows, in the order of rows.
-        triangles: (M, 3) vertices, counter-clockwise from outside, in the order of rows.
-        geoms: (rows,) the model's ids.
-        still: how many rows have no joint between them and the world; they are the first.
+        vertices: structured array of `VERTEX` in the frames of their rows.
+        triangles: (M, 3) vertex indices, counter-clockwise from outside.
+        geoms: (rows,) geom ids.
+        still: number of static rows (no joint between them and the world), which come first.
         casting: (rows,) whether a row casts shadows.
         layers: (L, LAYER_SIZE, LAYER_SIZE, 3) uint8 textures, the first one white.
         materials: (rows, 4) specular, shininess exponent, emission, layer.
-        mirror: the geom that reflects the scene, if there is one.
+        mirror: reflecting geom, if any.
         as_mujoco: see `build_draw_list`.
     """
 
@@ -66,7 +65,7 @@ class DrawList:
     as_mujoco: bool = False
 
     def fill(self, table: Floats, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Write poses, colours and materials of the present state into a table, (rows, ROWS, 4)."""
+        """Write poses, colours and materials of the present state into a table (rows, TABLE_LINES, 4)."""
         table[:, :3, :3] = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         table[:, :3, 3] = data.geom_xpos[self.geoms]
         table[:, 3] = colours(model, self.geoms)
@@ -82,14 +81,14 @@ def build_draw_list(
     """Collect the visual geoms of a model.
 
     Args:
-        model: a compiled scene.
-        shadowless: bodies that cast no shadow.
-        meshes: drawn in place of the scene's of these names; see `shapes.mesh_in_file`.
-        as_mujoco: whether all looks as in MuJoCo's own renderer: edges of meshes are sharp, and light is cut off at 1
-            before the texture takes its part.
+        model: compiled scene.
+        shadowless: names of bodies that cast no shadow.
+        meshes: replacements of the scene's meshes by name; see `shapes.mesh_in_file`.
+        as_mujoco: whether to imitate MuJoCo's renderer: sharp mesh edges, and light clipped to 1 before it is
+            multiplied by the texture.
 
     Raises:
-        MemobenchError: for a visual geom of a shape that is not drawn here.
+        MemobenchError: a visual geom has an unsupported type.
     """
     visual = np.flatnonzero(model.geom_group == VISUAL_GROUP)
     moves = model.body_weldid[model.geom_bodyid[visual]] != 0
@@ -119,13 +118,13 @@ def build_draw_list(
 
 
 def _bodies(model: mujoco.MjModel, names: tuple[str, ...]) -> list[int]:
-    """Return the ids of those bodies that the model has."""
+    """Return the ids of the named bodies that exist in the model."""
     ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names]
     return [body for body in ids if body >= 0]
 
 
 def colours(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Floats:
-    """Return the colours (N, 4) of geoms: their own where set, else their material's."""
+    """Return the colours (N, 4) of geoms: their own if set, else their material's."""
     rgba = model.geom_rgba[geoms]
     material = model.geom_matid[geoms]
     plain = (material >= 0) & np.all(rgba == _DEFAULT_RGBA, axis=1)
@@ -148,18 +147,21 @@ def _textured(
     as_mujoco: bool,
     layer_of: dict[int, tuple[int, ...]],
 ) -> Iterator[tuple[int, Triangles]]:
-    """Yield a geom's triangles with their texture coordinates, and the layer that they show."""
+    """Yield texture layers of a geom and their triangles with texture coordinates."""
     material = int(model.geom_matid[geom])
     texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value]) if material >= 0 else -1
     layers = layer_of.get(texture, (0,))
     kind, mesh = int(model.geom_type[geom]), int(model.geom_dataid[geom])
     is_mesh = kind == mujoco.mjtGeom.mjGEOM_MESH.value
-    # MuJoCo computes light at corners, and has several in a side of a box; only this light shows the difference.
+    # MuJoCo computes light at vertices and subdivides boxes, which is visible with textures and spots only.
     fine = kind == mujoco.mjtGeom.mjGEOM_BOX.value and (texture in layer_of or _has_spots(model))
     shape = box_cells(model, geom) if fine else triangles_of(model, geom, meshes, as_mujoco)
     mapped = is_mesh and (bool(shape[2].any()) or model.mesh_texcoordadr[mesh] >= 0)
     if texture not in layer_of or mapped:
-        yield from ((layers[0], piece) for piece in (pieces_of(shape, PIECE) if is_mesh and as_mujoco else (shape,)))
+        yield from (
+            (layers[0], piece)
+            for piece in (pieces_of(shape, MAX_PIECE_TRIANGLES) if is_mesh and as_mujoco else (shape,))
+        )
     elif len(layers) == 1:
         yield layers[0], flat_coordinates(model, geom, shape)
     else:
@@ -169,3 +171,40 @@ def _textured(
 
 def _has_spots(model: mujoco.MjModel) -> bool:
     return bool(np.any(model.light_type[model.light_active != 0] != mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value))
+
+
+# --- reflection: MuJoCo mirrors a scene in the upper side of the first reflecting box or plane ---
+
+_REFLECTING = (mujoco.mjtGeom.mjGEOM_PLANE.value, mujoco.mjtGeom.mjGEOM_BOX.value)
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A reflecting geom.
+
+    Attributes:
+        rows: rows of the geom in the draw list.
+        height: height of the upper side in the geom's frame, m.
+        reflectance: reflected share of colours, 0 to 1.
+    """
+
+    rows: NDArray[np.int64]
+    height: float
+    reflectance: float
+
+    def plane(self, table: Floats) -> tuple[Floats, Floats]:
+        """Return a point of the upper side (3,) and its normal (3,) in the world."""
+        pose = table[self.rows[0]]
+        return pose[:3, 3] + np.float32(self.height) * pose[:3, 2], pose[:3, 2]
+
+
+def find_mirror(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Mirror | None:
+    """Return the first reflecting geom of a draw list's rows, None without one."""
+    for geom in np.unique(geoms):
+        material = int(model.geom_matid[geom])
+        if material < 0 or model.geom_type[geom] not in _REFLECTING or model.mat_reflectance[material] <= 0:
+            continue
+        box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX.value
+        height = float(model.geom_size[geom, 2]) if box else 0.0
+        return Mirror(np.flatnonzero(geoms == geom), height, float(model.mat_reflectance[material]))
+    return None

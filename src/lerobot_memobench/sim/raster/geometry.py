@@ -1,4 +1,4 @@
-"""From triangles to pixels: which rows a camera can see, which triangle is nearest in a pixel, depths from a light."""
+"""Rasterize triangles: cull rows, find the nearest triangle of each pixel, and draw shadow-map depths."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ Floats = NDArray[np.float32]
 Integers = NDArray[np.int32]
 
 TILE = 16
-"""Side of a tile of the shadow map, texels: what a moving caster touches is noted by tile."""
+"""Side of a shadow-map tile, texels; changes by moving casters are tracked per tile."""
 
-
-LEVEL = 1e-9
-"""Slope of an edge over a row below which it counts as level."""
+LEVEL_EDGE_SLOPE = 1e-9
+"""Relative slope below which an edge counts as horizontal."""
 
 
 class Shapes(NamedTuple):
-    """The triangles of a scene by rows of the table; they are the same in every frame.
+    """Triangles of a scene by rows of the table, constant over frames.
 
     ``position``: (N, 3) in the frames of the rows; ``first_vertex``: (rows + 1,), and ``first_triangle`` likewise;
     ``triangles``: (T, 3); ``centre`` and ``half``: (rows, 3), the boxes around the rows in their frames.
@@ -37,7 +36,7 @@ class Shapes(NamedTuple):
 
 
 class Clip(NamedTuple):
-    """Vertices as a camera or a light sees them: (N,) each, in clip space; ``visible``: (rows,)."""
+    """Vertices in the clip space of a camera or light, (N,) each; ``visible``: (rows,)."""
 
     x: Floats
     y: Floats
@@ -46,26 +45,26 @@ class Clip(NamedTuple):
 
 
 class Target(NamedTuple):
-    """Buffers of a picture: ``depth`` (H, W), the inverse distance, 0 at infinity; ``triangle`` (H, W), −1 for none."""
+    """Image buffers: ``depth`` (H, W), inverse distance, 0 at infinity; ``triangle`` (H, W), −1 for none."""
 
     depth: Floats
     triangle: Integers
 
 
 def clip_space(vertices: int, rows: int) -> Clip:
-    """Return memory for the vertices of a scene."""
+    """Return buffers for the vertices of a scene."""
     x, y, w = (np.zeros(vertices, np.float32) for _ in range(3))
     return Clip(x, y, w, np.zeros(rows, np.bool_))
 
 
 @compiled
 def _project(shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, clip: Any) -> None:
-    """Move the vertices of rows to clip space, but of those that lie outside of the picture as a whole.
+    """Transform the vertices of rows to clip space; skip rows outside the image.
 
     Args:
         shapes: `Shapes`.
-        rows: which ones.
-        table: poses, (all rows, ROWS, 4).
+        rows: indices of rows.
+        table: poses, (all rows, TABLE_LINES, 4).
         matrix: from the world to clip space, (4, 4).
         near: distance of the near clipping plane, m.
         clip: `Clip`, overwritten.
@@ -93,7 +92,7 @@ def _project(shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, clip: A
 
 @compiled
 def _in_picture(m: Any, centre: Any, half: Any, near: Any) -> Any:
-    """Return whether a box may be in the picture; it is not where all of it is beyond one side."""
+    """Return whether a box may be in the image: not entirely beyond one side of the view volume."""
     for side in range(5):
         axis = side // 2
         sign = np.float32(1 - 2 * (side % 2))
@@ -108,11 +107,11 @@ def _in_picture(m: Any, centre: Any, half: Any, near: Any) -> Any:
 
 @compiled
 def _bounds(a: Any, b: Any, c: Any) -> Any:
-    """Return how an edge, a x + b y + c ≥ 0 inside, bounds x in row y: from below p y + q on, up to r y + s.
+    """Return (p, q, r, s): an edge with a x + b y + c ≥ 0 inside bounds x in row y by p y + q and r y + s.
 
-    A level edge bounds the rows, see `_rows`.
+    Horizontal edges bound the rows instead, see `_rows`.
     """
-    if abs(a) <= LEVEL * abs(b):
+    if abs(a) <= LEVEL_EDGE_SLOPE * abs(b):
         return 0.0, -1e30, 0.0, 1e30
     slope, start = -b / a, -c / a
     return (slope, start, 0.0, 1e30) if a > 0.0 else (0.0, -1e30, slope, start)
@@ -120,8 +119,8 @@ def _bounds(a: Any, b: Any, c: Any) -> Any:
 
 @compiled
 def _rows(top: Any, bottom: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return those rows, from the first to the last, that are within an edge, if it is level."""
-    if abs(a) > LEVEL * abs(b):
+    """Return the first and last row within an edge; only horizontal edges restrict them."""
+    if abs(a) > LEVEL_EDGE_SLOPE * abs(b):
         return top, bottom
     if b > 0.0:
         return max(top, math.ceil(min(max(-c / b, -1e6), 1e6))), bottom
@@ -132,7 +131,7 @@ def _rows(top: Any, bottom: Any, a: Any, b: Any, c: Any) -> Any:
 
 @compiled
 def _span(left: Any, right: Any, y: Any, edge0: Any, edge1: Any, edge2: Any) -> Any:
-    """Return the first and the last pixel of a row within three edges; the last is before the first for none."""
+    """Return the first and last pixel of a row within three edges; last < first if there is none."""
     start = max(edge0[0] * y + edge0[1], edge1[0] * y + edge1[1], edge2[0] * y + edge2[1], float(left))
     end = min(edge0[2] * y + edge0[3], edge1[2] * y + edge1[3], edge2[2] * y + edge2[3], float(right))
     if start > end:
@@ -145,18 +144,18 @@ def _span(left: Any, right: Any, y: Any, edge0: Any, edge1: Any, edge2: Any) -> 
 def draw_triangles(
     shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, far: Any, clip: Any, target: Any
 ) -> None:
-    """Note in each pixel the nearest triangle of some rows, if it is nearer than the one there.
+    """Update each pixel with the nearest triangle of some rows.
 
-    Triangles are set up in homogeneous coordinates, so those that reach behind the camera need no clipping. The
-    middle of a pixel decides. Faces are seen from the side on which their corners go clockwise: pictures are drawn
-    upside down. Of triangles that are equally near the first one stays.
+    Triangles are set up in homogeneous coordinates, so those that extend behind the camera need no clipping. Pixel
+    centres are sampled. Front faces are clockwise because images are drawn upside down. The first of equally near
+    triangles is kept.
 
     Args:
         shapes: `Shapes`.
-        rows: which ones, in the order in which they are drawn.
+        rows: indices of rows in drawing order.
         table, matrix, near, clip: see `_project`.
         far: distance of the far clipping plane, m.
-        target: `Target`, brought up to date.
+        target: `Target`, updated.
     """
     _project(shapes, rows, table, matrix, near, clip)
     height, width = target.depth.shape
@@ -171,7 +170,7 @@ def draw_triangles(
             xi, yi, wi = clip.x[i], clip.y[i], clip.w[i]
             xj, yj, wj = clip.x[j], clip.y[j], clip.w[j]
             xk, yk, wk = clip.x[k], clip.y[k], clip.w[k]
-            # Most triangles of a large row lie beyond one side of the picture.
+            # Most triangles of a large row lie beyond one side of the image.
             if (xi > wi and xj > wj and xk > wk) or (xi < -wi and xj < -wj and xk < -wk):
                 continue
             if (yi > wi and yj > wj and yk > wk) or (yi < -wi and yj < -wj and yk < -wk):
@@ -180,13 +179,13 @@ def draw_triangles(
             x0, y0 = (xi + w0) * half_width, (yi + w0) * half_height
             x1, y1 = (xj + w1) * half_width, (yj + w1) * half_height
             x2, y2 = (xk + w2) * half_width, (yk + w2) * half_height
-            # Each corner's share of a point (x, y, 1), not yet divided by the volume that the corners span.
+            # Barycentric coefficients of a point (x, y, 1), not yet divided by the volume spanned by the corners.
             a0, b0, c0 = y2 * w1 - y1 * w2, x1 * w2 - x2 * w1, x2 * y1 - x1 * y2
             volume = a0 * x0 + b0 * y0 + c0 * w0
             if volume <= 1e-12:
                 continue
             left, right, top, bottom = 0, width - 1, 0, height - 1
-            behind = w0 <= 1e-6 or w1 <= 1e-6 or w2 <= 1e-6  # a corner is, and the triangle has no box in the picture
+            behind = w0 <= 1e-6 or w1 <= 1e-6 or w2 <= 1e-6  # a corner behind the camera: no bounding box in the image
             if not behind:
                 u0, u1, u2 = x0 / w0, x1 / w1, x2 / w2
                 v0, v1, v2 = y0 / w0, y1 / w1, y2 / w2
@@ -202,7 +201,7 @@ def draw_triangles(
                     continue
             a1, b1, c1 = y0 * w2 - y2 * w0, x2 * w0 - x0 * w2, x0 * y2 - x2 * y0
             a2, b2, c2 = y1 * w0 - y0 * w1, x0 * w1 - x1 * w0, x1 * y0 - x0 * y1
-            # Pixels are counted by their middles.
+            # Sample pixel centres.
             c0, c1, c2 = c0 + 0.5 * (a0 + b0), c1 + 0.5 * (a1 + b1), c2 + 0.5 * (a2 + b2)
             if behind:
                 top, bottom = _rows(top, bottom, a0, b0, c0)
@@ -230,18 +229,18 @@ def draw_triangles(
 
 @compiled
 def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shadow_map: Any, touched: Any) -> None:
-    """Note in each texel the depth of the surface nearest to a light of parallel rays.
+    """Update each texel with the depth of the surface nearest to a directional light.
 
-    Depths are moved away from the light by more than a texel's slope, or surfaces would speckle themselves.
+    Depths are biased away from the light by more than a texel's slope to avoid self-shadowing.
 
     Args:
         shapes: `Shapes`.
-        rows: which ones.
-        table: poses, (all rows, ROWS, 4).
+        rows: indices of rows.
+        table: poses, (all rows, TABLE_LINES, 4).
         matrix: from the world to the light's clip space, (4, 4).
-        clip: `Clip`, overwritten; its w are the depths.
-        shadow_map: (size, size), from 0 to 1, brought up to date.
-        touched: (tiles, tiles), 1 where it was.
+        clip: `Clip`, overwritten; ``w`` holds depths.
+        shadow_map: (size, size), from 0 to 1, updated.
+        touched: (tiles, tiles), set to 1 for changed tiles.
     """
     size = shadow_map.shape[0]
     half = 0.5 * size
@@ -276,7 +275,7 @@ def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shad
             top, bottom = math.ceil(max(low, 0.0)), int(min(high, size - 1.0))
             if left > right or top > bottom:
                 continue
-            # A look-up takes a texel and those after it.
+            # A look-up reads a texel and its successors.
             for tile_y in range(max(top - 1, 0) // TILE, bottom // TILE + 1):
                 for tile_x in range(max(left - 1, 0) // TILE, right // TILE + 1):
                     touched[tile_y, tile_x] = 1
@@ -308,7 +307,7 @@ def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shad
 
 @compiled
 def restore_depths(shadow_map: Any, still: Any, touched: Any) -> None:
-    """Put the depths of still rows back into the tiles that were touched."""
+    """Restore the depths of static rows in the touched tiles."""
     size = shadow_map.shape[0]
     for tile_y in range(touched.shape[0]):
         for tile_x in range(touched.shape[1]):

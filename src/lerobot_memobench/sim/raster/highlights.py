@@ -1,4 +1,4 @@
-"""The prompt's way of marking a place: translucent discs in rows of their own behind a scene's."""
+"""Draw prompt highlights as translucent discs, appended to the rows of a scene."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.raster.drawlist import ROWS, VERTEX, DrawList, Floats
+from lerobot_memobench.sim.raster.drawlist import TABLE_LINES, VERTEX, DrawList, Floats
 from lerobot_memobench.sim.raster.shapes import disc
 
 HIGHLIGHTS = 16
-"""Highlights that fit into a frame."""
+"""Maximum number of highlights in a frame."""
 DISC_HALF_HEIGHT = 0.001
 _MATERIAL = (0.0, 1.0, 0.3, 0.0)
 
 
 @dataclass(frozen=True)
 class Highlight:
-    """A translucent disc drawn over the scene: the prompt's way of marking a place."""
+    """A translucent disc that marks a position, m."""
 
     position: tuple[float, float, float]
     radius: float
@@ -29,7 +29,7 @@ class Highlight:
 
 
 def with_discs(draw_list: DrawList) -> tuple[NDArray[np.void], NDArray[np.int32]]:
-    """Return a list's vertices and triangles and, behind them, a disc for each highlight, in rows of their own."""
+    """Return a list's vertices and triangles, followed by a row with a disc for each highlight."""
     positions, normals, uv, triangles = disc()
     discs = np.zeros((HIGHLIGHTS, len(positions)), dtype=VERTEX)
     discs["position"], discs["normal"], discs["uv"] = positions, normals, uv
@@ -40,8 +40,8 @@ def with_discs(draw_list: DrawList) -> tuple[NDArray[np.void], NDArray[np.int32]
 
 
 def table_of(draw_list: DrawList) -> Floats:
-    """Return a table for a list's rows and those of the highlights, (rows, ROWS, 4)."""
-    return np.zeros((len(draw_list.geoms) + HIGHLIGHTS, ROWS, 4), dtype=np.float32)
+    """Return a table (rows, TABLE_LINES, 4) for the rows of a list and of highlights."""
+    return np.zeros((len(draw_list.geoms) + HIGHLIGHTS, TABLE_LINES, 4), dtype=np.float32)
 
 
 def fill_table(
@@ -51,10 +51,10 @@ def fill_table(
     data: mujoco.MjData,
     highlights: Sequence[Highlight],
 ) -> None:
-    """Write the present state of a list's rows, and highlights, into a table.
+    """Write the present state of a list's rows and the highlights into a table.
 
     Raises:
-        MemobenchError: there are more highlights than fit.
+        MemobenchError: there are more than `HIGHLIGHTS` highlights.
     """
     if len(highlights) > HIGHLIGHTS:
         raise MemobenchError(f"there are {len(highlights)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")

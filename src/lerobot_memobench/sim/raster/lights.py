@@ -1,4 +1,4 @@
-"""The lights of a scene, and the matrix of the one whose shadows are drawn."""
+"""Read the lights of a scene, and compute the matrix of the shadow-casting light."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ _PARALLEL = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
 _SPOT = mujoco.mjtLightType.mjLIGHT_SPOT.value
 
 
-def shining(model: mujoco.MjModel) -> list[int]:
-    """Return the ids of the lights that shine: those of parallel rays and spots, as in MuJoCo's renderer."""
+def active_lights(model: mujoco.MjModel) -> list[int]:
+    """Return the ids of active directional lights and spots, as in MuJoCo's renderer."""
     return [k for k in range(model.nlight) if model.light_active[k] and model.light_type[k] in (_PARALLEL, _SPOT)]
 
 
 def shadow_caster(model: mujoco.MjModel) -> int | None:
-    """Return the id of the light whose shadows are drawn: the first one of parallel rays that casts any."""
-    casting = [k for k in shining(model) if model.light_castshadow[k] and model.light_type[k] == _PARALLEL]
+    """Return the id of the first directional light that casts shadows, None without one."""
+    casting = [k for k in active_lights(model) if model.light_castshadow[k] and model.light_type[k] == _PARALLEL]
     return casting[0] if casting else None
 
 
 class Lights(NamedTuple):
-    """The lights of a frame, the headlight first.
+    """Lights of a frame, the headlight first.
 
-    ``to``: (L, 3), direction to a light of parallel rays, place of another; ``placed``: (L,), whether it is the latter;
-    ``axis``: (L, 3), where it shines; ``cone``: (L, 2), cosine of its cutoff and exponent; ``attenuation``: (L, 3);
-    ``ambient``, ``diffuse``, ``specular``: (L, 3). ``caster``: which one casts shadows, −1 for none. ``clamped``:
-    whether light is cut off at 1 before the texture takes its part.
+    ``to``: (L, 3), direction to a directional light, position of a spot; ``placed``: (L,), whether it is a spot;
+    ``axis``: (L, 3), direction of a spot; ``cone``: (L, 2), cosine of the cutoff, and exponent; ``attenuation``,
+    ``ambient``, ``diffuse``, ``specular``: (L, 3). ``caster``: index of the shadow-casting light, −1 for none.
+    ``clamped``: whether light is clipped to 1 before it is multiplied by the texture.
     """
 
     to: Floats
@@ -46,17 +46,17 @@ class Lights(NamedTuple):
     clamped: bool
 
 
-class Lamps:
-    """The lights of a scene; their colours are read once, where they shine for every frame.
+class SceneLights:
+    """Lights of a scene; colours are read once, directions per frame.
 
     Args:
-        model: a compiled scene.
-        shadows: whether shadows of the first light that casts any are drawn.
+        model: compiled scene.
+        shadows: whether to draw shadows of the first shadow-casting light.
         clamped: see `Lights`.
     """
 
     def __init__(self, model: mujoco.MjModel, shadows: bool, clamped: bool = False) -> None:
-        self._ids = ids = shining(model)
+        self._ids = ids = active_lights(model)
         caster = shadow_caster(model) if shadows else None
         self.caster = caster
         head, count = model.vis.headlight, 1 + len(ids)
@@ -78,8 +78,8 @@ class Lamps:
         self.lights.cone[1:, 0] = np.where(cutoff >= 180.0, -1.0, np.cos(np.radians(cutoff)))
         self.lights.cone[1:, 1] = model.light_exponent[ids]
 
-    def look(self, data: mujoco.MjData, camera: int) -> Lights:
-        """Return the lights of a state, the headlight shining from a camera; overwritten by the next call."""
+    def update(self, data: mujoco.MjData, camera: int) -> Lights:
+        """Return the lights of a state, with the headlight at a camera; overwritten by the next call."""
         lights = self.lights
         axis = data.light_xdir[self._ids]
         lights.to[0] = data.cam_xmat[camera].reshape(3, 3)[:, 2]
@@ -88,7 +88,7 @@ class Lamps:
         return lights
 
     def light_matrix(self, model: mujoco.MjModel, data: mujoco.MjData) -> Floats:
-        """Return the matrix (4, 4) from the world to the clip space of the caster; the same array while it is still."""
+        """Return the matrix (4, 4) from the world to the caster's clip space; cached while the caster is static."""
         if self.caster is not None:
             direction = data.light_xdir[self.caster].tobytes()
             if direction != self._light_matrix[0]:
@@ -99,7 +99,7 @@ class Lamps:
 def light_matrix(model: mujoco.MjModel, data: mujoco.MjData, light: int) -> Floats:
     """Return the matrix (4, 4) from the world to the clip space of a directional light."""
     forward = data.light_xdir[light]
-    if not forward.any():  # nothing was simulated yet
+    if not forward.any():  # no kinematics were computed yet
         forward = model.light_dir[light]
     side = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)

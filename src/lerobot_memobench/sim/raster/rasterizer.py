@@ -1,8 +1,8 @@
-"""Draw a `DrawList` on the CPU: first which triangle each pixel shows, then the colour of each pixel once.
+"""Draw a `DrawList` on the CPU with deferred shading: find the visible triangle of each pixel, then shade it once.
 
-The light is MuJoCo's: a headlight with ambience, parallel and spot lights, Blinn's highlights, textures that modulate
-all of it. Shadows are those of the first light of parallel rays that casts them, with soft edges. A still camera keeps
-its picture of the still rows: only moving rows and changed shadows are drawn.
+The lighting model is MuJoCo's: headlight, ambient light, directional lights and spots, Blinn's specular term and
+modulating textures. The first shadow-casting directional light has soft-edged shadows. For a static camera the image of
+static rows is cached; only moving rows and changed shadows are drawn.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.raster.background import KEPT, light_background, shadow_tiles
-from lerobot_memobench.sim.raster.drawlist import DrawList, Floats, Image
+from lerobot_memobench.sim.raster.background import BACKGROUND_CHANNELS, light_background, shadow_tiles
+from lerobot_memobench.sim.raster.drawlist import DrawList, Floats, Image, Mirror
 from lerobot_memobench.sim.raster.geometry import (
     TILE,
     Shapes,
@@ -29,8 +29,7 @@ from lerobot_memobench.sim.raster.geometry import (
     restore_depths,
 )
 from lerobot_memobench.sim.raster.highlights import Highlight, fill_table, table_of, with_discs
-from lerobot_memobench.sim.raster.lights import Lamps, Lights
-from lerobot_memobench.sim.raster.mirror import Mirror, cropped, mirrored
+from lerobot_memobench.sim.raster.lights import Lights, SceneLights
 from lerobot_memobench.sim.raster.shading import (
     BACKGROUND,
     PICTURE,
@@ -40,20 +39,19 @@ from lerobot_memobench.sim.raster.shading import (
     shade,
 )
 from lerobot_memobench.sim.raster.textures import LAYER_SIZE, levels_of
-from lerobot_memobench.sim.raster.view import camera_matrix, clipping
+from lerobot_memobench.sim.raster.view import camera_matrix, clipping, cropped, mirrored
 
-FARTHEST = 1e6
-"""Bound of all places in a scene, m."""
-OPAQUE = 0.995
-"""Alpha from which on MuJoCo takes a geom as opaque."""
-KEPT_SCENES = 4
-"""States of still rows that are kept, and cameras of each: simulations of one scene have fixtures at different
-places."""
+MAX_COORDINATE = 1e6
+"""Largest coordinate in a scene, m."""
+OPAQUE_ALPHA = 0.995
+"""Smallest alpha of opaque geoms in MuJoCo."""
+MAX_STILL_STATES = 4
+"""Cached states of static rows, and cached cameras of each; simulations of one scene differ in fixture poses."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """A camera's picture of the still rows: colours, depths, and the parts of colours that shadows change."""
+    """A camera's image of the static rows: colours, depths, and the shadow-dependent parts of colours."""
 
     image: Image
     depth: Floats
@@ -63,26 +61,26 @@ class Background:
 
 
 @dataclass(frozen=True)
-class Still:
-    """The still rows in one state: their depths from the light, and their pictures by the matrices of cameras."""
+class StillState:
+    """One state of the static rows: shadow map, and backgrounds by camera matrix."""
 
     shadow_map: Floats
     backgrounds: dict[bytes, Background] = field(default_factory=dict)
 
 
 class Rasterizer:
-    """Everything that is needed to draw one draw list at one size; it serves one thread at a time.
+    """Draw one draw list at one size; not thread-safe.
 
     Args:
-        model: where lights and clipping planes are read from.
-        draw_list: what there is to draw.
+        model: model with lights and clipping planes.
+        draw_list: triangles to draw.
         width, height: size of the frames, pixels.
-        shadow_size: side of the shadow map, pixels; 0 draws no shadows.
+        shadow_size: side of the shadow map, pixels; 0 disables shadows.
     """
 
     def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int, shadow_size: int) -> None:
         self._list, self._width, self._height = draw_list, width, height
-        self._lamps = Lamps(model, shadow_size > 0 and bool(draw_list.casting.any()), draw_list.as_mujoco)
+        self._scene_lights = SceneLights(model, shadow_size > 0 and bool(draw_list.casting.any()), draw_list.as_mujoco)
         rows = len(draw_list.geoms)
         self._table = table_of(draw_list)
         vertices, triangles = with_discs(draw_list)
@@ -101,12 +99,12 @@ class Rasterizer:
         still = np.arange(rows) < draw_list.still
         self._still_casters = np.flatnonzero(still & draw_list.casting).astype(np.int32)
         self._moving_casters = np.flatnonzero(~still & draw_list.casting).astype(np.int32)
-        size = shadow_size if self._lamps.caster is not None else 1
+        size = shadow_size if self._scene_lights.caster is not None else 1
         self._tiles = -(-size // TILE)
         self._shadow_map = np.ones((size, size), np.float32)
-        # One more for pixels that no shadow can change.
+        # One extra entry for pixels that no shadow can change.
         self._touched = np.zeros(self._tiles**2 + 1, np.uint8)
-        self._still: OrderedDict[bytes, Still] = OrderedDict()
+        self._still: OrderedDict[bytes, StillState] = OrderedDict()
         self._upper = _upper_side(draw_list, len(triangles))
         self._shown: bytes | None = None
 
@@ -115,18 +113,18 @@ class Rasterizer:
     def draw(
         self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight] = ()
     ) -> Image:
-        """Return what a camera sees, (height, width, 3) uint8, first row on top.
+        """Return a camera's image, (height, width, 3) uint8, first row on top.
 
         Args:
-            model: an instance of the model that the draw list was made of.
-            data: the state to show.
-            camera: its name.
-            highlights: drawn in this order.
+            model: copy of the model of the draw list.
+            data: state to draw.
+            camera: name of the camera.
+            highlights: discs, drawn in this order.
         """
-        view = self._look(model, data, camera, highlights)
+        view = self._view(model, data, camera, highlights)
         still = self._bring_shadows_up_to_date(view)
         rows = self._rows
-        opaque = self._table[: len(rows), 3, 3] >= OPAQUE
+        opaque = self._table[: len(rows), 3, 3] >= OPAQUE_ALPHA
         moving = rows >= self._list.still
         if model.body_weldid[model.cam_bodyid[view.camera]] == 0:
             background = self._background(still, view, rows[opaque & ~moving])
@@ -134,7 +132,7 @@ class Rasterizer:
             self._target.depth[:] = background.depth
             self._target.triangle[:] = -1
             view.draw_triangles(rows[opaque & moving])
-            if self._lamps.caster is not None:
+            if self._scene_lights.caster is not None:
                 light_background(
                     background.kept,
                     background.tile,
@@ -160,31 +158,28 @@ class Rasterizer:
         return image
 
     def draw_geoms(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> NDArray[np.int64]:
-        """Return the id of the geom that each pixel of `draw` shows, (height, width), -1 for none, highlights left out.
-
-        The middle of a pixel decides.
-        """
-        view = self._look(model, data, camera, ())
+        """Return the visible geom's id at each pixel centre, (height, width), -1 for none; highlights are ignored."""
+        view = self._view(model, data, camera, ())
         self._clear()
         view.draw_triangles(self._rows)
         shown = self._target.triangle
         rows = self._surfaces.row[self._shapes.triangles[shown, 0]]
-        # A row of a highlight is none of the list, and is not drawn here.
+        # Rows of highlights are not drawn here.
         return np.where(shown >= 0, self._list.geoms[np.minimum(rows, len(self._list.geoms) - 1)], -1)
 
-    def _look(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight]) -> View:
+    def _view(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight]) -> View:
         """Fill the table with a state and return a camera's view of it.
 
         Raises:
-            MemobenchError: something is at no place. Compiled functions would write outside of their memory.
+            MemobenchError: a pose is not finite; compiled functions would write out of bounds.
         """
         fill_table(self._table, self._list, model, data, highlights)
         view = View(self, model, data, camera)
         rows = len(self._rows) + len(highlights)
         for numbers in (self._table[:rows, :3], view.matrix, view.light_matrix):
-            if numbers.size and not float(np.abs(numbers).max()) < FARTHEST:
+            if numbers.size and not float(np.abs(numbers).max()) < MAX_COORDINATE:
                 raise MemobenchError(
-                    f"a body, camera or highlight to be drawn is not within {FARTHEST:g} m; expected a finite state"
+                    f"a drawn body, camera or highlight is not within {MAX_COORDINATE:g} m; expected a finite state"
                 )
         return view
 
@@ -192,20 +187,20 @@ class Rasterizer:
         self._target.depth[:] = 0.0
         self._target.triangle[:] = -1
 
-    # --- still rows and their shadows -----------------------------------------------------------------------
+    # --- static rows and their shadows ----------------------------------------------------------------------
 
-    def _bring_shadows_up_to_date(self, view: View) -> Still:
-        """Draw the shadow map of the present state; return the kept pictures of its still rows."""
+    def _bring_shadows_up_to_date(self, view: View) -> StillState:
+        """Draw the shadow map of the present state; return the cached images of its static rows."""
         scene = self._table[: self._list.still].tobytes() + view.lighting
         still = self._still.get(scene)
         if still is None:
-            still = self._still[scene] = Still(np.ones_like(self._shadow_map))
-            if self._lamps.caster is not None:
+            still = self._still[scene] = StillState(np.ones_like(self._shadow_map))
+            if self._scene_lights.caster is not None:
                 self._draw_depths(view, self._still_casters, still.shadow_map, np.zeros_like(self._touched))
-            if len(self._still) > KEPT_SCENES:
+            if len(self._still) > MAX_STILL_STATES:
                 self._still.popitem(last=False)
         self._still.move_to_end(scene)
-        if self._lamps.caster is not None:
+        if self._scene_lights.caster is not None:
             shown = scene + self._table[: len(self._list.geoms), :3].tobytes()
             if shown != self._shown:
                 self._shadow_map_of(still, same=self._shown is not None and self._shown.startswith(scene))
@@ -213,7 +208,7 @@ class Rasterizer:
                 self._shown = shown
         return still
 
-    def _shadow_map_of(self, still: Still, same: bool) -> None:
+    def _shadow_map_of(self, still: StillState, same: bool) -> None:
         if same:
             restore_depths(self._shadow_map, still.shadow_map, self._tile_square(self._touched))
         else:
@@ -228,19 +223,19 @@ class Rasterizer:
             self._shapes, rows, self._table, view.light_matrix, self._clip, shadow_map, self._tile_square(touched)
         )
 
-    def _background(self, still: Still, view: View, rows: NDArray[np.int32]) -> Background:
-        """Return a still camera's picture of the still rows."""
+    def _background(self, still: StillState, view: View, rows: NDArray[np.int32]) -> Background:
+        """Return a static camera's image of the static rows."""
         key = view.matrix.tobytes()
         if key not in still.backgrounds:
-            if len(still.backgrounds) >= KEPT_SCENES:  # a camera that is put elsewhere for every frame
+            if len(still.backgrounds) >= MAX_STILL_STATES:  # a camera that is moved for each frame
                 still.backgrounds.pop(next(iter(still.backgrounds)))
             still.backgrounds[key] = self._draw_background(still, view, rows)
         return still.backgrounds[key]
 
-    def _draw_background(self, still: Still, view: View, rows: NDArray[np.int32]) -> Background:
+    def _draw_background(self, still: StillState, view: View, rows: NDArray[np.int32]) -> Background:
         pixels = self._width * self._height
         image = np.zeros((self._height, self._width, 3), np.uint8)
-        kept = np.zeros((KEPT, pixels), np.float32)
+        kept = np.zeros((BACKGROUND_CHANNELS, pixels), np.float32)
         tile = np.zeros(pixels, np.int32)
         self._clear()
         view.draw_triangles(rows)
@@ -255,12 +250,12 @@ class Rasterizer:
     def _add_reflection(
         self, view: View, mirror: Mirror, rows: NDArray[np.int32], shown: NDArray[np.int32], image: Image
     ) -> None:
-        """Add the reflection in the mirror's upper side to a picture whose triangles are ``shown``."""
+        """Add the reflection in the mirror's upper side to an image with visible triangles ``shown``."""
         point, normal = mirror.plane(self._table)
         seen = self._upper[np.maximum(shown, 0)] & (shown >= 0)
         if (view.eye - point) @ normal <= 0 or not seen.any():
             return
-        # Only this part of the picture is drawn again; the mirrored scene is turned left to right.
+        # Only this part of the image is drawn again; the mirrored scene is flipped horizontally.
         down, across = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
         part = slice(down[0], down[-1] + 1), slice(across[0], across[-1] + 1)
         seen = seen[part][:, ::-1]
@@ -272,11 +267,11 @@ class Rasterizer:
         other.target.triangle[~seen] = -1
         other.shade(PICTURE, reflection)
         self._table[:, 3, :3] = colours
-        # Elsewhere the reflection is black.
+        # The reflection is black outside the mirror.
         image[part] = np.minimum(image[part].astype(np.uint16) + reflection[:, ::-1], 255)
 
     def _reach_above(self, rows: NDArray[np.int32], point: Floats, normal: Floats) -> NDArray[np.int32]:
-        """Return the rows that may reach above a plane."""
+        """Return the rows that may extend above a plane."""
         poses, centre, half = self._table[rows, :3], self._shapes.centre[rows], self._shapes.half[rows]
         middle = np.einsum("rij,rj->ri", poses[:, :, :3], centre) + poses[:, :, 3] - point
         reach = np.abs(np.einsum("rij,i->rj", poses[:, :, :3], normal)) * half
@@ -289,7 +284,7 @@ class Rasterizer:
         return rows[np.argsort(distance, kind="stable")]
 
     def _draw_over(self, view: View, row: int, image: Image) -> None:
-        """Draw a translucent row over a picture: it hides no later row."""
+        """Draw a translucent row over an image without changing depths."""
         depth = self._target.depth.copy()
         self._target.triangle[:] = -1
         view.draw_triangles(np.array([row], dtype=np.int32))
@@ -298,7 +293,7 @@ class Rasterizer:
 
 
 class View:
-    """One frame of a rasterizer: a camera's place and lights."""
+    """Camera and lights of one frame of a rasterizer."""
 
     def __init__(self, rasterizer: Rasterizer, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> None:
         of = self._of = rasterizer
@@ -307,18 +302,18 @@ class View:
         self.eye = data.cam_xpos[self.camera].astype(np.float32)
         self.target = of._target
         self._near, self._far = (np.float32(distance) for distance in clipping(model))
-        self._lights: Lights = of._lamps.look(data, self.camera)
-        self.light_matrix = of._lamps.light_matrix(model, data)
-        # The headlight goes with the camera, whose matrix is a key of its own.
+        self._lights: Lights = of._scene_lights.update(data, self.camera)
+        self.light_matrix = of._scene_lights.light_matrix(model, data)
+        # The headlight moves with the camera, whose matrix is a separate key.
         self.lighting = self._lights.to[1:].tobytes() + self._lights.axis[1:].tobytes()
 
     def mirrored(self, point: Floats, normal: Floats, corner: tuple[int, int], shape: tuple[int, ...]) -> View:
-        """Return a view of the scene mirrored in a plane, turned left to right; the same lights shine.
+        """Return a view of the scene mirrored in a plane, flipped horizontally, with the same lights.
 
         Args:
-            point, normal: of the plane.
-            corner: column and row of the turned picture at which the part begins that is drawn.
-            shape: height and width of that part.
+            point, normal: plane.
+            corner: column and row of the drawn part in the flipped image.
+            shape: height and width of the drawn part.
         """
         other = copy.copy(self)
         whole = self.target.triangle.shape
@@ -328,14 +323,14 @@ class View:
         return other
 
     def draw_triangles(self, rows: NDArray[np.int32]) -> None:
-        """Note which triangle of rows each pixel shows."""
+        """Update the visible triangle of each pixel with some rows."""
         of = self._of
         draw_triangles(of._shapes, rows, of._table, self.matrix, self._near, self._far, of._clip, self.target)
 
     def shade(self, mode: int, image: Image, kept: Floats | None = None) -> None:
-        """Colour the pixels in which a triangle was noted; see `shading.shade`."""
+        """Shade the pixels with a visible triangle; see `shading.shade`."""
         of = self._of
-        kept = np.zeros((KEPT, 0), np.float32) if kept is None else kept
+        kept = np.zeros((BACKGROUND_CHANNELS, 0), np.float32) if kept is None else kept
         shade(
             of._shapes, of._surfaces, of._table, self._lights, self.eye, self.light_matrix, of._clip, of._shadow_map,
             self.target, of._work, mode, image.reshape(-1, 3), kept,
@@ -343,7 +338,7 @@ class View:
 
 
 def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
-    """Return which triangles are the upper side of the mirror."""
+    """Return a mask of the triangles of the mirror's upper side."""
     upper, mirror = np.zeros(triangles, np.bool_), draw_list.mirror
     if mirror is not None:
         mine = np.flatnonzero(np.isin(draw_list.vertices["row"][draw_list.triangles[:, 0]], mirror.rows))
@@ -353,7 +348,7 @@ def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
 
 
 def _shapes(vertices: NDArray[np.void], triangles: NDArray[np.int32], rows: int) -> Shapes:
-    """Return triangles by rows, with the box around each row."""
+    """Return triangles by rows, with the bounding box of each row."""
     row = vertices["row"].astype(np.int64)
     first_vertex = np.searchsorted(row, np.arange(rows + 1)).astype(np.int32)
     first_triangle = np.searchsorted(row[triangles[:, 0]], np.arange(rows + 1)).astype(np.int32)

@@ -1,7 +1,7 @@
-"""From the triangle that a pixel shows to its colour: light at the corners, textures and shadows in each pixel.
+"""Shade pixels: compute light at vertices, and textures and shadows per pixel.
 
-Pixels are shaded in batches whose loops the compiler turns into vector instructions: rows of `BATCH` numbers lie in one
-array, so that it can see that they do not overlap.
+Pixels are shaded in batches with vectorised loops. All rows of `BATCH` numbers lie in one array, so that the compiler
+can prove that they do not overlap.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ Integers = NDArray[np.int32]
 
 BATCH = 256
 CHUNK = 16
-"""Pixels are appended to a batch in whole chunks: surplus numbers are overwritten or not used. Indices are
-unsigned there: numba looks whether others are negative, which no vector instruction does."""
+"""Pixels are appended to a batch in whole chunks; surplus numbers are overwritten or unused. Indices are unsigned in
+these loops, because numba checks signed ones for negative values, which prevents vectorisation."""
 STRIDE = BATCH + CHUNK
 ATTRIBUTES = 11
-"""Of a vertex: steady light (3), light that a shadow may take (3), texture coordinates (2), shadow map (3)."""
+"""Attributes per vertex: unshadowed light (3), light removed by shadow (3), texture coordinates (2), shadow map (3)."""
 PICTURE, BACKGROUND, TRANSLUCENT = 0, 1, 2
-"""Where colours go: into the picture, into the kept background, over the picture."""
+"""Output modes: write the image, write the cached background, blend over the image."""
 
-# Rows of a batch: the attributes, and behind them
+# Float rows of a batch: the attributes, followed by
 _INVERSE, _LIT, _LEVEL, _SHARE, _PAINT, _ACROSS, _DOWN, _DEPTHS, _FLOAT_ROWS = 11, 12, 13, 14, 15, 18, 19, 20, 24
-# Rows of its integers: pixel, where its texture begins, level of it, where that begins, its side, addresses of four
-# texels, the texels.
+# Integer rows of a batch: pixel, start of the texture, level, start of the level, side of the level, addresses of four
+# texels, the four texels.
 _WHERE, _LAYER, _BELOW, _OFFSET, _SIDE, _ADDRESS, _TEXEL, _INTEGER_ROWS = 0, 1, 2, 3, 4, 5, 9, 13
 
 _0, _1, _HALF, _255 = np.float32(0), np.float32(1), np.float32(0.5), np.float32(255)
@@ -38,10 +38,10 @@ _TINY = np.float32(1e-30)
 
 
 class Surfaces(NamedTuple):
-    """What shading needs of a scene's vertices and textures.
+    """Vertex attributes and textures of a scene.
 
     ``normal``: (N, 3) in the frames of the rows; ``uv``: (N, 2); ``row``: (N,); ``texels``: all levels of all layers,
-    a byte each of red, green and blue in an integer; ``side``: of the first level, a power of two.
+    one byte of red, green and blue each per integer; ``side``: side of the first level, a power of two.
     """
 
     normal: Floats
@@ -52,12 +52,11 @@ class Surfaces(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of intermediate results, made by `scratch`.
+    """Buffers for intermediate results, created by `scratch`.
 
-    A stamp says in which call something was listed: ``listed_vertex`` (N,), ``listed_triangle`` (T,). ``vertices`` and
-    ``triangles``: those that are shown; ``slot``: (T,), the place of a triangle in the list. ``attributes``: of the
-    vertices; ``planes``: of the listed triangles. ``runs``: first pixel, number of pixels, triangle.
-    ``ramp``: 0, 1, 2 …
+    ``listed_vertex`` (N,) and ``listed_triangle`` (T,): stamp of the last call that listed them. ``vertices`` and
+    ``triangles``: visible ones; ``slot``: (T,), index of a triangle in the list. ``attributes``: of the vertices;
+    ``planes``: of the listed triangles. ``runs``: first pixel, number of pixels, triangle. ``ramp``: 0, 1, 2 …
     """
 
     stamp: NDArray[np.int64]
@@ -75,7 +74,7 @@ class Scratch(NamedTuple):
 
 
 def scratch(vertices: int, triangles: int, pixels: int) -> Scratch:
-    """Return memory for a scene and a size of pictures."""
+    """Return buffers for a scene and an image size."""
     shown = min(triangles, pixels)
     return Scratch(
         np.zeros(1, np.int64),
@@ -98,19 +97,19 @@ def shade(
     shapes: Any, surfaces: Any, table: Any, lights: Any, eye: Any, light_matrix: Any, clip: Any, shadow_map: Any,
     target: Any, work: Any, mode: Any, image: Any, kept: Any,
 ) -> None:  # fmt: skip
-    """Give every pixel that shows a triangle its colour.
+    """Shade every pixel with a visible triangle.
 
     Args:
-        shapes, table, clip, target: see `geometry.draw_triangles`, which has been called.
+        shapes, table, clip, target: after a call of `geometry.draw_triangles`.
         surfaces: `Surfaces`.
         lights: `lights.Lights`.
-        eye: the camera's place, (3,).
+        eye: position of the camera, (3,).
         light_matrix: from the world to the caster's clip space, (4, 4).
         shadow_map: see `geometry.draw_depths`.
         work: `Scratch`.
         mode: `PICTURE`, `BACKGROUND` or `TRANSLUCENT`.
-        image: (H * W, 3) uint8, brought up to date in the modes `PICTURE` and `TRANSLUCENT`.
-        kept: (background.KEPT, H * W), brought up to date in the mode `BACKGROUND`.
+        image: (H * W, 3) uint8, updated in the modes `PICTURE` and `TRANSLUCENT`.
+        kept: (background.BACKGROUND_CHANNELS, H * W), updated in the mode `BACKGROUND`.
     """
     height, width = target.triangle.shape
     runs = _find_runs(target.triangle, work.runs)
@@ -122,7 +121,7 @@ def shade(
     size = (4 * side * side - 1) // 3  # of all levels of a layer
     for textured in (False, True):
         count = 0
-        for n in range(runs + 1):  # the last one is none: it finishes what is left
+        for n in range(runs + 1):  # the last iteration flushes the incomplete batch
             start: Any = 0
             length: Any = 0
             slot: Any = 0
@@ -158,7 +157,7 @@ def shade(
 
 @compiled
 def _find_runs(triangle: Any, runs: Any) -> Any:
-    """Note pixels of one triangle side by side: first pixel, how many, which triangle; return how many runs."""
+    """Find horizontal runs of pixels with one triangle: first pixel, length, triangle; return their number."""
     height, width = triangle.shape
     count = 0
     for y in range(height):
@@ -178,7 +177,7 @@ def _find_runs(triangle: Any, runs: Any) -> Any:
 
 @compiled
 def _list_shown(runs: Any, corners: Any, work: Any) -> Any:
-    """List the triangles of runs and their vertices; return how many vertices and triangles."""
+    """List the triangles of runs and their vertices; return the numbers of vertices and triangles."""
     work.stamp[0] += 1
     stamp = work.stamp[0]
     vertices, triangles = 0, 0
@@ -198,12 +197,12 @@ def _list_shown(runs: Any, corners: Any, work: Any) -> Any:
     return vertices, triangles
 
 
-# --- corners ---
+# --- vertices ---
 
 
 @compiled
 def _log2(value: Any) -> Any:
-    """Return the logarithm of a positive number to base 2, within 1e-7, by operations that are equal everywhere."""
+    """Return the base-2 logarithm of a positive number within 1e-7, by bit-reproducible operations."""
     bits = np.float64(value).view(np.int64)
     exponent = (bits >> 52) - 1023
     mantissa = np.int64((bits & 0xFFFFFFFFFFFFF) | 0x3FF0000000000000).view(np.float64)
@@ -218,7 +217,7 @@ def _log2(value: Any) -> Any:
 
 @compiled
 def _rough_log2(value: Any) -> Any:
-    """Return the logarithm of a positive number to base 2, within 2e-5 (a polynomial fitted by Chebyshev's points)."""
+    """Return the base-2 logarithm of a positive number within 2e-5 (polynomial fitted at Chebyshev nodes)."""
     bits = np.float64(value).view(np.int64)
     m = np.int64((bits & 0xFFFFFFFFFFFFF) | 0x3FF0000000000000).view(np.float64)
     series = -2.79416749 + m * (5.06979932 + m * (-3.52027091 + m * (1.61020813 + m * (-0.40948426 + m * 0.04392957))))
@@ -227,7 +226,7 @@ def _rough_log2(value: Any) -> Any:
 
 @compiled
 def _power(base: Any, exponent: Any) -> Any:
-    """Return the power of a number from 0 to 1, within 1e-6, by operations that are equal everywhere."""
+    """Return the power of a number from 0 to 1 within 1e-6, by bit-reproducible operations."""
     if base <= 0.0:
         return 0.0
     product = exponent * _log2(base)
@@ -243,7 +242,7 @@ def _power(base: Any, exponent: Any) -> Any:
 def _light(
     vertices: Any, position: Any, surfaces: Any, table: Any, lights: Any, eye: Any, light_matrix: Any, attributes: Any
 ) -> None:
-    """Write down the attributes of vertices: MuJoCo's light, with Blinn's highlights."""
+    """Compute the attributes of vertices: MuJoCo's light with Blinn's specular term."""
     for i in vertices:
         out = attributes[i]
         row = surfaces.row[i]
@@ -302,14 +301,15 @@ def _light(
 
 @compiled
 def _set_up(listed: Any, corners: Any, clip: Any, width: Any, height: Any, attributes: Any, planes: Any) -> None:
-    """Write down how attributes over distance, and the inverse distance at last, change over the picture.
+    """Compute the plane equations of attributes divided by distance, and of the inverse distance, over the image.
 
     Args:
         listed: (S,) triangles.
         corners: (T, 3).
         clip, width, height: see `geometry.draw_triangles`.
-        attributes: of the vertices.
-        planes: (S, ATTRIBUTES + 1, 3), overwritten: value per pixel to the right, per pixel down, in the first pixel.
+        attributes: attributes of the vertices.
+        planes: (S, ATTRIBUTES + 1, 3), overwritten: change per pixel to the right, per pixel down, value at the first
+            pixel.
     """
     half_width, half_height = 0.5 * width, 0.5 * height
     for slot in range(listed.size):
@@ -344,7 +344,7 @@ def _fill(
     planes: Any, slot: Any, pixel: Any, width: Any, length: Any, count: Any, textured: Any, shadows: Any, ramp: Any,
     t: Any, i: Any,
 ) -> None:  # fmt: skip
-    """Append pixels of one triangle, side by side from ``pixel`` on, to the batch, which holds ``count``."""
+    """Append a run of pixels of one triangle from ``pixel`` to the batch, which holds ``count``."""
     whole = (length + CHUNK - 1) // CHUNK * CHUNK
     y = pixel // width
     x = pixel - y * width
@@ -366,7 +366,7 @@ def _choose_levels(
     planes: Any, slot: Any, pixel: Any, width: Any, length: Any, count: Any, offset: Any, side: Any, ramp: Any,
     t: Any, i: Any,
 ) -> None:  # fmt: skip
-    """Choose the levels of a texture by how many texels a pixel covers at both ends of a run."""
+    """Choose mipmap levels from the number of texels per pixel at both ends of a run."""
     y = pixel // width
     first, step = 0.0, 0.0
     e, f, g = planes[slot, _INVERSE, 0], planes[slot, _INVERSE, 1], planes[slot, _INVERSE, 2]
@@ -394,7 +394,7 @@ def _choose_levels(
 
 @compiled
 def _rest(count: Any, t: Any, i: Any) -> None:
-    """Fill the rest of the last batch with what can be computed with."""
+    """Fill the rest of the last batch with valid numbers."""
     for n in range(_FLOAT_ROWS):
         value = _1 if n == _INVERSE else _0
         for k in range(count, BATCH):
@@ -406,7 +406,7 @@ def _rest(count: Any, t: Any, i: Any) -> None:
 
 @compiled
 def _colour(textured: Any, shadows: Any, texels: Any, side: Any, shadow_map: Any, mode: Any, t: Any, i: Any) -> None:
-    """Compute the colours of a batch into its first three rows; in the mode `BACKGROUND` without the shadow."""
+    """Compute the colours of a batch into its first three rows; without shadow in the mode `BACKGROUND`."""
     _divide(t, textured, shadows)
     if textured:
         mixed = _begin_sampling(side, t, i)
@@ -425,7 +425,7 @@ def _colour(textured: Any, shadows: Any, texels: Any, side: Any, shadow_map: Any
 
 @compiled
 def _write(count: Any, mode: Any, alpha: Any, image: Any, kept: Any, t: Any, i: Any) -> None:
-    """Put the first pixels of a batch where they belong."""
+    """Write the first ``count`` pixels of a batch to the output of the mode."""
     if mode == PICTURE:
         for x in range(3 * STRIDE):
             t[x] = min(max(t[x], _0), _255) + _HALF
@@ -450,7 +450,7 @@ def _write(count: Any, mode: Any, alpha: Any, image: Any, kept: Any, t: Any, i: 
 
 @compiled
 def _divide(t: Any, textured: Any, shadows: Any) -> None:
-    """Multiply the attributes by the distance, over which they were divided."""
+    """Multiply the attributes by the distance (perspective correction)."""
     for x in range(BATCH):
         t[_INVERSE * STRIDE + x] = _1 / t[_INVERSE * STRIDE + x]
     for x in range(BATCH):
@@ -476,7 +476,7 @@ def _divide(t: Any, textured: Any, shadows: Any) -> None:
 
 @compiled
 def _paint(t: Any, shadows: Any) -> None:
-    """Let the texture take its part of the light."""
+    """Multiply light by texture colours."""
     for x in range(BATCH):
         t[x] *= t[_PAINT * STRIDE + x]
         t[STRIDE + x] *= t[(_PAINT + 1) * STRIDE + x]
@@ -490,7 +490,7 @@ def _paint(t: Any, shadows: Any) -> None:
 
 @compiled
 def _join(t: Any) -> None:
-    """Add what the shadow leaves of the caster's light."""
+    """Add the unshadowed share of the caster's light."""
     for x in range(BATCH):
         lit = t[_LIT * STRIDE + x]
         t[x] += lit * t[3 * STRIDE + x]
@@ -500,7 +500,7 @@ def _join(t: Any) -> None:
 
 @compiled
 def _begin_sampling(side: Any, t: Any, i: Any) -> Any:
-    """Go to the lower of two levels, with nothing read of any; return whether the upper one takes any share."""
+    """Select the lower of two mipmap levels and clear the colours; return whether the upper level is needed."""
     coarsest = np.float32(_log2(float(side))) - np.float32(0.001)
     most = _0
     for x in range(BATCH):
@@ -517,7 +517,7 @@ def _begin_sampling(side: Any, t: Any, i: Any) -> Any:
 
 @compiled
 def _next_level(t: Any, i: Any) -> None:
-    """Go to the upper of two levels, which takes its share."""
+    """Select the upper of two mipmap levels with its weight."""
     for x in range(BATCH):
         i[_BELOW * STRIDE + x] += np.int32(1)
         t[_SHARE * STRIDE + x] = t[_LEVEL * STRIDE + x]
@@ -525,13 +525,13 @@ def _next_level(t: Any, i: Any) -> None:
 
 @compiled
 def _sample(texels: Any, side: Any, t: Any, i: Any) -> None:
-    """Read textures of a level between their four texels, and mix them into what was read of others."""
+    """Interpolate textures bilinearly at a level, and blend them into the colours of the previous level."""
     whole = np.int32(side)
     area = np.int32(whole * whole)
     for x in range(BATCH):
         here = np.int32(whole >> i[_BELOW * STRIDE + x])
         i[_SIDE * STRIDE + x] = here
-        # The levels before have 4/3 of what their areas differ.
+        # The previous levels contain 4/3 of the difference of areas.
         before = np.uint32(np.int32(area - np.int32(here * here)) << np.int32(2)) // np.uint32(3)
         i[_OFFSET * STRIDE + x] = np.int32(i[_LAYER * STRIDE + x] + np.int32(before))
     for x in range(BATCH):
@@ -582,7 +582,7 @@ def _sample(texels: Any, side: Any, t: Any, i: Any) -> None:
 
 @compiled
 def _look_up(shadow_map: Any, t: Any, i: Any) -> None:
-    """Say how much of the caster's light arrives: four texels, joined by how near they are."""
+    """Compute the visible share of the caster's light by bilinear interpolation of four shadow-map tests."""
     size = np.int32(shadow_map.shape[0])
     flat = shadow_map.reshape(-1)
     wide = np.float32(size)
@@ -608,5 +608,5 @@ def _look_up(shadow_map: Any, t: Any, i: Any) -> None:
         s = _1 if depth <= t[(_DEPTHS + 3) * STRIDE + x] else _0
         upper, lower = p + across * (q - p), r + across * (s - r)
         u, v = t[8 * STRIDE + x], t[9 * STRIDE + x]
-        # Beyond the map nothing casts shadows.
+        # There are no shadows outside the map.
         t[_LIT * STRIDE + x] = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)

@@ -1,4 +1,4 @@
-"""The triangles of MuJoCo's shapes, each in its geom's frame: meshes, planes, boxes, cylinders, spheres, capsules."""
+"""Triangulate MuJoCo's geoms in their own frames: meshes, planes, boxes, cylinders, spheres, capsules."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 
-ROUND = 32
+ROUND_SIDES = 32
 """Sides of cylinders and spheres."""
-LEAST_AGREEMENT = 0.8
-"""Cosine below which MuJoCo's renderer draws a corner of a mesh with its face's normal: there is an edge."""
-ENDLESS = 1.05
-"""Half of the side of a plane without end, in distances of the far clipping plane."""
-PLANE_CELLS = 40
-"""Most cells in the side of a plane."""
+MIN_NORMAL_COSINE = 0.8
+"""Smallest cosine between vertex and face normal of a smooth corner; otherwise MuJoCo uses the face normal."""
+INFINITE_PLANE_FACTOR = 1.05
+"""Half side of an infinite plane, in units of the far clipping distance."""
+MAX_PLANE_CELLS = 40
+"""Maximum number of cells per side of a plane."""
 
 Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
 """Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
@@ -29,13 +29,13 @@ def triangles_of(
     """Return a geom's triangles in its own frame.
 
     Args:
-        model: a compiled scene.
-        geom: its id.
-        meshes: taken in place of the model's of these names; see `mesh_in_file`.
+        model: compiled scene.
+        geom: id of the geom.
+        meshes: replacements of the model's meshes by name; see `mesh_in_file`.
         sharp: whether edges of other meshes are sharp.
 
     Raises:
-        MemobenchError: for a shape that is not drawn here.
+        MemobenchError: the geom's type is not supported.
     """
     kind = mujoco.mjtGeom(int(model.geom_type[geom]))
     size = np.asarray(model.geom_size[geom])
@@ -45,7 +45,7 @@ def triangles_of(
         case mujoco.mjtGeom.mjGEOM_BOX:
             return _box(size)
         case mujoco.mjtGeom.mjGEOM_PLANE:
-            return _plane(size, ENDLESS * float(model.vis.map.zfar * model.stat.extent))
+            return _plane(size, INFINITE_PLANE_FACTOR * float(model.vis.map.zfar * model.stat.extent))
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
             return _revolve([(0, 1), (1, 1), (1, 1), (1, -1), (1, -1), (0, -1)], [2, 2, 0, 0, -2, -2], size[[0, 0, 1]])
         case mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -55,19 +55,19 @@ def triangles_of(
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
             return _capsule(float(size[0]), float(size[1]))
     raise MemobenchError(
-        f"geom {model.geom(geom).name!r} is a {kind.name.removeprefix('mjGEOM_').lower()}, which is not drawn; use "
-        "planes, boxes, cylinders, spheres, ellipsoids, capsules and meshes for visual geoms"
+        f"geom {model.geom(geom).name!r} has the type {kind.name.removeprefix('mjGEOM_').lower()}, which is not drawn; "
+        "use planes, boxes, cylinders, spheres, ellipsoids, capsules and meshes for visual geoms"
     )
 
 
 def _named_mesh(model: mujoco.MjModel, mesh: int, meshes: Mapping[str, Triangles], sharp: bool) -> Triangles:
-    """Return a mesh, or the given one of its name, in the frame of the model's mesh, which is also its geom's.
+    """Return a mesh, or its replacement, in the frame of the model's mesh, which is also its geom's.
 
-    The compiler moves every mesh into its own centre and principal axes, and a mesh of more faces has others.
+    The compiler moves each mesh to its centre and principal axes, which differ for a mesh with more faces.
     """
     name = model.mesh(mesh).name
     if name not in meshes:
-        return _mesh(model, mesh, LEAST_AGREEMENT if sharp else -np.inf)
+        return _mesh(model, mesh, MIN_NORMAL_COSINE if sharp else -np.inf)
     here = _mesh_axes(model, mesh)
     if not model.mesh_pos[mesh].any() and (here == np.eye(3)).all():
         return meshes[name]
@@ -78,12 +78,12 @@ def _named_mesh(model: mujoco.MjModel, mesh: int, meshes: Mapping[str, Triangles
 def mesh_in_file(model: mujoco.MjModel, mesh: int) -> Triangles:
     """Return a mesh with sharp edges, in the frame of its file."""
     axes = _mesh_axes(model, mesh)
-    points, normals, uv, triangles = _mesh(model, mesh, LEAST_AGREEMENT)
+    points, normals, uv, triangles = _mesh(model, mesh, MIN_NORMAL_COSINE)
     return points @ axes.T + model.mesh_pos[mesh], normals @ axes.T, uv, triangles
 
 
 def welded(shape: Triangles) -> Triangles:
-    """Return a shape in single precision whose vertices all differ: many files list one for each corner."""
+    """Return a shape in single precision without duplicate vertices; many files list one vertex per corner."""
     points, normals, uv, triangles = shape
     rows = np.concatenate([points, normals, uv], axis=1).astype(np.float32) + np.float32(0)  # no negative zeros
     unique, index = _unique_in_order(rows.view(np.int32))
@@ -92,7 +92,7 @@ def welded(shape: Triangles) -> Triangles:
 
 
 def in_pieces(shape: Triangles, most: int) -> Triangles:
-    """Return a shape in an order in which so many triangles after each other lie in one region, with vertices alone."""
+    """Return a shape sorted so that each block of up to ``most`` triangles is compact and has its own vertices."""
     points, normals, uv, triangles = shape
     middle = points[triangles].mean(axis=1)
     left: list[NDArray[np.int64]] = [np.arange(len(triangles))]
@@ -114,7 +114,7 @@ def in_pieces(shape: Triangles, most: int) -> Triangles:
 
 
 def pieces_of(shape: Triangles, most: int) -> Iterator[Triangles]:
-    """Cut a shape into pieces of so many triangles after each other; see `in_pieces`."""
+    """Yield consecutive blocks of ``most`` triangles of a shape; see `in_pieces`."""
     points, normals, uv, triangles = shape
     for start in range(0, len(triangles), most):
         mine = triangles[start : start + most]
@@ -130,12 +130,12 @@ def _mesh_axes(model: mujoco.MjModel, mesh: int) -> NDArray[np.float64]:
 
 
 def _mesh(model: mujoco.MjModel, mesh: int, agreement: float = -np.inf) -> Triangles:
-    """Return a mesh's triangles, one vertex for each combination of point, normal and texture coordinate.
+    """Return a mesh's triangles with one vertex per combination of point, normal and texture coordinate.
 
     Args:
-        model: a compiled model.
-        mesh: its id.
-        agreement: cosine to a face's own normal below which a point's mean normal is not taken.
+        model: compiled model.
+        mesh: id of the mesh.
+        agreement: cosine between vertex and face normal below which the face normal is used.
     """
     face, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     point, normal = int(model.mesh_vertadr[mesh]), int(model.mesh_normaladr[mesh])
@@ -143,7 +143,7 @@ def _mesh(model: mujoco.MjModel, mesh: int, agreement: float = -np.inf) -> Trian
     points = model.mesh_face[face : face + faces]
     normals = model.mesh_normal[normal : normal + int(model.mesh_normalnum[mesh])]
     normal_of = model.mesh_facenormal[face : face + faces]
-    if uv < 0 and agreement > -1:  # a mesh with texture coordinates comes with normals of its own
+    if uv < 0 and agreement > -1:  # a mesh with texture coordinates has explicit normals
         a, b, c = (model.mesh_vert[point + points[:, corner]] for corner in range(3))
         flat = np.cross(b - a, c - a)
         flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
@@ -164,7 +164,7 @@ def _mesh(model: mujoco.MjModel, mesh: int, agreement: float = -np.inf) -> Trian
 
 
 def _unique_in_order(rows: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
-    """Return the distinct rows by first use, and where each row went: neighbours in use are neighbours in memory."""
+    """Return the distinct rows in order of first use, and the index of each row in them."""
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
@@ -193,18 +193,18 @@ def _box(size: NDArray[np.floating]) -> Triangles:
 
 
 def box_cells(model: mujoco.MjModel, geom: int) -> Triangles:
-    """Return a box whose sides have as many cells as MuJoCo gives them: light is computed at corners."""
+    """Return a box with sides subdivided as in MuJoCo, because light is computed at vertices."""
     points, normals, *_ = _box(np.asarray(model.geom_size[geom]))
     sides = [_cells(points[k : k + 4], normals[k], model.vis.quality.numquads) for k in range(0, len(points), 4)]
     return _joined(sides)
 
 
 def _plane(size: NDArray[np.floating], endless: float) -> Triangles:
-    """Return a plane of half sides and cells of a size; a half side of 0 stands for one without end."""
+    """Return a subdivided plane from half sides and cell size; a half side of 0 is infinite."""
     x, y = np.where(size[:2] > 0, size[:2], endless)
     corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)])
     cells = int(np.ceil(max(x, y) / max(float(size[2]), 1e-9))) + 1
-    return _cells(corners, np.array([0.0, 0.0, 1.0]), min(cells, PLANE_CELLS))
+    return _cells(corners, np.array([0.0, 0.0, 1.0]), min(cells, MAX_PLANE_CELLS))
 
 
 def _cells(corners: NDArray[np.floating], normal: NDArray[np.floating], cells: int) -> Triangles:
@@ -229,41 +229,40 @@ def _joined(shapes: list[Triangles]) -> Triangles:
 
 
 def _revolve(profile: list[tuple[float, float]], slopes: list[float], size: NDArray[np.floating]) -> Triangles:
-    """Turn a profile of (radius, z) about z, top to bottom, and scale it.
+    """Revolve a profile of (radius, z) about z, from top to bottom, and scale it.
 
-    ``slopes`` gives the angle of the normal over the horizontal per point, in quarter turns of which ±2 stand for up
-    and down.
+    ``slopes``: angle of the normal above the horizontal per point, in units of 45°; ±2 is up and down.
     """
-    angle = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
+    angle = np.linspace(0, 2 * np.pi, ROUND_SIDES, endpoint=False)
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     positions, normals = [], []
     for (radius, z), slope in zip(profile, slopes, strict=True):
         tilt = slope * np.pi / 4
-        positions.append(np.column_stack([radius * around, np.full(ROUND, z)]))
-        normals.append(np.column_stack([np.cos(tilt) * around, np.full(ROUND, np.sin(tilt))]))
+        positions.append(np.column_stack([radius * around, np.full(ROUND_SIDES, z)]))
+        normals.append(np.column_stack([np.cos(tilt) * around, np.full(ROUND_SIDES, np.sin(tilt))]))
     points = np.concatenate(positions) * size
     directions = np.concatenate(normals) / size
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    k = np.arange(ROUND)
-    after = (k + 1) % ROUND
+    k = np.arange(ROUND_SIDES)
+    after = (k + 1) % ROUND_SIDES
     triangles = []
     for ring in range(len(profile) - 1):
-        upper, lower = ring * ROUND, (ring + 1) * ROUND
+        upper, lower = ring * ROUND_SIDES, (ring + 1) * ROUND_SIDES
         triangles.append(np.column_stack([upper + k, lower + k, lower + after]))
         triangles.append(np.column_stack([upper + k, lower + after, upper + after]))
     faces = np.concatenate(triangles)
     edges = points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
-    whole = np.linalg.norm(np.cross(*edges), axis=1) > 1e-14  # rings that lie in each other leave no face
+    whole = np.linalg.norm(np.cross(*edges), axis=1) > 1e-14  # drop degenerate faces between coincident rings
     return points, directions, np.zeros((len(points), 2)), faces[whole]
 
 
 def _ellipsoid(size: NDArray[np.floating]) -> Triangles:
-    tilt = np.linspace(1, -1, ROUND // 2 + 1) * np.pi / 2
+    tilt = np.linspace(1, -1, ROUND_SIDES // 2 + 1) * np.pi / 2
     return _revolve([(float(np.cos(t)), float(np.sin(t))) for t in tilt], [float(t / (np.pi / 4)) for t in tilt], size)
 
 
 def _capsule(radius: float, half_length: float) -> Triangles:
-    tilt = np.linspace(1, 0, ROUND // 4 + 1) * np.pi / 2
+    tilt = np.linspace(1, 0, ROUND_SIDES // 4 + 1) * np.pi / 2
     upper = [(radius * float(np.cos(t)), half_length + radius * float(np.sin(t))) for t in tilt]
     slopes = [float(t / (np.pi / 4)) for t in tilt]
     lower = [(r, -z) for r, z in reversed(upper)]
@@ -271,5 +270,5 @@ def _capsule(radius: float, half_length: float) -> Triangles:
 
 
 def disc() -> Triangles:
-    """Return a flat cylinder of radius 1 and height 2, top and side: the shape of a highlight."""
+    """Return the shape of a highlight: top and side of a cylinder of radius 1 and height 2."""
     return _revolve([(0, 1), (1, 1), (1, 1), (1, -1)], [2, 2, 0, 0], np.ones(3))

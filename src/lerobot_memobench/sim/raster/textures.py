@@ -1,4 +1,4 @@
-"""Textures as layers of one size, where they lie on shapes that bring no coordinates, and their coarser levels."""
+"""Convert textures into layers of one size with mipmaps, and compute texture coordinates of shapes without them."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from lerobot_memobench.sim.raster.compiled import compiled
 from lerobot_memobench.sim.raster.shapes import Triangles
 
 LAYER_SIZE = 512
-"""Side to which textures are brought, pixels: the largest of the project's own; a power of two."""
+"""Side of a texture layer, pixels; a power of two, the largest size of this package's textures."""
 SIDES = 6
-"""Of a cube, in OpenGL's order: +x, −x, +y, −y, +z, −z."""
+"""Sides of a cube in OpenGL's order: +x, −x, +y, −y, +z, −z."""
 
 _ACROSS = ((2, -1), (2, 1), (0, 1), (0, 1), (0, 1), (0, -1))
 _DOWN = ((1, -1), (1, -1), (2, 1), (2, -1), (1, -1), (1, -1))
-"""For each side of a cube, the axis along which its picture goes and the direction (OpenGL 2.1, table 3.21)."""
+"""Axis and direction of the image on each side of a cube (OpenGL 2.1, table 3.21)."""
 
 
 def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple[int, ...]]]:
-    """Return a model's textures at one size, and texture id → its layer, or six of a cube; layer 0 is white."""
+    """Return a model's textures at one size, and texture id → its layer (six for a cube); layer 0 is white."""
     layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
     layer_of: dict[int, tuple[int, ...]] = {}
-    known: dict[bytes, int] = {}  # the sides of a cube are often one picture
+    known: dict[bytes, int] = {}  # the sides of a cube often share an image
     for texture in range(model.ntex):
         if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX or model.tex_nchannel[texture] != 3:
             continue
@@ -43,7 +43,7 @@ def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple
 
 
 def resized(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a picture at the size of layers; one of that size is left as it is."""
+    """Return an image resized to the layer size."""
     from PIL import Image
 
     if picture.shape[:2] == (LAYER_SIZE, LAYER_SIZE):
@@ -52,20 +52,20 @@ def resized(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _pictures(model: mujoco.MjModel, texture: int, pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-    """Return the picture of a flat texture, or the six of a cube, which may all be the one that there is."""
+    """Return the image of a flat texture, or the six images of a cube, which may be a single one repeated."""
     if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D:
         return [pixels]
     return [pixels] * SIDES if len(pixels) == pixels.shape[1] else np.split(pixels, SIDES)
 
 
 def levels_of(layers: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Return every layer at its size, at half of it, and so on down to one pixel, layer by layer.
+    """Return the mipmaps of all layers, from full size to one pixel, layer by layer.
 
     Args:
         layers: (L, LAYER_SIZE, LAYER_SIZE, 3).
 
     Returns:
-        The pixels, red + 256 green + 65536 blue.
+        Pixels as red + 256 green + 65536 blue.
     """
     count, side = len(layers), LAYER_SIZE
     levels = np.empty((count, (4 * side * side - 1) // 3), np.int32)
@@ -75,7 +75,7 @@ def levels_of(layers: NDArray[np.uint8]) -> NDArray[np.int32]:
 
 @compiled
 def _fill_levels(layers: Any, levels: Any) -> None:
-    """Write each level behind the one of twice its side, of which a pixel is the mean of four."""
+    """Write the levels in order of size; a pixel is the mean of four pixels of the previous level."""
     for layer in range(layers.shape[0]):
         side, start = layers.shape[1], 0
         for y in range(side):
@@ -98,7 +98,7 @@ def _fill_levels(layers: Any, levels: Any) -> None:
 
 
 def _full_size(model: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
-    """Return half extents (3,) of a geom as MuJoCo's renderer scales its shapes."""
+    """Return the half extents (3,) by which MuJoCo's renderer scales a geom."""
     size = np.array(model.geom_size[geom])
     match mujoco.mjtGeom(int(model.geom_type[geom])):
         case mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -109,7 +109,7 @@ def _full_size(model: mujoco.MjModel, geom: int) -> NDArray[np.float64]:
 
 
 def flat_coordinates(model: mujoco.MjModel, geom: int, shape: Triangles) -> Triangles:
-    """Lay a picture over a shape from above, as MuJoCo does: ``texrepeat`` times, or so many times per 2 m."""
+    """Project a texture from above as MuJoCo: repeated ``texrepeat`` times, or per 2 m if uniform."""
     points, normals, _, triangles = shape
     material = int(model.geom_matid[geom])
     scale = np.array(model.mat_texrepeat[material], dtype=np.float64)
@@ -121,9 +121,9 @@ def flat_coordinates(model: mujoco.MjModel, geom: int, shape: Triangles) -> Tria
 
 
 def cube_coordinates(model: mujoco.MjModel, geom: int, shape: Triangles) -> Iterator[tuple[int, Triangles]]:
-    """Yield the sides of a cube around a shape that show on it, and the triangles that show each.
+    """Yield each visible side of a cube texture and its triangles.
 
-    A triangle belongs to the side to which its middle points.
+    A triangle belongs to the side in the direction of its centroid.
     """
     points, normals, _, triangles = shape
     direction = np.asarray(points, dtype=np.float64)
@@ -137,6 +137,6 @@ def cube_coordinates(model: mujoco.MjModel, geom: int, shape: Triangles) -> Iter
         there = direction[mine]
         depth = np.maximum(np.abs(there[:, side // 2]), 1e-9)
         uv = [0.5 * sign * there[:, k] / depth + 0.5 for k, sign in (_ACROSS[side], _DOWN[side])]
-        # A picture ends at the cube's edges.
+        # Do not wrap at the cube's edges.
         inside = np.clip(np.stack(uv, axis=1), 0.5 / LAYER_SIZE, 1 - 0.5 / LAYER_SIZE)
         yield int(side), (points[mine], normals[mine], inside, index.reshape(-1, 3))
