@@ -141,6 +141,14 @@ def test_shuffled_memory_is_compared_checkpoint_by_checkpoint(tmp_path: Path) ->
     assert "| shuffled | 90.0 | 24.0 | 2.0 |" in text
 
 
+def test_a_checkpoint_after_a_missed_one_does_not_count(tmp_path: Path) -> None:
+    normal = evaluation(tmp_path / "normal", [0])
+    shuffled = evaluation(tmp_path / "shuffled", [3], "b", policy_settings={"shuffle_subgoals": True})
+    write_episodes(tmp_path / "normal", [rollout(STOVE, "temporal", "SUU", [False, True, True], False, 0)])
+    assert main(["compare", normal, shuffled, "--format", "json", "--out", str(tmp_path)]) == 0
+    assert [rows_of(tmp_path)[STOVE, f"c{k}"]["a"] for k in (1, 2, 3)] == [0, 0, 0]
+
+
 def test_the_paper_has_no_figures_of_other_comparisons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a, b = evaluation(tmp_path / "a", [1]), evaluation(tmp_path / "b", [1], policy="b")
     assert main(["compare", a, b, "--with", "paper"]) == 2
