@@ -111,7 +111,7 @@ def _add_false(noisy: Tensor, there: Tensor, size: float) -> None:
 
 
 def in_order(slots: Tensor) -> Tensor:
-    """Return slots (N, n, WIDTH) sorted as by `sim.object_slots.in_slots`: by class and place, the empty ones last."""
+    """Return slots (N, n, WIDTH) sorted as by `sim.object_slots.fill_slots`: by class and place, empty ones last."""
     x = field(slots, "position")[..., 0].clamp(-4, 4) / 10
     order = (field(slots, "class").squeeze(-1) + x).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
     rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
