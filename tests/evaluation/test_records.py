@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lerobot_memobench.cli.report import given_runs
-from lerobot_memobench.envs.episode_log import (
-    PROTOCOL_FILE,
-    EpisodeLog,
-    check_protocol,
-    differences,
-    has_log,
-    write_episodes,
-    write_protocol,
-)
+from lerobot_memobench.envs.episode_log import EpisodeLog, differences, has_log, write_episodes
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, check_protocol, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import failure_counts, summarise
-from lerobot_memobench.evaluation.records import CARD_FILE, read_protocol, read_rollouts, read_runs, sweeps
+from lerobot_memobench.evaluation.records import read_protocol, read_rollouts, read_runs, sweeps
 from lerobot_memobench.evaluation.report import build, render, write_report
 from lerobot_memobench.evaluation.report_tables import departures, failures_table
 from lerobot_memobench.run.merging import merge
@@ -37,7 +31,7 @@ def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, 
 
 
 def test_the_environments_settings_stand_beside_the_log(tmp_path: Path) -> None:
-    log = EpisodeLog(tmp_path, SETTINGS)
+    log = EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS))
     assert not list(tmp_path.iterdir())  # nothing before an episode has ended
     log.append(record())
     log.append(record("b", 3))
@@ -46,12 +40,12 @@ def test_the_environments_settings_stand_beside_the_log(tmp_path: Path) -> None:
 
 
 def test_another_protocol_is_refused_before_a_line_is_written(tmp_path: Path) -> None:
-    EpisodeLog(tmp_path, SETTINGS).append(record())
-    EpisodeLog(tmp_path, SETTINGS).append(record(episode=1))  # another worker
-    before = sorted((tmp_path / "episodes").iterdir()), (tmp_path / PROTOCOL_FILE).read_bytes()
+    EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS)).append(record())
+    EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS)).append(record(episode=1))  # another worker
+    before = sorted((tmp_path / "episodes").iterdir()), (tmp_path / EVALUATION_FILE).read_bytes()
     with pytest.raises(MemobenchError, match="horizon: 1200 and 600"):
-        EpisodeLog(tmp_path, {**SETTINGS, "horizon": 600}).append(record("other"))
-    assert before == (sorted((tmp_path / "episodes").iterdir()), (tmp_path / PROTOCOL_FILE).read_bytes())
+        EpisodeLog(tmp_path, partial(write_protocol, tmp_path, {**SETTINGS, "horizon": 600})).append(record("other"))
+    assert before == (sorted((tmp_path / "episodes").iterdir()), (tmp_path / EVALUATION_FILE).read_bytes())
 
 
 def test_a_log_alone_tells_what_it_can(tmp_path: Path) -> None:
@@ -71,9 +65,9 @@ def test_a_log_alone_tells_what_it_can(tmp_path: Path) -> None:
 
 
 def test_what_was_asked_for_comes_from_the_card(tmp_path: Path) -> None:
-    EpisodeLog(tmp_path, SETTINGS).append(record())
+    EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS)).append(record())
     card = {"protocol": {**SETTINGS, "tasks": ["a_task", "b"], "episodes": 50}, "policy": {"type": "act"}}
-    (tmp_path / CARD_FILE).write_text(json.dumps(card))
+    (tmp_path / EVALUATION_FILE).write_text(json.dumps(card))
     assert read_protocol(tmp_path) == {**card["protocol"], "policy": {"type": "act"}}
 
 
@@ -86,12 +80,8 @@ def test_no_evaluation_at_all(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["{", "[1]"])
 def test_files_that_are_none_of_ours_are_named(tmp_path: Path, text: str) -> None:
     write_episodes(tmp_path, [record()])
-    (tmp_path / PROTOCOL_FILE).write_text(text)
-    with pytest.raises(MemobenchError, match=PROTOCOL_FILE):
-        read_protocol(tmp_path)
-    (tmp_path / PROTOCOL_FILE).unlink()
-    (tmp_path / CARD_FILE).write_text(text)
-    with pytest.raises(MemobenchError, match=CARD_FILE):
+    (tmp_path / EVALUATION_FILE).write_text(text)
+    with pytest.raises(MemobenchError, match=EVALUATION_FILE):
         read_protocol(tmp_path)
 
 
@@ -307,7 +297,7 @@ def test_merging_two_suites_is_refused(strict: Path, published: Path, tmp_path: 
 
 
 def test_an_earlier_folder_goes_on_as_published_and_not_as_strict(tmp_path: Path) -> None:
-    (tmp_path / PROTOCOL_FILE).write_text('{"horizon": 1200}')
+    (tmp_path / EVALUATION_FILE).write_text('{"protocol": {"horizon": 1200}}')
     assert check_protocol(tmp_path, {"horizon": 1200, "suite": "published"})
     with pytest.raises(MemobenchError, match="suite: published and strict"):
         check_protocol(tmp_path, {"horizon": 1200, "suite": "strict"})

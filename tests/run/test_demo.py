@@ -34,7 +34,7 @@ def write_video(path: Path, frames: int = 12) -> None:
 def fake_evaluation(output: Path) -> None:
     for name in demo.TASKS:
         write_video(output / "videos" / f"{name}.0.mp4")
-    for name in ("episodes.jsonl", "report.json", "report.md", "protocol.json", "card.json", "card.md"):
+    for name in ("episodes.jsonl", "report.json", "report.md", "evaluation.json"):
         (output / name).write_text(name)
 
 
@@ -75,8 +75,7 @@ def test_the_html_report_finds_the_demos_films(tmp_path: Path) -> None:
         write_episodes(output, [rollout(name, "temporal", "", [], True, 0) for name in demo.TASKS])
 
     demo.make_demo(tmp_path / "demo", evaluate, fake_comparison)
-    for name in ("card.json", "protocol.json"):  # of a fake evaluation: none
-        (tmp_path / "demo" / name).unlink()
+    (tmp_path / "demo" / "evaluation.json").unlink()  # of a fake evaluation: none
     written = write_html([tmp_path / "demo"], tmp_path / "html")
     assert written.videos == len(demo.TASKS)
     assert not written.notes

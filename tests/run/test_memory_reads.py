@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import OBJECTS, RESET
+from lerobot_memobench.envs.settings import OBJECTS, RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import page_data
 from lerobot_memobench.evaluation.memory_reads import find_reads, reads_file

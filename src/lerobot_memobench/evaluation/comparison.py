@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.envs.episode_log import OF_THE_POLICY, SETTINGS, differences
+from lerobot_memobench.envs.episode_log import OF_THE_POLICY, differences
+from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Record, by_task, operations, policy_inputs, value_of

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
-from lerobot_memobench.envs.observations import RESET
+from lerobot_memobench.envs.settings import RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import seed_base
 from lerobot_memobench.io import Count, Name, Number, Whole, count_of, file_name, read_json, write_file

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, PROTOCOL_FILE, read_episodes
-from lerobot_memobench.envs.observations import OBJECTS
+from lerobot_memobench.envs.episode_log import MERGED_FILE, read_episodes
+from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import policy_inputs
@@ -29,7 +29,6 @@ from lerobot_memobench.evaluation.records import CARD_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON, REPORT_MARKDOWN
 from lerobot_memobench.io import write_file
 from lerobot_memobench.policies.checkpoint import shipped_policies
-from lerobot_memobench.run.card import CARD_MARKDOWN
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line
 from lerobot_memobench.run.run import VIDEOS
 from lerobot_memobench.run.run import made as made_folder
@@ -48,7 +47,7 @@ TASKS = (
 """One task of each memory type."""
 CONTACT_SHEET = "contact_sheet.png"
 MEMORY_VIDEO, MEMORY_STRIP, MEMORY_TABLE = "memory.mp4", "memory.png", "memory.md"
-RESULTS = (MERGED_FILE, REPORT_JSON, REPORT_MARKDOWN, PROTOCOL_FILE, CARD_FILE, CARD_MARKDOWN)
+RESULTS = (MERGED_FILE, REPORT_JSON, REPORT_MARKDOWN, CARD_FILE)
 """Files that are taken over from the expert's evaluation."""
 PRODUCTS = (*RESULTS, VIDEOS, CONTACT_SHEET, MEMORY_VIDEO, MEMORY_STRIP, MEMORY_TABLE)
 """All that a demo writes, and so all that a new one removes."""

@@ -139,7 +139,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
     jobs = [
         ShardJob(
             program=tuple(program),
-            flags=(*plan.portable_flags, *_part_options(plan)),
+            flags=(*plan.settings.words, *_part_options(plan)),
             shard=shard,
             out=out,
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
@@ -175,7 +175,7 @@ def _check_folders(plan: EvaluationPlan, out: Path, jobs: Sequence[ShardJob], te
 
 def executor_options(plan: EvaluationPlan) -> dict[str, Any]:
     """Return the executor's options, complete: a large policy is given a GPU, and room for its weights twice."""
-    options, device = plan.options, plan.arguments.get("policy.device")
+    options, device = plan.options, plan.settings.policy.get("device")
     parameters = parameters_of(plan.policy_path) or 0 if plan.policy_path is not None else 0
     on_gpu = device.startswith("cuda") if device else parameters >= LARGE
     needs = Needs(cores=2, memory_gb=8 + 2 * 4 * parameters // 10**9, gpus=int(on_gpu))
