@@ -195,26 +195,6 @@ def test_one_folder_holds_one_kind_of_observations(tmp_path: Path) -> None:
         vector(DRAWER, 1, tmp_path, obs_type=BOTH, horizon=1, resume=True)
 
 
-@pytest.mark.usefixtures("blind")
-def test_a_logged_episode_rests_and_the_others_are_what_they_were(tmp_path: Path) -> None:
-    settings = {"obs_type": OBJECTS, "horizon": 2, "seed_base": 20_007, "resume": True}
-
-    def roll() -> np.ndarray:
-        env = vector(DRAWER, 2, tmp_path / "log", **settings)
-        env.reset(seed=SEEDS[:2], options={"lerobot_new_rollout": True})
-        seen = [env.step(np.full((2, 7), 0.4, np.float32))[0]["environment_state"].copy() for _ in range(2)]
-        env.close()
-        return np.stack(seen)
-
-    whole = roll()
-    assert whole.any(axis=(0, 2)).all()
-    (log,) = (tmp_path / "log" / "episodes").iterdir()
-    log.write_text(log.read_text().splitlines(keepends=True)[0])
-    again = roll()
-    assert not again[:, 0].any()
-    np.testing.assert_array_equal(again[:, 1], whole[:, 1])
-
-
 def policy(kind: str, *seen: FeatureType, **more: Any) -> Any:
     """What is asked of a policy's configuration."""
     images = {"observation.images.image": None} if FeatureType.VISUAL in seen else {}

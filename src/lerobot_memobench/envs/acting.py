@@ -39,10 +39,10 @@ ELSEWHERE = (
     *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
     *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
 )
-"""Settings of a policy that say where it runs or where it goes, not what it does."""
+"""Settings of where a policy runs or is published; its actions do not depend on them."""
 
 DIGITS = 12
-"""Of a hash that tells policies apart."""
+"""Digits of the hash that identifies a policy."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class Acting:
     """Whose episodes are being run.
 
     Attributes:
-        policy: ``type``, ``identity`` and, of a checkpoint in a folder, ``sha256``; {} where nobody knows.
-        inputs: of the policy, in words; None where nobody knows.
+        policy: ``type``, ``identity`` and, of a checkpoint in a folder, ``sha256``; {} where not known.
+        inputs: of the policy, in words; None where not known.
         run: names this run of LeRobot's evaluation; a log may hold several, of one policy.
-        seeds: of the episodes that were asked for; None where nobody knows. LeRobot runs whole batches, and what it
+        seeds: of the episodes that were asked for; None where not known. LeRobot runs whole batches, and what it
             runs beyond these is no part of the evaluation.
     """
 
@@ -68,12 +68,12 @@ class Acting:
 
     @property
     def protocol(self) -> dict[str, Any]:
-        """What goes beside the log, as far as it is known."""
+        """The part of the protocol that names inputs and policy, where known."""
         return _known({INPUTS: self.inputs, POLICY: dict(self.policy) or None})
 
     @property
     def line(self) -> dict[str, Any]:
-        """What goes on every line of the log, as far as it is known."""
+        """The fields of every line of the log, where known."""
         return _known({POLICY: self.policy.get("identity"), "run": self.run, INPUTS: self.inputs})
 
 

@@ -1,4 +1,4 @@
-"""What LeRobot's command line says beside the environment: its configuration holds no policy, training or names."""
+"""Overrides and names from LeRobot's command line, and its log lines kept quiet."""
 
 from __future__ import annotations
 

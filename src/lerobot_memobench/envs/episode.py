@@ -168,7 +168,7 @@ class Episode:
             return
         self.sim.begin_execution()
         self.exec_start = self.step_index
-        # What holds already, such as a thing on the plate that it is to leave, is nobody's mistake.
+        # What holds already, such as a thing on the plate that it is to leave, is no mistake.
         self._wrong = [atom for atom in _wrong_atoms(self.task) if not self.sim.holds(atom)]
 
     @property
@@ -215,7 +215,7 @@ class Episode:
 
     @property
     def lost(self) -> bool:
-        """The goal can no longer be reached; told of strict tasks only, the published ones run to their horizon."""
+        """The goal can no longer be reached; for strict tasks only; published ones run to their horizon."""
         return self.task.suite == STRICT and self.phase == EXECUTION and self.progress.lost
 
     @property
@@ -260,7 +260,7 @@ class Episode:
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong)
 
     def _act(self, action: ArrayLike) -> Fault | None:
-        """Carry out what the policy says; return what went wrong."""
+        """Carry out the action of the policy; return the fault, if any."""
         try:
             numbers = as_action(action, np.float32)  # before it is clipped: infinity would become 1
             moved = self.pacing.step(np.clip(numbers, -1.0, 1.0))
@@ -319,7 +319,7 @@ def referent_of(task: Task, seed: int) -> Task:
     """Return the variant of a task that a random referent shows in the episode of a seed.
 
     Variants are drawn in balance: from the first seed of a split on (`protocol.SPLITS`), every run of as many seeds as
-    there are variants shows each of them once, in an order drawn anew. So each is right equally often, in a dataset as
+    there are variants shows each of them once, in a new order. So each is right equally often, in a dataset as
     in an evaluation, and which one it is says nothing about where things stand.
     """
     if task.num_variants == 1:

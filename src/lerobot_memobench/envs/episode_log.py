@@ -81,7 +81,7 @@ class Outcome(TypedDict, total=False):
         choice: where each scene is run with each variant: which one was acted on; None: none of them.
         answered: whether an answer was given; False with a choice of None: none was.
         variants: then, of the task: how many there are to choose from.
-        chance: then, of the task: the rate of right choices without the past; None where the instruction tells.
+        chance: then, of the task: the rate of right choices without the past; None where the instruction names it.
         failure: class of the failure; None for a success.
         suite: of tasks that are not published: strict.
         world: of scenes that are not the package's own: libero.
@@ -146,7 +146,7 @@ class EpisodeRecord(Outcome):
 
 
 def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, Any]:
-    """Return an episode's line for the log (`EpisodeRecord` says what its fields mean).
+    """Return an episode's line for the log (fields: `EpisodeRecord`).
 
     Args:
         number: of the episode in its evaluation, from 0 on.
@@ -376,7 +376,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
 
 
 def _check_one_policy(directory: Path, policies: Mapping[str | None, tuple[Path, Mapping[str, Any]]]) -> None:
-    """Refuse a log of several policies (identity -> a line of it and its file): its rates would be nobody's."""
+    """Refuse a log of several policies (identity -> a line of it and its file): rates would mix them."""
     known = [(name, *place) for name, place in policies.items() if name is not None]
     if len(known) > 1:
         told = " and ".join(f"{name} ({record['task']}, in {file.name})" for name, file, record in known[:2])
@@ -433,7 +433,7 @@ UNTOLD: dict[str, Any] = {
 """Values of settings that a protocol leaves out: there were no others when it was written. ``render_every`` is a
 setting of earlier versions: control steps per drawn picture."""
 INPUTS = "inputs"
-"""Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote them down."""
+"""Inputs of the policy, in the words of `observations.policy_inputs`; absent in logs from before they were recorded."""
 OF_THE_POLICY = ("prompt_in", INPUTS)
 """Settings that follow from the policy: evaluations of two policies may differ in them, which is told, parts of one may
 not."""

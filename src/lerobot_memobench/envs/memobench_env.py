@@ -200,7 +200,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._log is None and self._not_run is None and (fault := self.episode.fault) is not None:
             raise MemobenchError(f"the episode has ended ({fault.why}); begin another by reset()")
         if self._not_run is None:
-            # A dataset's labels count what was completed before a frame; what this step completes is told one later.
+            # A dataset's labels count checkpoints before a frame; those of this step count one frame later.
             completed = self.episode.progress.index
             with self._noting():
                 self.episode.step(action)
@@ -240,7 +240,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @contextmanager
     def _noting(self) -> Iterator[None]:
-        """Note why an episode cannot be run, where there is a log to say it in."""
+        """Note the reason why an episode cannot be run, if it is logged; else raise."""
         try:
             yield
         except MemobenchError as error:
@@ -342,7 +342,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observer.frame(self.episode) if self._not_run is None else _black()
 
     def close(self) -> None:
-        """Let the scene go; the next reset compiles or fetches it anew. Closing twice does no harm."""
+        """Let the scene go; the next reset compiles or fetches it again. It may be closed twice."""
         self._discard_video()
         self._episode = None
         self._began, self._closed = False, True
@@ -354,7 +354,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment whose logged episodes end at their first step, as the log says, without being simulated.
+    """An environment whose logged episodes end at their first step with the logged outcome, without being simulated.
 
     The batch keeps its size and every other row its place, so a policy gives the rows that do run the actions that it
     would have given them in an undisturbed evaluation. Observations of a skipped episode are blank.
@@ -379,7 +379,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         return blank(self.observation_space), self._info(False)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Advance, or end as the log says."""
+        """Advance, or end with the logged outcome."""
         if self._skipped is None:
             return self.env.step(action)
         success = self._skipped["success"]

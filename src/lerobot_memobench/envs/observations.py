@@ -91,12 +91,12 @@ def check_obs_type(policy: Any, obs_type: str) -> None:
 
 
 def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
-    """Return a policy's inputs beside the arm's state in words; all of ``obs_type`` where they are not known.
+    """Return a policy's inputs in words, apart from the arm's state; all of ``obs_type`` where they are not known.
 
     Args:
         policy: its configuration, or the class of it. One that names its ``inputs`` is taken at its word.
         obs_type: the environment's.
-        oracle_memory: whether the instruction tells what was done so far.
+        oracle_memory: whether the instruction ends with the completed checkpoints.
     """
     found = getattr(policy, "inputs", None)
     if not isinstance(found, tuple):

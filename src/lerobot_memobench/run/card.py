@@ -97,7 +97,7 @@ class TrainConfig(TypedDict):
 
 
 def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
-    """Return what identifies a policy beside its weights: its configuration as LeRobot encodes it, the run's seed.
+    """Return what identifies a policy apart from its weights: its configuration as LeRobot encodes it, the run's seed.
 
     Of a detector, which is no part of its checkpoint, also the hash.
 
@@ -181,7 +181,7 @@ def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool =
     """Return a card for both of two runs of one evaluation: extent, episodes, runs and tasks' hashes of both.
 
     Args:
-        again: whether an equal run is one more start, or the same start told twice.
+        again: whether an equal run is one more start, or the same start read twice.
     """
     a, b = card["protocol"], other["protocol"]
     extent = {"tasks": sorted({*a["tasks"], *b["tasks"]}), "episodes": max(a["episodes"], b["episodes"])}

@@ -102,7 +102,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
 
 
 def _joined_settings(protocols: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the settings that the protocols tell, those of the first before all others."""
+    """Return the settings of all protocols; the first one that names a setting counts."""
     joined: dict[str, Any] = {}
     for protocol in protocols:
         joined = {**protocol, **joined}

@@ -193,7 +193,7 @@ def check_split(plan: EvaluationPlan) -> None:
     """Refuse seeds outside the split that was named, and the sealed ones where it was not.
 
     Raises:
-        MemobenchError: they are, with what to say instead.
+        MemobenchError: they are.
     """
     asked, seeds, sealed = plan.options.split, plan.seeds, SPLITS[SEALED]
     if asked is not None and plan.split != asked:
@@ -418,13 +418,13 @@ def check_observations(policy: PreTrainedConfig | None, environment: EnvConfig |
 
 
 def check_memory_reads(policy: Any) -> None:
-    """Refuse to note what a policy reads that does not tell it.
+    """Refuse ``memory_reads`` for a policy that does not report its reads.
 
     Args:
         policy: it, or its configuration.
 
     Raises:
-        MemobenchError: it is none of ours, or has no memory that tells it.
+        MemobenchError: the policy has no memory that reports its reads.
     """
     config = getattr(policy, "config", policy)
     if not hasattr(config, "check_memory_reads"):
@@ -444,7 +444,7 @@ class RunOptions:
 
     Attributes:
         split: whose seeds are run, one of `EVALUATED`; None: those that `seed=` says.
-        memory_reads: how much each chunk reads of what the policy remembers is written beside the log.
+        memory_reads: write how much each chunk reads of each remembered frame next to the log.
         resume: go on with the evaluation in the output folder.
         shard: run this part alone.
         shards: run so many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.

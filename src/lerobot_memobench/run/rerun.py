@@ -86,7 +86,7 @@ def repeat(
         out: folder of the repetition, a dated one when None.
         server: see `repeatable_card`.
         evaluate: runs the plan and returns its exit status.
-        say: told what differs here, and what was found.
+        say: called with differences of this machine, and with the result.
 
     Raises:
         MemobenchError: the card cannot be repeated here.
@@ -184,7 +184,7 @@ def check_policy(card: Mapping[str, Any]) -> None:
     """Refuse to repeat an evaluation with another policy.
 
     Raises:
-        MemobenchError: the checkpoint is another one, or nobody knows which it was.
+        MemobenchError: the checkpoint is another one, or the card does not identify it.
     """
     given = card["asked"].policy_path
     if given is None:

@@ -63,7 +63,7 @@ def run_evaluation(
 
     Args:
         tell: told what matters and stops nothing, and how to go on when a run breaks off.
-        begin: told what is about to be run: the first episode takes a while.
+        begin: called with a line on the evaluation before it starts.
         advance: see `evaluate.Advance`.
 
     Raises:
