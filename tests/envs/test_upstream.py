@@ -53,7 +53,7 @@ def test_an_episode_ends_when_all_checkpoints_have_held_there_alone() -> None:
     never, at_once = OPEN, SHUT
     theirs = rested(drawer(never, at_once), "upstream")
     assert (theirs.exec_steps, theirs.success, theirs.closed) == (1, False, True)
-    assert episode_record(theirs, 0, None, 0.1)["failure"] == "execution_failure"
+    assert episode_record(theirs, 0, 0.1)["failure"] == "execution_failure"
     ours = rested(drawer(never, at_once), "paper", horizon=3)
     assert (ours.exec_steps, ours.closed) == (3, False)
 
