@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -183,6 +184,10 @@ def test_files_of_earlier_versions_are_read_as_one(tmp_path: Path) -> None:
     (tmp_path / EARLIER_PROTOCOL).write_text(json.dumps({"horizon": 5, "render_every": 8}))
     with pytest.raises(MemobenchError, match="render_every: 8 and 1"):
         check_protocol(tmp_path, EnvSettings(horizon=5).protocol_block)
+    card_file = tmp_path / EARLIER_CARD
+    card_file.with_name(f"{EARLIER_CARD}.gz").write_bytes(gzip.compress(card_file.read_bytes()))
+    card_file.unlink()
+    assert read_evaluation(card_file) == card
     write_protocol(tmp_path / "new", EnvSettings().protocol_block)
     assert read_evaluation(tmp_path / "new")["format"] == 2
 
@@ -199,7 +204,7 @@ def test_a_damaged_file_is_named(tmp_path: Path, name: str, text: str) -> None:
 
 
 def test_an_absent_file_is_an_empty_one_unless_all_of_it_is_needed(tmp_path: Path) -> None:
-    assert read_evaluation(tmp_path) == protocol_of(tmp_path) == {}
+    assert read_evaluation(tmp_path) == protocol_of(tmp_path) == protocol_of(tmp_path / "new") == {}
     with pytest.raises(MemobenchError, match="missing"):
         read_evaluation(tmp_path, whole=True)
     with pytest.raises(MemobenchError, match="missing"):

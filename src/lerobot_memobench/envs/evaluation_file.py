@@ -282,9 +282,9 @@ def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
     Raises:
         MemobenchError: it is missing or has another form.
     """
-    schema, folder = WholeCard if whole else Card, not place.is_file()
-    file = place / EVALUATION_FILE if folder else place
-    if folder and not is_there(file) and (not whole or is_there(place / EARLIER_CARD)):
+    schema = WholeCard if whole else Card
+    file = place if is_there(place) else place / EVALUATION_FILE
+    if not is_there(file) and (not whole or is_there(place / EARLIER_CARD)):
         return _earlier(place, schema)
     advice = "expected an evaluation's file as `lerobot eval` writes it"
     try:
