@@ -35,6 +35,8 @@ PROMPT_IN = (AUTO, STEPS, RESET)
 its configuration: it waits while `observation.phase` is 0 and discards planned actions when it becomes 1. For any other
 policy the prompt plays within `reset`. ``auto`` chooses by the policy; where no policy is known, it means ``steps``."""
 
+REFERENT_VALUES = (*REFERENTS, DRAWN)
+"""Values of ``referent``; the last one is that of strict tasks alone."""
 QUALITIES = ("fast", "default", "high")
 EVERY = -1
 """Value of ``videos``: record every episode."""
@@ -87,7 +89,9 @@ class EnvSettings:
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
     obs_type: str = setting(PIXELS, "observations besides the arm's state: pictures, object slots, or both", OBS_TYPES)
-    referent: str = setting("fixed", "the published goals, or drawn by seed; strict tasks are always drawn")
+    referent: str = setting(
+        "fixed", "the published goals, or drawn by seed; strict tasks are always drawn", REFERENT_VALUES
+    )
     demonstration_prompt: bool = setting(True, "object and procedural tasks begin with their demonstration prompt")
     prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or within reset", PROMPT_IN)
     horizon: int = setting(HORIZON, "execution steps per episode", least=1)
@@ -104,15 +108,15 @@ class EnvSettings:
     def __post_init__(self) -> None:
         for each in fields(self):
             self._check(each.name, str(each.type), each.metadata)
-        referents = (*REFERENTS, DRAWN) if self.suite == STRICT else REFERENTS
-        check_choice("referent", self.referent, referents)
-        check_world("", self.world, self.suite)
+        if self.referent == DRAWN and self.suite != STRICT:
+            check_choice("referent", self.referent, REFERENTS)
         if abs(steps_per_action(self.speed) * self.speed - 1) > 0.02 or not 1 / SLOWEST <= self.speed <= 1:
             raise MemobenchError(
                 f"speed is {self.speed!r}; expected 1, 0.5, 0.33, 0.25 and so on down to {1 / SLOWEST}: an action "
                 "takes a whole number of control steps"
             )
         if self.suite == STRICT:
+            check_world("", self.world, self.suite)
             self._set(referent=DRAWN)
         if self.protocol == UPSTREAM:
             self._follow_upstream()
@@ -132,7 +136,7 @@ class EnvSettings:
                 raise MemobenchError(f"{name} is {value!r}; expected a number above 0")
         elif kind == "bool" and not isinstance(value, bool | np.bool_):
             raise MemobenchError(f"{name} is {value!r}; expected true or false")
-        elif accepted["values"]:
+        elif accepted["values"] and value not in accepted["values"]:
             check_choice(name, value, accepted["values"])
 
     def _follow_upstream(self) -> None:
