@@ -34,7 +34,7 @@ def ours(images: bool, logs: str) -> dict[str, Callable[[Any], Any]]:
     if not images:
         side = Ours(TASK, images=False)
         return {"step": side.step, "reset": side.reset}
-    config = MemobenchEnvConfig(task=TASK, demonstration_prompt=False, log_dir=logs)
+    config = MemobenchEnvConfig(tasks=TASK, demonstration_prompt=False, log_dir=logs)
     [suite] = config.create_envs(1).values()
     [env] = suite.values()
     env.reset(seed=[0])

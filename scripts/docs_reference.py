@@ -8,6 +8,7 @@ Cheap: no simulator is opened. Configurations are read from their source, so tor
 from __future__ import annotations
 
 import ast
+import dataclasses
 import html
 import inspect
 import io
@@ -122,7 +123,12 @@ def lerobot_page() -> str:
 
 
 def environment_fields() -> Iterator[tuple[str, str, str]]:
-    """Yield name, default and meaning of the environment's settings, from its class's docstring."""
+    """Yield name, default and meaning of the environment's settings."""
+    from lerobot_memobench.envs.settings import EnvSettings
+
+    for each in dataclasses.fields(EnvSettings):
+        values = f" ({', '.join(code(value) for value in each.metadata['values'])})" if each.metadata["values"] else ""
+        yield each.name, repr(each.default), f"{each.metadata['meaning']}{values}"
     tree = class_of(SOURCE / "envs" / "configuration_memobench.py", "MemobenchEnvConfig")
     says = arguments(ast.get_docstring(tree) or "")
     for node in tree.body:
@@ -191,9 +197,12 @@ def spaces_page() -> str:
     from lerobot_memobench import protocol
     from lerobot_memobench.datasets.lerobot_format.layout import ACTION_NAMES, PROPRIO_NAMES
     from lerobot_memobench.envs import observations
+    from lerobot_memobench.envs.pacing import longest
+    from lerobot_memobench.envs.settings import BOTH, EnvSettings
     from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS
 
-    space = observations.observation_space(True, 2, observations.BOTH, True)
+    asked = EnvSettings(obs_type=BOTH, expert_action=True, blind_action=True)
+    space = observations.observation_space(asked, longest(asked))
     units = {
         "pixels/image": "third-person camera, RGB, upright",
         "pixels/wrist_image": "wrist camera, RGB, upright",
@@ -201,11 +210,10 @@ def spaces_page() -> str:
         "phase": "0 demonstration prompt, or the robot idles; 1 execution",
         "step": "control steps since the phase began; of strict tasks since the episode began",
         "environment_state": f"{SLOTS} object slots, with `env.obs_type` of that name or `both`",
-        "picture_age": "control steps since the pictures were drawn; with `env.render_every` above 1",
         "expert_action": "the scripted expert's; with `env.expert_action=true`",
         "blind_action": "the published routine's; with `env.blind_action=true`",
     }
-    at_policy = observations.policy_names(observations.BOTH)
+    at_policy = observations.policy_names(BOTH)
     rows = []
     for name, part in sorted(flat(space), key=lambda leaf: [*units].index(leaf[0])):
         there = at_policy.get(name, f"observation.{name}")
@@ -281,20 +289,19 @@ def dataset_page() -> str:
 
 def schemas_page() -> str:
     """Return the page of log, protocol and card, from the types by which they are read."""
-    from lerobot_memobench.envs import episode_log
-    from lerobot_memobench.evaluation import records
+    from lerobot_memobench.envs import episode_log, evaluation_file
 
     wanted = [
         ("episodes.jsonl: one line per rollout", episode_log.EpisodeRecord),
         ("Checkpoints of a line", episode_log.CheckpointRecord),
-        ("protocol.json", episode_log.WholeProtocol),
-        ("card.json", records.WholeCard),
-        ("Policy of a card", records.Policy),
-        ("Checkpoint of a card", records.Checkpoint),
-        ("One start", records.Start),
-        ("Runs of the sealed test", records.SealedRun),
-        ("A run before it", records.SealedStart),
-        ("Episodes of a card", records.CardEpisode),
+        ("evaluation.json", evaluation_file.WholeCard),
+        ("Its protocol", evaluation_file.WholeProtocol),
+        ("Policy of a card", evaluation_file.Policy),
+        ("Checkpoint of a card", evaluation_file.Checkpoint),
+        ("One start", evaluation_file.Start),
+        ("Runs of the sealed test", evaluation_file.SealedRun),
+        ("A run before it", evaluation_file.SealedStart),
+        ("Episodes of a card", evaluation_file.CardEpisode),
     ]
     parts = [
         "# Log and card schemas",
@@ -319,11 +326,23 @@ def typed_rows(kind: Any) -> list[list[str]]:
     ]
 
 
+OF_A_PROTOCOL = {
+    "idle": "control steps that the robot of a strict task idles at most before the execution",
+    "goals": "revision of the goals of strict tasks",
+    "inputs": "of the policy",
+}
+"""Keys of a protocol besides the environment's settings."""
+
+
 def meanings(kind: Any) -> dict[str, str]:
     """Return field -> meaning from the docstrings of a `TypedDict` and of those that it extends."""
     found: dict[str, str] = {}
     for base in getattr(kind, "__orig_bases__", ()):
         found |= meanings(base)
+    if "horizon" in kind.__annotations__:
+        from lerobot_memobench.envs.settings import EnvSettings
+
+        found |= {each.name: each.metadata["meaning"] for each in dataclasses.fields(EnvSettings)} | OF_A_PROTOCOL
     return found | arguments(inspect.getdoc(kind) or "")
 
 

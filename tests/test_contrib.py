@@ -111,7 +111,7 @@ def test_descriptions_are_keyed_as_lerobots_videos() -> None:
     scope: dict[str, Any] = {}
     exec(compile(function, "patch", "exec"), scope)
     task = smoke()["env"]["MEMOBENCH_TASK"]
-    ((suite, number, folder),) = MemobenchEnvConfig(task=task).selected()
+    ((suite, number, folder),) = MemobenchEnvConfig(tasks=task).selected()
     assert scope["_memobench_descriptions"](task) == {f"{suite}_{number}": load_task(folder).language}
 
 
@@ -177,5 +177,5 @@ def test_lerobots_hub_loader_makes_the_environments(
     assert "stove" in env.call("task_description")[0]
     module = env_utils._load_module_from_path(str(OURS / "envhub" / "env.py"))
     of_class = type("Cfg", (), {"task": "object"})()
-    for cfg in (SimpleNamespace(task="object", fps=30, hub_path="x"), MemobenchEnvConfig(task="object"), of_class):
+    for cfg in (SimpleNamespace(task="object", fps=30, hub_path="x"), MemobenchEnvConfig(tasks="object"), of_class):
         assert {suite: [*tasks] for suite, tasks in module.make_env(1, cfg=cfg).items()} == {"object": [*range(20, 25)]}

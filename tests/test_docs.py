@@ -21,13 +21,19 @@ import typer
 from PIL import Image
 
 from lerobot_memobench.cli import memobench
-from lerobot_memobench.envs import episode_log
+from lerobot_memobench.envs import episode_log, evaluation_file
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation import records
 from lerobot_memobench.evaluation.metrics import Rate
 from lerobot_memobench.policies.memobench_mem.memory import OURS
-from lerobot_memobench.run.arguments import joined, read_arguments, resolve_recipe, split_arguments
+from lerobot_memobench.run.arguments import (
+    is_of_benchmark,
+    joined,
+    read_arguments,
+    resolve_recipe,
+    split_arguments,
+)
 from lerobot_memobench.run.plan import take_run_options
+from lerobot_memobench.run.settings import read_settings
 from lerobot_memobench.run.training import take_training_options
 from tests.support.logs import rollout
 from tests.support.scripts import load_script
@@ -320,9 +326,10 @@ def check_lerobot(command: str, line: list[str]) -> None:
     stand_in = {"policy": "policy=memobench_mem", "dataset": "dataset.root=outputs"}
     pairs = [stand_in[key] if (key := word.partition("=")[0]) in stand_in and is_place(word) else word for word in line]
     given = split_arguments(pairs)
-    if command == "eval":
-        given = take_run_options(given)[1]
-    else:
+    if command == "eval" and is_of_benchmark(given):
+        read_settings(take_run_options(given)[1])
+        return
+    if command == "train":
         given = take_training_options(resolve_recipe(given))[-1]
     read_arguments(command, given)
 
@@ -432,9 +439,9 @@ def test_every_field_of_the_log_is_explained() -> None:
     for kind in (
         episode_log.EpisodeRecord,
         episode_log.CheckpointRecord,
-        episode_log.WholeProtocol,
-        records.WholeCard,
-        records.CardEpisode,
+        evaluation_file.WholeProtocol,
+        evaluation_file.WholeCard,
+        evaluation_file.CardEpisode,
     ):
         assert all(says for _, says, _ in reference.typed_rows(kind)), kind
     rows = reference.typed_rows(episode_log.EpisodeRecord)

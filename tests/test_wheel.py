@@ -127,5 +127,5 @@ def test_a_bare_environment(wheel: Path, tmp_path: Path) -> None:
     assert {name for name in names if "opencv" in name} == {"opencv-python-headless"}
     done = run("lerobot", "eval", "env=memobench", "tasks=open_and_close_the_microwave", "episodes=1", "output_dir=out")
     assert done.returncode == 0, done.stdout + done.stderr
-    card = json.loads((tmp_path / "out" / "card.json").read_text())
+    card = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert [episode["success"] for episode in card["episodes"]] == [True]

@@ -187,15 +187,15 @@ class Cell:
         Raises:
             MemobenchError: an unknown setting or value, named with the nearest known one.
         """
-        from lerobot_memobench.run.arguments import read_arguments
         from lerobot_memobench.run.plan import take_run_options
+        from lerobot_memobench.run.settings import read_settings
 
         words = self.training_words()
         check_training(words)
         for part in self.parts:
             told = [word for word in self.evaluation_words(part)[2:] if not word.startswith(("env=", "policy="))]
             given = ["env=memobench", f"policy={word_of(words, 'policy')}", *told]
-            read_arguments("eval", take_run_options(split_arguments(given))[1])
+            read_settings(take_run_options(split_arguments(given))[1])
 
     def training_words(self) -> list[str]:
         """Return the command that trains its policy."""

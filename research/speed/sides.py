@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.observations import METADATA, action_space, observation_space
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ
@@ -110,7 +111,7 @@ class Vectored:
         from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 
         self._logs = TemporaryDirectory()
-        config = MemobenchEnvConfig(task=task, demonstration_prompt=False, log_dir=self._logs.name)
+        config = MemobenchEnvConfig(tasks=task, demonstration_prompt=False, log_dir=self._logs.name)
         [suite] = config.create_envs(1).values()
         self.env: Any  # gymnasium's stub of a vector environment knows no list of seeds
         [self.env] = suite.values()
@@ -305,7 +306,7 @@ class StockEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def __init__(self, stock: Any, steps: int) -> None:
         self.render_mode, self._stock, self._max_episode_steps = "rgb_array", stock, steps
-        self.observation_space, self.action_space = observation_space(False), action_space()
+        self.observation_space, self.action_space = observation_space(EnvSettings(), steps), action_space()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

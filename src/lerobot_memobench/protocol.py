@@ -9,7 +9,7 @@ CONTROL_HZ = 20
 HORIZON = 1200
 """Control steps of an execution before an episode is cut off."""
 PROTOCOLS = BY_PAPER, UPSTREAM = ("paper", "upstream")
-"""Whose evaluation it is: the paper's text, or the script that its authors published (`envs.upstream`)."""
+"""Whose evaluation it is: the paper's text, or the script that its authors published (`envs.settings`)."""
 UPSTREAM_HORIZON = 990
 """Control steps of an execution there: LIBERO's simulator ends after 1,000, of which 10 are the stabilisation's."""
 UPSTREAM_EVALUATIONS = 2

@@ -7,8 +7,3 @@ import lerobot_memobench.envs.configuration_memobench
 import lerobot_memobench.policies.baselines.configuration_baselines
 import lerobot_memobench.policies.memobench_mem.configuration_memobench_mem
 import lerobot_memobench.policies.remote.configuration_remote  # noqa: F401
-from lerobot_memobench.envs.configuration_memobench import PATH_CHECKS, POLICY_CHECKS
-from lerobot_memobench.policies.compatibility import check_policy, refuse_short_name
-
-POLICY_CHECKS.append(check_policy)
-PATH_CHECKS.append(refuse_short_name)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,14 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.acting import Acting
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import check_protocol
+from lerobot_memobench.envs.evaluation_file import check_protocol
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import PIXEL_INPUT, RESET, STEPS, check_counts
+from lerobot_memobench.envs.observations import PIXEL_INPUT
 from lerobot_memobench.envs.pacing import longest
+from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
-from lerobot_memobench.protocol import ACTION_DIM, BY_PAPER, CAMERAS, EVALUATION_SEED, HORIZON, PROMPT, SEALED, SPLITS
-from lerobot_memobench.tasks.task import MEMOBENCH, PUBLISHED
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
 
 try:
     from vla_eval.benchmarks.base import StepBenchmark, StepResult
@@ -45,7 +46,14 @@ logger = logging.getLogger(__name__)
 NAMES = {"image": ("agentview", "video_history"), "wrist_image": ("wrist", "wrist_video_history")}
 """Our name of a camera -> the harness's names of its picture and of its part of the demonstration prompt."""
 STATES, STATE_HISTORY, STEP = "states", "state_history", "step"
-SUCCESS = "success"
+SUCCESS, STEPS_KEY = "success", "n_action_steps"
+DECIDED = {
+    "seed_base": "seed",
+    "replan_steps": STEPS_KEY,
+    "prompt_in": "send_video_history",
+    "obs_type": "send_state and send_wrist_image",
+}
+"""Settings of `EnvSettings` that follow from an argument."""
 
 
 class MEMOBench(StepBenchmark):
@@ -65,26 +73,18 @@ class MEMOBench(StepBenchmark):
 
     Args:
         tasks: `all`, memory types, task names or their numbers, separated by commas or as a list.
-        suite: `published` or `strict`.
-        world: `memobench` or `libero`, as of `MemobenchEnvConfig`.
-        protocol: `paper` or `upstream`, as of `MemobenchEnvConfig`.
-        referent: `fixed` or `random`.
         seed: of episode 0.
-        horizon: control steps of an execution. A ``max_steps`` of the harness that is lower ends episodes unlogged.
-        demonstration_prompt: whether object and procedural tasks begin with their demonstration prompt.
-        pause_steps: control, as of `MemobenchEnvConfig`. A pause begins and ends between two answers.
-        speed: control, as of `MemobenchEnvConfig`.
-        evidence: control, as of `MemobenchEnvConfig`.
         history_every: steps between the frames of the prompt that are sent.
-        n_action_steps: actions executed of each answer, open-loop.
+        n_action_steps: actions executed of each answer, open-loop. A pause begins and ends between two answers.
         send_wrist_image: whether that picture is sent; of this and the next two the harness takes a model server's
-            wish where they are not set.
-        send_state: whether the state is.
+            wish from its greeting.
+        send_state: whether the arm's state is.
         send_video_history: whether the prompt is.
         mirror: send pictures mirrored left to right, as the harness's LIBERO does.
-        render: quality of the pictures: `fast`, `default` or `high`.
         log_dir: folder of the episode log, which ``memobench report`` reads; none is written when None.
         label: what the model server serves, in your words, for the log.
+        settings: others of `EnvSettings` by name, such as ``suite``, ``referent``, ``horizon`` or ``evidence``. A
+            ``max_steps`` of the harness that is lower than the horizon ends episodes unlogged.
     """
 
     _ALL_RECORD_FIELDS = frozenset({"reward", SUCCESS, "checkpoints_completed", "action", "state"})
@@ -98,62 +98,48 @@ class MEMOBench(StepBenchmark):
     def __init__(
         self,
         tasks: str | int | Sequence[str | int] = "all",
-        suite: str = PUBLISHED,
-        world: str = MEMOBENCH,
-        protocol: str = BY_PAPER,
-        referent: str = "fixed",
+        *,
         seed: int = EVALUATION_SEED,
-        horizon: int = HORIZON,
-        demonstration_prompt: bool = True,
-        pause_steps: int = 0,
-        speed: float = 1.0,
-        evidence: bool = False,
         history_every: int = 1,
         n_action_steps: int = 1,
         send_wrist_image: bool = True,
         send_state: bool = True,
         send_video_history: bool = True,
         mirror: bool = False,
-        render: str = "default",
         log_dir: str | None = None,
         label: str | None = None,
+        **settings: Any,
     ) -> None:
         super().__init__()
-        check_counts(history_every=history_every, n_action_steps=n_action_steps)
-        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            raise MemobenchError(f"seed is {seed!r}; expected a whole number from 0 on")
+        for name, number, least in (
+            ("seed", seed, 0),
+            ("history_every", history_every, 1),
+            (STEPS_KEY, n_action_steps, 1),
+        ):
+            if isinstance(number, bool) or not isinstance(number, int) or number < least:
+                raise MemobenchError(f"{name} is {number!r}; expected a whole number from {least} on")
         if seed in SPLITS[SEALED]:
             raise MemobenchError(
                 f"seed {seed} is of the sealed test, whose runs are counted: `memobench test-sealed "
                 "policy=memobench_remote dialect=vla_eval` runs it with your model server"
             )
-        self._config = MemobenchEnvConfig(
-            tasks=str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks)),
-            suite=suite,
-            world=world,
-            protocol=protocol,
-            referent=referent,
-            seed_base=seed,
-            horizon=horizon,
-            demonstration_prompt=demonstration_prompt,
-            pause_steps=pause_steps,
-            speed=speed,
-            evidence=evidence,
-            render=render,
-            replan_steps=n_action_steps,
+        prompt_in = STEPS if send_video_history else RESET
+        for name in DECIDED.keys() & settings.keys():
+            raise MemobenchError(f"{name} is {settings[name]!r}; this benchmark decides it, use {DECIDED[name]}")
+        self._settings = EnvSettings().changed(
+            **settings, seed_base=seed, replan_steps=n_action_steps, prompt_in=prompt_in
         )
-        self._tasks = {folder.name: (memory_type, folder) for memory_type, _, folder in self._config.selected()}
+        chosen = str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks))
+        selected = MemobenchEnvConfig(tasks=chosen, **asdict(self._settings)).selected()
+        self._tasks = {folder.name: (memory_type, folder) for memory_type, _, folder in selected}
         self._cameras = [name for name in CAMERAS if send_wrist_image or name != "wrist_image"]
         self._send_state, self._mirror = send_state, mirror
         self._history_every, self._n_action_steps = history_every, n_action_steps
         self._log_dir = log_dir
         policy = {} if label is None else {"type": "vla_eval", "identity": f"vla_eval {label}"}
         self._acting = Acting(policy, PIXEL_INPUT)
-        self._prompt_in = STEPS if send_video_history else RESET
         if log_dir is not None:  # now, not when the first episode has been simulated
-            check_protocol(
-                Path(log_dir), {**self._config.agreed_settings, "prompt_in": self._prompt_in, **self._acting.protocol}
-            )
+            check_protocol(Path(log_dir), self._settings.protocol_block | self._acting.protocol)
         self._env: MemobenchEnv | None = None
         self._history: dict[str, list[NDArray[Any]]] = {}
 
@@ -170,7 +156,7 @@ class MEMOBench(StepBenchmark):
         if self._env is None or self._env.task != task["name"]:
             self.cleanup()
             self._env = self._make(self._tasks[task["name"]][1])
-        observation, info = self._env.reset(seed=self._config.seed_base + int(task.get("episode_idx", 0)))
+        observation, info = self._env.reset(seed=self._settings.seed_base + int(task.get("episode_idx", 0)))
         self._history = {}
         while "fault" not in info and observation["phase"][0] == PROMPT:
             step, shows = int(observation[STEP][0]), not self._env.episode.idling
@@ -193,13 +179,7 @@ class MEMOBench(StepBenchmark):
             self._history.setdefault(STATE_HISTORY, []).append(observation["agent_pos"])
 
     def _make(self, folder: Path) -> MemobenchEnv:
-        return MemobenchEnv(
-            str(folder),
-            log_dir=self._log_dir,
-            prompt_in=self._prompt_in,
-            acting=self._acting,
-            **self._config.gym_kwargs,
-        )
+        return MemobenchEnv(str(folder), self._settings, log_dir=self._log_dir, acting=self._acting)
 
     def step(self, action: dict[str, Any]) -> StepResult:
         """Execute the first actions of an answer, up to the episode's end.
@@ -265,9 +245,8 @@ class MEMOBench(StepBenchmark):
 
     def get_metadata(self) -> dict[str, Any]:
         """Return the harness's bound of steps, the horizon with all pauses, and suite, world and protocol."""
-        config = self._config
-        most = longest(config.horizon, config.pause_steps, config.speed, self._n_action_steps)
-        return {"max_steps": most, "suite": config.suite, "world": config.world, "protocol": config.protocol}
+        own = self._settings
+        return {"max_steps": longest(own), "suite": own.suite, "world": own.world, "protocol": own.protocol}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """Return the conventions of an action."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
+from lerobot_memobench.envs.evaluation_file import write_protocol
 from lerobot_memobench.run.plan import Cell, EvaluationPlan
 from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.tasks.task import Task
@@ -44,7 +46,7 @@ class FakeLoop:
         self.cells.append(cells)
         begin()
         self.before(plan)
-        log = EpisodeLog(plan.log, plan.environment.agreed_settings)
+        log = EpisodeLog(plan.log, partial(write_protocol, plan.log, plan.environment.settings.protocol_block))
         logged = read_episodes(plan.log) if has_log(plan.log) else []
         skipped = {(record["task"], record["episode"]) for record in logged}
         for cell in cells:
@@ -60,9 +62,10 @@ class FakeLoop:
             advance(len(self.ran), len(self.ran), cell[0].name)
 
     def value(self, key: str) -> str | None:
-        """Return what the last plan says of one of LeRobot's settings."""
+        """Return a setting of the last plan, by LeRobot's key, as text."""
         plan = self.plans[-1]
-        return {"output_dir": str(plan.output), "env.log_dir": str(plan.log)}.get(key, plan.arguments.get(key))
+        words = dict(word.removeprefix("--").split("=", 1) for word in plan.settings.words)
+        return {"output_dir": str(plan.output), "env.log_dir": str(plan.log)}.get(key, words.get(key))
 
     def record(self, task: Task, episode: int, seed: int) -> dict[str, Any]:
         return {
@@ -89,7 +92,8 @@ def fake_loop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLoop:
     """The loop is replaced, and the present folder is an empty one."""
     import lerobot_policy_memobench  # noqa: F401 - what LeRobot would find by looking through all that is installed
 
-    monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
+    for module in ("arguments", "settings"):
+        monkeypatch.setattr(f"lerobot_memobench.run.{module}.register_plugins", lambda: None)
     monkeypatch.chdir(tmp_path)
     fake = FakeLoop()
     monkeypatch.setattr("lerobot_memobench.run.run.evaluate", fake)

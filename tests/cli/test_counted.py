@@ -11,7 +11,7 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.sealed import RUN_FILE, user_ledger
+from lerobot_memobench.run.sealed import user_ledger
 
 COMMAND = ["test-sealed", "policy=memobench_random", "tasks=turn_on_the_stove_and_turn_it_off", "episodes=2"]
 
@@ -26,7 +26,7 @@ def lines() -> int:
 
 
 def number(folder: str) -> int:
-    found: int = json.loads(Path(folder, "card.json").read_text())["sealed"]["run"]
+    found: int = json.loads(Path(folder, "evaluation.json").read_text())["sealed"]["run"]
     return found
 
 
@@ -56,7 +56,7 @@ def test_going_on_is_the_same_start_and_running_again_another(fake_loop: Any) ->
     assert main([*COMMAND, "output_dir=a"]) == 0
     assert (lines(), number("a")) == (2, 2)
     Path("c").mkdir()
-    shutil.copy(Path("a", RUN_FILE), "c")
+    shutil.copy("a/evaluation.json", "c")
     assert main([*COMMAND, "output_dir=c"]) == 0
     assert (lines(), number("c")) == (3, 3)
     assert main([*COMMAND, "output_dir=e", "policy.seed=7"]) == 0

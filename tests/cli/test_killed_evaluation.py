@@ -122,8 +122,8 @@ def test_killed_and_gone_on_with(server: ForkServer, tmp_path: Path, settings: l
     report = json.loads((killed / "report.json").read_text())
     assert report == json.loads((undisturbed / "report.json").read_text())
     assert (
-        json.loads((killed / "card.json").read_text())["episodes"]
-        == json.loads((undisturbed / "card.json").read_text())["episodes"]
+        json.loads((killed / "evaluation.json").read_text())["episodes"]
+        == json.loads((undisturbed / "evaluation.json").read_text())["episodes"]
     )
     assert not [path for path in killed.rglob("*") if path.name.endswith(".part")]
 

@@ -140,38 +140,6 @@ def test_an_unknown_command_names_the_nearest(capsys: pytest.CaptureFixture[str]
 # --- eval ---
 
 
-def test_eval_needs_nothing_but_the_environment(evaluation: Any) -> None:
-    assert main(["eval", "env=memobench"]) == 0
-    assert evaluation.value("env.type") == "memobench"
-    assert evaluation.value("policy.type") == "memobench_expert"
-    assert evaluation.value("env.expert_action") == "true"
-    assert evaluation.value("seed") == "7"
-    assert evaluation.value("eval.n_episodes") == "50"
-    assert 50 % int(evaluation.value("eval.batch_size") or 0) == 0
-    output = evaluation.value("output_dir")
-    assert output is not None
-    assert output.startswith("outputs/eval/")
-    assert output.endswith("_memobench_memobench_expert")
-    assert evaluation.value("env.log_dir") == output
-
-
-def test_what_the_user_sets_stays(evaluation: Any) -> None:
-    words = ["eval", "env=memobench", f"tasks={TASK}", "episodes=7", "seed=3", "output_dir=out", "batch_size=7"]
-    assert main([*words, "--env.log_dir=log", "--policy.type=memobench_expert"]) == 0
-    assert evaluation.value("seed") == "3"
-    assert evaluation.value("eval.batch_size") == "7"
-    assert evaluation.value("env.log_dir") == "log"
-    assert evaluation.value("env.expert_action") == "true"
-
-
-def test_the_batch_divides_the_episodes(evaluation: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lerobot_memobench.run.plan.cores", lambda: 16)
-    assert main(["eval", "env=memobench", "episodes=9"]) == 0
-    assert evaluation.value("eval.batch_size") == "9"
-    assert main(["eval", "env=memobench", "episodes=50", "--eval.batch_size=0"]) == 0
-    assert evaluation.value("eval.batch_size") == "10"
-
-
 def test_the_report_is_written_and_printed(evaluation: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["eval", "env=memobench", f"tasks={TASK}", "episodes=2", "output_dir=out"]) == 0
     assert json.loads(Path("out/report.json").read_text())["average"]["SR"] == 50.0
@@ -186,14 +154,6 @@ def test_surplus_episodes_are_not_reported(evaluation: Any) -> None:
     evaluation.before = lambda plan: log_episodes(plan.log, 4)
     assert main(["eval", "env=memobench", f"tasks={TASK}", "episodes=3", "output_dir=out"]) == 0
     assert json.loads(Path("out/report.json").read_text())["average"]["n"] == 3
-
-
-def test_the_replan_interval_of_the_policy_is_noted(evaluation: Any) -> None:
-    path = checkpoint(Path("run/pretrained_model"))
-    assert main(["eval", "env=memobench", f"policy={path}", "policy.n_action_steps=20"]) == 0
-    assert evaluation.value("policy.path") == str(path)
-    assert evaluation.value("env.replan_steps") == "20"
-    assert evaluation.value("env.expert_action") is None
 
 
 def test_an_earlier_evaluation_is_not_mixed_in(evaluation: Any, capsys: pytest.CaptureFixture[str]) -> None:
@@ -519,22 +479,9 @@ def refused(words: list[str], called: Any, capsys: pytest.CaptureFixture[str]) -
     return err
 
 
-def test_a_wrong_task_name(evaluation: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["eval", "env=memobench", "tasks=turn_on_the_stov"]
-    assert TASK in refused(words, evaluation, capsys)
-
-
-def test_an_unknown_policy(evaluation: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "memobench_mem" in refused(["eval", "env=memobench", "policy=memobnch_mem"], evaluation, capsys)
-
-
 def test_an_unknown_alignment(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["train", "policy=memobench_mem", "align=contrastiv"]
     assert "contrastive" in refused(words, training, capsys)
-
-
-def test_an_unknown_referent(evaluation: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "random" in refused(["eval", "env=memobench", "referent=rnd"], evaluation, capsys)
 
 
 @pytest.mark.parametrize(
@@ -597,6 +544,27 @@ def test_the_clock_has_no_statistics(in_folder: Path) -> None:
         told["steps"][0]["config"]["features"] |= {key: {"type": "STATE", "shape": [1]} for key in CLOCK}
         path.write_text(json.dumps(told))
     check_checkpoint(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["tasks=turn_on_the_stov"], TASK),
+        (["tasks=,"], "among the tasks"),
+        (["policy=memobnch_mem"], "memobench_mem"),
+        (["referent=rnd"], "'random'"),
+        (["env.render=ultra"], "render is 'ultra'"),
+        (["horizon=many"], "horizon=many: expected a whole number"),
+        (["horizn=5"], "'horizon'"),
+        (["shard=3/2", "output_dir=out"], "i from 1 to n"),
+        (["suite=strict", "world=libero"], "leave one of the two out"),
+    ],
+)
+def test_a_bad_word_of_an_evaluation_is_one_sentence(
+    evaluation: Any, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    assert said in refused(["eval", "env=memobench", *words], evaluation, capsys)
+    assert not any(Path().iterdir())
 
 
 def test_no_environment_and_no_policy(evaluation: Any, training: Called, capsys: pytest.CaptureFixture[str]) -> None:
@@ -724,13 +692,6 @@ def test_the_dump_of_a_trainings_configuration_is_no_news(training: Called, caps
 
 def test_the_dump_is_still_what_it_is_taken_for() -> None:
     assert "logging.info(pformat(cfg.to_dict()))" in Path(lerobot.scripts.lerobot_train.__file__).read_text()
-
-
-@pytest.mark.parametrize("spec", ["", ","])
-def test_no_task_is_not_all_tasks(evaluation: Any, capsys: pytest.CaptureFixture[str], spec: str) -> None:
-    assert main(["eval", "env=memobench", f"tasks={spec}"]) == 2
-    assert not evaluation.plans
-    assert "among the tasks; expected names" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("code", "status"), [(None, 0), (0, 0), (3, 3), ("no", 1)])

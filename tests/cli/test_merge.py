@@ -44,8 +44,8 @@ def test_merged_parts_are_the_whole(fake_loop: Any, capsys: pytest.CaptureFixtur
     assert comparable("out") == comparable("whole")
     assert json.loads(Path("out/report.json").read_text()) == json.loads(Path("whole/report.json").read_text())
     assert (
-        json.loads(Path("out/card.json").read_text())["episodes"]
-        == json.loads(Path("whole/card.json").read_text())["episodes"]
+        json.loads(Path("out/evaluation.json").read_text())["episodes"]
+        == json.loads(Path("whole/evaluation.json").read_text())["episodes"]
     )
     # What was merged can be gone on with like any other evaluation.
     fake_loop.ran.clear()
@@ -73,10 +73,10 @@ def test_folders_can_be_named(fake_loop: Any, capsys: pytest.CaptureFixture[str]
 
 def test_a_card_is_repeated(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert lerobot([*COMMAND, "output_dir=out", "seed=9", "horizon=600"]) == 0
-    first = fake_loop.plans[0].portable_flags
-    assert memobench(["rerun", "out/card.json", "--out", "again"]) == 0
+    first = fake_loop.plans[0].settings.portable
+    assert memobench(["rerun", "out/evaluation.json", "--out", "again"]) == 0
     assert "repeated: 8 episodes, as on the card" in capsys.readouterr().out
-    assert fake_loop.plans[1].portable_flags == first
+    assert fake_loop.plans[1].settings.portable == first
     assert memobench(["rerun", "out", "--out", "folder"]) == 0
     fake_loop.changed = {"steps": 5}
     assert memobench(["rerun", "out", "--out", "changed"]) == 1
@@ -87,7 +87,7 @@ def test_a_card_is_repeated(fake_loop: Any, capsys: pytest.CaptureFixture[str]) 
 def test_a_part_alone_is_repeated_as_a_part(fake_loop: Any) -> None:
     assert lerobot([*COMMAND, "output_dir=out", "shard=2/2"]) == 0
     fake_loop.ran.clear()
-    assert memobench(["rerun", "out/shard-2-of-2/card.json", "--out", "again"]) == 0
+    assert memobench(["rerun", "out/shard-2-of-2/evaluation.json", "--out", "again"]) == 0
     assert fake_loop.ran == [(DRAWER, k) for k in range(4)]
 
 
@@ -103,22 +103,22 @@ INCOMPLETE = {
 @pytest.mark.parametrize("change", INCOMPLETE)
 def test_a_card_is_repeated_only_with_the_outcome_of_every_episode(fake_loop: Any, change: str, capsys: Any) -> None:
     assert lerobot([*COMMAND, "output_dir=out"]) == 0
-    card = json.loads(Path("out/card.json").read_text())
+    card = json.loads(Path("out/evaluation.json").read_text())
     card["episodes"] = INCOMPLETE[change](card["episodes"])
-    Path("card.json").write_text(json.dumps(card))
+    Path("evaluation.json").write_text(json.dumps(card))
     capsys.readouterr()
     status = 1 if change in ("another outcome", "without steps") else 2
-    assert memobench(["rerun", "card.json", "--out", "again"]) == status
+    assert memobench(["rerun", "evaluation.json", "--out", "again"]) == status
     assert "\nrepeated: " not in capsys.readouterr().out
     assert Path("again").exists() == (status == 1), "an incomplete card runs nothing"
 
 
 def test_other_versions_are_told(fake_loop: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert lerobot([*COMMAND, "output_dir=out"]) == 0
-    card = json.loads(Path("out/card.json").read_text())
+    card = json.loads(Path("out/evaluation.json").read_text())
     card["runs"][0]["versions"]["mujoco"] = "0.1"
-    Path("card.json").write_text(json.dumps(card))
-    assert memobench(["rerun", "card.json", "--out", "again"]) == 0
+    Path("evaluation.json").write_text(json.dumps(card))
+    assert memobench(["rerun", "evaluation.json", "--out", "again"]) == 0
     assert "note: the card's run used mujoco 0.1 (here " in capsys.readouterr().out
 
 
@@ -221,7 +221,7 @@ def test_slurm_gets_a_job_per_part_and_one_that_merges(
 def test_a_parts_process_ends_with_the_one_that_wanted_it(tmp_path: Path) -> None:
     words = ["eval", "env=memobench", f"tasks={STOVE}", "episodes=50", "output_dir=out", "shard=1/1", "batch_size=1"]
     part = subprocess.Popen([sys.executable, *SHARD_PROGRAM, *words], cwd=tmp_path, stdin=subprocess.PIPE)
-    while not (tmp_path / "out" / "shard-1-of-1" / "card.json").exists():
+    while not (tmp_path / "out" / "shard-1-of-1" / "evaluation.json").exists():
         assert part.poll() is None
     assert part.stdin is not None
     part.stdin.close()

@@ -92,12 +92,18 @@ def test_a_second_writer_changes_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    for name in ("out/sealed.json", "demo/contact_sheet.png", "out/.1-a.part.card.json", "run/model", "files/a.hdf5"):
+    for name in (
+        "out/notes.json",
+        "demo/contact_sheet.png",
+        "out/.1-a.part.evaluation.json",
+        "run/model",
+        "files/a.hdf5",
+    ):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("of the first run")
     parts: dict[str, Any] = {"protocol": {"tasks": [STOVE], "episodes": 2}, "policy": {}, "checkpoint": None}
     started = [run_facts(["lerobot", "eval"], 1)]
-    write_card(Path("out"), new_card(**parts, trained_on=None, task_files={}, flags=[], runs=started))
+    write_card(Path("out"), new_card(**parts, trained_on=None, task_files={}, settings={}, runs=started))
     for name in ("ds/.staging/episodes/.tmp-000000", "html/videos/run", f"data/{FOLDER}"):
         Path(name).mkdir(parents=True)
     Path("html/index.html").write_text(UNFINISHED)

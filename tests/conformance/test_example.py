@@ -13,7 +13,8 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.checks import Outcome, run_checks
 from lerobot_memobench.conformance.streams import TASK
 from lerobot_memobench.conformance.subject import load_subject
-from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.evaluation_file import protocol_of
 from tests.conformance.conftest import EXAMPLE
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +91,7 @@ def test_it_rolls_out(checkpoint: Path, objects: Path, tmp_path: Path, monkeypat
     words = [f"policy={checkpoint}", f"tasks={TASK}", "episodes=2", "batch_size=2", "horizon=3", f"output_dir={out}"]
     assert main(["eval", "env=memobench", *words]) == 0
     assert [record["steps"] for record in read_episodes(out)] == [3, 3]
-    protocol = read_protocol_file(out)
+    protocol = protocol_of(out)
     assert (protocol["prompt_in"], protocol["obs_type"]) == ("steps", "environment_state_agent_pos")
     first, second = ([phases[row] for phases, _ in clocks].index(1) for row in range(2))
     assert first != second

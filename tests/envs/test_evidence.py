@@ -10,9 +10,10 @@ import pytest
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.episode_log import differences, read_episodes, read_log, read_protocol_file
+from lerobot_memobench.envs.episode_log import differences, read_episodes, read_log
+from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import OBJECTS, RESET
+from lerobot_memobench.envs.settings import OBJECTS, RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import seed_base
 from lerobot_memobench.run.card import drawn_otherwise
@@ -48,7 +49,7 @@ def test_a_scene_is_run_with_each_variant_before_the_next(tmp_path: Path) -> Non
     (drawn,) = episodes(tmp_path / "drawn", range(20_000, 20_001))
     assert "choice" not in drawn
     assert drawn["scene_hash"] == records[0]["scene_hash"], "only the past differs"
-    each, once = (read_protocol_file(tmp_path / name) for name in ("each", "drawn"))
+    each, once = (protocol_of(tmp_path / name) for name in ("each", "drawn"))
     assert differences(each, once) == ["evidence: True and False"]
 
 
@@ -81,7 +82,7 @@ def test_the_published_goal_alone_is_no_evidence() -> None:
         MemobenchEnvConfig(evidence=True)
     with pytest.raises(MemobenchError, match="say referent=random"):
         MemobenchEnv(str(get_task(MILK).derived_from), evidence=True)
-    assert MemobenchEnvConfig(evidence=True, suite="strict").agreed_settings["evidence"] is True
+    assert MemobenchEnvConfig(evidence=True, suite="strict").settings.protocol_block["evidence"] is True
 
 
 def test_tasks_without_variants_are_left_out() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from lerobot_memobench.envs.episode import Episode, first_execution_step, referent_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import BOTH, RESET
+from lerobot_memobench.envs.settings import BOTH, RESET
 from lerobot_memobench.protocol import ACTION_DIM, ENDED, EXECUTION, IDLE_STEPS, NO_CLOCK, PROMPT, PROMPT_HORIZON
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names

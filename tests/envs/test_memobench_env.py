@@ -98,19 +98,6 @@ def test_batches_of_strict_tasks(name: str, tmp_path: Path) -> None:
     check_batches(name, tmp_path, 12, seeds, suite="strict", prompt_in="reset")
 
 
-def test_observation_matches_its_space() -> None:
-    env = make(STOVE, expert_action=True)
-    observation, info = env.reset(seed=7)
-    assert env.observation_space.contains(observation)
-    assert info["is_success"] is False
-    observation, reward, terminated, truncated, info = env.step(np.zeros(7, np.float32))
-    assert env.observation_space.contains(observation)
-    assert (reward, terminated, truncated) == (0.0, False, False)
-    assert observation["phase"] == [EXECUTION]
-    assert observation["step"] == [1]
-    env.close()
-
-
 def test_prompt_plays_whatever_the_policy_does() -> None:
     """Actions have no effect during the prompt; afterwards the scene is what it was, and only then does time count."""
     ends = []
@@ -148,7 +135,7 @@ def test_a_prompt_within_reset_changes_nothing_but_who_sees_it(tmp_path: Path) -
     shown, records, films = [], [], []
     for where in ("steps", "reset"):
         log = tmp_path / where
-        env = make(HIGHLIGHT, prompt_in=where, horizon=3, log_dir=str(log), videos=True)
+        env = make(HIGHLIGHT, prompt_in=where, horizon=3, log_dir=str(log), videos=1)
         observation, info = env.reset(seed=7)
         if where == "reset":
             assert env._max_episode_steps == 3
@@ -182,48 +169,6 @@ def test_highlight_is_seen_in_the_prompt_only() -> None:
         most = max(most, float((np.abs(observation["pixels"]["image"] - still).max(axis=2) > 20).mean()))
     assert most > 0.003
     np.testing.assert_array_equal(observation["pixels"]["image"], still)
-    env.close()
-
-
-def test_without_prompt_video_execution_begins_at_once() -> None:
-    env = make(HIGHLIGHT, demonstration_prompt=False)
-    with_prompt = make(HIGHLIGHT)
-    observation, info = env.reset(seed=7)
-    with_prompt.reset(seed=7)
-    assert observation["phase"] == [EXECUTION]
-    assert info["phase"] == EXECUTION
-    assert env.scene_hash() == with_prompt.scene_hash()
-    env.close()
-    with_prompt.close()
-
-
-def test_render_every_changes_images_only() -> None:
-    every, third = make(DRAWER), make(DRAWER, render_every=3)
-    plan = actions(7, 9)
-    every.reset(seed=7)
-    shown = third.reset(seed=7)[0]["pixels"]["image"]
-    for step, action in enumerate(plan, start=1):
-        one, two = every.step(action)[0], third.step(action)[0]
-        assert every.scene_hash() == third.scene_hash()
-        np.testing.assert_array_equal(one["agent_pos"], two["agent_pos"])
-        if step % 3 == 0:
-            shown = one["pixels"]["image"]
-        np.testing.assert_array_equal(two["pixels"]["image"], shown)
-    every.close()
-    third.close()
-
-
-def test_random_referent_is_the_seeds() -> None:
-    env = make(HIGHLIGHT, referent="random", demonstration_prompt=False)
-    chosen = []
-    for _ in range(2):
-        row = []
-        for seed in range(7, 27):
-            env.episode.reset(seed)
-            row.append(env.episode.task.variant_index)
-        chosen.append(row)
-    assert chosen[0] == chosen[1]
-    assert len(set(chosen[0])) > 1
     env.close()
 
 
@@ -313,39 +258,4 @@ def test_render_is_annotated() -> None:
     assert frame.dtype == np.uint8
     assert frame.shape[0] > 256
     assert frame.shape[1:] == (512, 3)
-    env.close()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"tasks": "turn_on_the_stofe_and_turn_it_off"}, "turn_on_the_stove_and_turn_it_off"),
-        ({"referent": "randon"}, "did you mean 'random'"),
-        ({"render": "ultra"}, "env.render is 'ultra'"),
-        ({"obs_type": "state"}, "env.obs_type is 'state'"),
-        ({"prompt_in": "rest"}, "env.prompt_in is 'rest'; did you mean 'reset'"),
-        ({"horizon": 0}, "env.horizon is 0"),
-        ({"render_every": 0}, "env.render_every is 0"),
-        ({"videos": -2}, "env.videos is -2"),
-        ({"replan_steps": 0}, "env.replan_steps is 0"),
-        ({"fps": 30}, "control rate is 20"),
-    ],
-)
-def test_bad_settings_are_told_in_one_sentence(tmp_path: Path, settings: dict[str, Any], words: str) -> None:
-    log = tmp_path / "log"
-    with pytest.raises(MemobenchError, match=words) as caught:
-        MemobenchEnvConfig(log_dir=str(log), **settings).create_envs(1)
-    assert "\n" not in str(caught.value)
-    assert not log.exists()
-
-
-@pytest.mark.parametrize(
-    ("action", "words"),
-    [(np.zeros(6, np.float32), r"shape \(6,\); expected \(7,\)"), (np.full(7, np.nan, np.float32), "not finite")],
-)
-def test_bad_actions_are_told_in_one_sentence(action: np.ndarray, words: str) -> None:
-    env = make(STOVE)
-    env.reset(seed=7)
-    with pytest.raises(MemobenchError, match=words):
-        env.step(action)
     env.close()

@@ -15,9 +15,10 @@ from lerobot.envs import env_to_policy_features, preprocess_observation
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.episode_log import read_protocol_file
+from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, check_obs_type, obs_type_of
+from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.envs.video import LAST_FRAMES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.write import frame_count
@@ -71,7 +72,7 @@ def test_features_are_lerobots(obs_type: str) -> None:
 
 @pytest.mark.usefixtures("blind")
 def test_objects_are_those_of_the_moment_and_nothing_is_drawn() -> None:
-    env = make(HIGHLIGHT, expert_action=True, render_every=5, horizon=4)
+    env = make(HIGHLIGHT, expert_action=True, horizon=4)
     observation, _ = env.reset(seed=20_007)
     look, lit = ObjectSlots(env.episode.sim), 0
     while True:
@@ -189,29 +190,9 @@ def test_one_folder_holds_one_kind_of_observations(tmp_path: Path) -> None:
     env.reset(seed=20_007)
     env.step(np.zeros(7, np.float32))
     env.close()
-    assert read_protocol_file(tmp_path)["obs_type"] == OBJECTS
+    assert protocol_of(tmp_path)["obs_type"] == OBJECTS
     with pytest.raises(MemobenchError, match=r"another protocol \(obs_type: environment_state_agent_pos and both"):
-        vector(DRAWER, 1, tmp_path, obs_type=BOTH, horizon=1)
-
-
-@pytest.mark.usefixtures("blind")
-def test_a_logged_episode_rests_and_the_others_are_what_they_were(tmp_path: Path) -> None:
-    settings = {"obs_type": OBJECTS, "horizon": 2, "seed_base": 20_007, "resume": True}
-
-    def roll() -> np.ndarray:
-        env = vector(DRAWER, 2, tmp_path / "log", **settings)
-        env.reset(seed=SEEDS[:2], options={"lerobot_new_rollout": True})
-        seen = [env.step(np.full((2, 7), 0.4, np.float32))[0]["environment_state"].copy() for _ in range(2)]
-        env.close()
-        return np.stack(seen)
-
-    whole = roll()
-    assert whole.any(axis=(0, 2)).all()
-    (log,) = (tmp_path / "log" / "episodes").iterdir()
-    log.write_text(log.read_text().splitlines(keepends=True)[0])
-    again = roll()
-    assert not again[:, 0].any()
-    np.testing.assert_array_equal(again[:, 1], whole[:, 1])
+        vector(DRAWER, 1, tmp_path, obs_type=BOTH, horizon=1, resume=True)
 
 
 def policy(kind: str, *seen: FeatureType, **more: Any) -> Any:

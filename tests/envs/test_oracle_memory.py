@@ -33,7 +33,6 @@ def described(name: str, frames: int, referent: str) -> list[str]:
         expert_action=True,
         referent=referent,
         render="fast",
-        render_every=10_000,
     )
     observation, _ = env.reset(seed=SEED)
     texts = [env.task_description]
@@ -56,7 +55,7 @@ def test_equals_the_dataset_frame_by_frame(name: str, referent: str) -> None:
 
 
 def test_without_the_option_the_instruction_stays() -> None:
-    env = MemobenchEnv(STOVE, render="fast", render_every=10_000)
+    env = MemobenchEnv(STOVE, render="fast")
     env.reset(seed=SEED)
     env.step(np.zeros(7, np.float32))
     assert env.task_description == get_task(STOVE).language
@@ -72,7 +71,6 @@ def test_async_workers_tell_it_too(tmp_path: Path) -> None:
         expert_action=True,
         referent="fixed",
         render="fast",
-        render_every=10_000,
         log_dir=str(tmp_path),
     )
     (suite,) = config.create_envs(2, use_async_envs=True).values()

@@ -20,8 +20,8 @@ from lerobot_memobench.envs import prompt_cache
 from lerobot_memobench.envs.episode import Episode, first_execution_step
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, RESET, STEPS
 from lerobot_memobench.envs.prompt_cache import Prompt, RestoredPrompt, prompt_file, prompt_of
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET, STEPS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import ACTION_DIM, PROMPT
 from lerobot_memobench.sim.simulation import NO_OP, STABILISATION_STEPS, Simulation

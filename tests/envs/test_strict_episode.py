@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode, first_execution_step, referent_of
-from lerobot_memobench.envs.episode_log import IDLE, differences, read_episodes, read_protocol_file
+from lerobot_memobench.envs.episode_log import IDLE, differences, read_episodes
+from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import RESET
+from lerobot_memobench.envs.settings import RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.fixtures import turn_knob
 from lerobot_memobench.experts.hand import OPEN, Hand
@@ -39,7 +40,7 @@ def seed_of(name: str, variant: int) -> int:
 
 @pytest.mark.parametrize("referent", ["fixed", "random"])
 def test_every_episode_is_drawn_whatever_referent_is_asked_for(referent: str) -> None:
-    env = MemobenchEnv(STOVE, referent=referent, render="fast", render_every=10_000)
+    env = MemobenchEnv(STOVE, referent=referent, render="fast")
     assert env.episode.referent == "drawn"
     for variant, words in enumerate(("once", "twice", "three times")):
         env.reset(seed=seed_of(STOVE, variant))
@@ -50,14 +51,14 @@ def test_every_episode_is_drawn_whatever_referent_is_asked_for(referent: str) ->
 @pytest.mark.parametrize("referent", ["fixed", "random", "drawn"])
 def test_a_configuration_tells_what_is_true_of_its_suite(referent: str) -> None:
     config = MemobenchEnvConfig(suite=STRICT, referent=referent)
-    assert config.referent == config.agreed_settings["referent"] == config.gym_kwargs["referent"] == "drawn"
+    assert config.referent == config.settings.protocol_block["referent"] == config.gym_kwargs["referent"] == "drawn"
 
 
 def test_published_tasks_are_not_drawn() -> None:
     published = get_task(str(get_task(STOVE).derived_from))
     with pytest.raises(MemobenchError, match="referent is 'drawn'; did you mean"):
         Episode(published, referent="drawn")
-    with pytest.raises(MemobenchError, match=r"env\.referent is 'drawn'"):
+    with pytest.raises(MemobenchError, match=r"referent is 'drawn'"):
         MemobenchEnvConfig(referent="drawn")
 
 
@@ -74,7 +75,6 @@ def test_resting_at_once_ends_the_episode_and_is_logged_as_a_miscount(tmp_path: 
         STOVE,
         log_dir=str(tmp_path),
         render="fast",
-        render_every=10_000,
         prompt_in=RESET,
         seed_base=7,
     )
@@ -85,7 +85,7 @@ def test_resting_at_once_ends_the_episode_and_is_logged_as_a_miscount(tmp_path: 
     assert not info["is_success"]
     (record,) = read_episodes(tmp_path)
     assert (record["suite"], record["lost"], record["failure"], record["steps"]) == (STRICT, True, "miscount", 40)
-    told = read_protocol_file(tmp_path)
+    told = protocol_of(tmp_path)
     assert (told["suite"], told["referent"], record["referent"]) == (STRICT, "drawn", "drawn")
 
 
@@ -197,7 +197,7 @@ def test_the_execution_begins_where_a_hiding_ended_even_unseen(
 def test_a_configuration_knows_its_suites_tasks(tmp_path: Path) -> None:
     assert [folder.name for *_, folder in MemobenchEnvConfig(suite=STRICT).selected()] == task_names(suite=STRICT)
     assert len(MemobenchEnvConfig().selected()) == 30
-    with pytest.raises(MemobenchError, match=r"env\.suite is 'strikt'"):
+    with pytest.raises(MemobenchError, match=r"suite is 'strikt'"):
         MemobenchEnvConfig(suite="strikt")
     with pytest.raises(MemobenchError, match="say suite=strict, or --suite strict"):
         MemobenchEnvConfig(tasks=STOVE).selected()
@@ -214,9 +214,9 @@ def test_a_protocol_without_a_suite_is_the_published_ones() -> None:
 
 
 def test_strict_results_from_before_the_robot_idled_are_of_another_protocol() -> None:
-    now = MemobenchEnvConfig(suite=STRICT).agreed_settings
+    now = MemobenchEnvConfig(suite=STRICT).settings.protocol_block
     before = {key: value for key, value in now.items() if key != IDLE}
     assert differences(before, now) == [f"idle: 0 and {IDLE_STEPS}"]
     assert differences(now, before) == [f"idle: {IDLE_STEPS} and 0"]
     assert differences(now, now) == []
-    assert IDLE not in MemobenchEnvConfig().agreed_settings
+    assert IDLE not in MemobenchEnvConfig().settings.protocol_block

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.cli.report import ReportFormat, compare, merge, report
-from lerobot_memobench.envs.episode_log import check_protocol, read_episodes, write_protocol
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.evaluation_file import EARLIER_PROTOCOL, check_protocol
 from lerobot_memobench.run import rerun as again
 from lerobot_memobench.run.card import new_card, with_episodes, write_card
 from lerobot_memobench.run.plan import earlier_batch_size
@@ -47,7 +48,7 @@ def card_of(folder: Path) -> dict[str, Any]:
         checkpoint={"path": "somewhere", "revision": None, "files": {"model.safetensors": "0" * 64}},
         trained_on={"repo_id": "me/it", "steps": 5},
         task_files={"one": "abc", "two_of_them": "def"},
-        flags=["--env.type=memobench", "--env.tasks=one,two_of_them", "--eval.n_episodes=4"],
+        settings={"env": {"tasks": "one,two_of_them"}, "policy": {"type": "act"}, "episodes": 4},
         runs=[start],
     )
     return with_episodes(card, records)
@@ -60,7 +61,7 @@ def whole_evaluation(folder: Path, successes: int) -> Path:
     (folder / "episodes").mkdir()
     worker = [json.dumps({**json.loads(line), "written_at": 1.0}) + "\n" for line in lines[:3]]
     (folder / "episodes" / "one.1.jsonl").write_text("".join(worker))
-    write_protocol(folder, SETTINGS)
+    (folder / EARLIER_PROTOCOL).write_text(json.dumps(SETTINGS))
     write_card(folder, card_of(folder))
     return folder
 

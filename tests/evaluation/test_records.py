@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import (
-    PROTOCOL_FILE,
-    EpisodeLog,
-    differences,
-    write_episodes,
-    write_protocol,
-)
+from lerobot_memobench.envs.episode_log import EpisodeLog, differences, write_episodes
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, check_protocol, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import failure_counts, summarise
-from lerobot_memobench.evaluation.records import CARD_FILE, read_protocol, read_rollouts, read_runs, sweeps
+from lerobot_memobench.evaluation.records import read_protocol, read_rollouts, read_runs, sweeps
 from lerobot_memobench.evaluation.report import build, render, write_report
 from lerobot_memobench.evaluation.report_tables import departures, failures_table
 from lerobot_memobench.run.merging import merge
@@ -34,7 +30,7 @@ def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, 
 
 
 def test_the_environments_settings_stand_beside_the_log(tmp_path: Path) -> None:
-    log = EpisodeLog(tmp_path, SETTINGS)
+    log = EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS))
     assert not list(tmp_path.iterdir())  # nothing before an episode has ended
     log.append(record())
     log.append(record("b", 3))
@@ -43,12 +39,12 @@ def test_the_environments_settings_stand_beside_the_log(tmp_path: Path) -> None:
 
 
 def test_another_protocol_is_refused_before_a_line_is_written(tmp_path: Path) -> None:
-    EpisodeLog(tmp_path, SETTINGS).append(record())
-    EpisodeLog(tmp_path, SETTINGS).append(record(episode=1))  # another worker
-    before = sorted((tmp_path / "episodes").iterdir()), (tmp_path / PROTOCOL_FILE).read_bytes()
+    EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS)).append(record())
+    EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS)).append(record(episode=1))  # another worker
+    before = sorted((tmp_path / "episodes").iterdir()), (tmp_path / EVALUATION_FILE).read_bytes()
     with pytest.raises(MemobenchError, match="horizon: 1200 and 600"):
-        EpisodeLog(tmp_path, {**SETTINGS, "horizon": 600}).append(record("other"))
-    assert before == (sorted((tmp_path / "episodes").iterdir()), (tmp_path / PROTOCOL_FILE).read_bytes())
+        EpisodeLog(tmp_path, partial(write_protocol, tmp_path, {**SETTINGS, "horizon": 600})).append(record("other"))
+    assert before == (sorted((tmp_path / "episodes").iterdir()), (tmp_path / EVALUATION_FILE).read_bytes())
 
 
 def test_a_log_alone_tells_what_it_can(tmp_path: Path) -> None:
@@ -68,9 +64,9 @@ def test_a_log_alone_tells_what_it_can(tmp_path: Path) -> None:
 
 
 def test_what_was_asked_for_comes_from_the_card(tmp_path: Path) -> None:
-    EpisodeLog(tmp_path, SETTINGS).append(record())
+    EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS)).append(record())
     card = {"protocol": {**SETTINGS, "tasks": ["a_task", "b"], "episodes": 50}, "policy": {"type": "act"}}
-    (tmp_path / CARD_FILE).write_text(json.dumps(card))
+    (tmp_path / EVALUATION_FILE).write_text(json.dumps(card))
     assert read_protocol(tmp_path) == {**card["protocol"], "policy": {"type": "act"}}
 
 
@@ -241,6 +237,16 @@ def test_the_papers_figures_stand_beside_the_published_suite_only(strict: Path, 
     assert build(read_runs([published]), paper=True).sections
     with pytest.raises(MemobenchError, match="leave out --with paper"):
         build(read_runs([strict]), paper=True)
+
+
+def test_an_earlier_folder_goes_on_as_published_and_not_as_strict(tmp_path: Path) -> None:
+    (tmp_path / EVALUATION_FILE).write_text('{"protocol": {"horizon": 1200}}')
+    assert check_protocol(tmp_path, {"horizon": 1200, "suite": "published"})
+    with pytest.raises(MemobenchError, match="suite: published and strict"):
+        check_protocol(tmp_path, {"horizon": 1200, "suite": "strict"})
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert not check_protocol(empty, {"suite": "strict"})
 
 
 def test_failures_of_strict_tasks_join_the_published_rows() -> None:

@@ -15,7 +15,8 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_memobench.datasets.feature_cache.layout import FOLDER
-from lerobot_memobench.envs.observations import PIXELS, obs_type_of
+from lerobot_memobench.envs.observations import obs_type_of
+from lerobot_memobench.envs.settings import PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig

@@ -7,7 +7,6 @@ smaller numbers or a tokenizer built here; the policy's own code runs unchanged.
 from __future__ import annotations
 
 import json
-import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,8 @@ from safetensors import safe_open
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.envs.episode_log import read_episodes, read_protocol_file
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.lerobot_commands import call_lerobot
@@ -88,7 +88,7 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
     assert main(["eval", "env=memobench", f"policy={run}", *words]) == 0
     (record,) = read_episodes(out / "eval")
     assert record["steps"] == 3
-    return read_protocol_file(out / "eval")
+    return protocol_of(out / "eval")
 
 
 #: LeRobot keeps the statistics of every column in the file; which of them are used its step's features say.
@@ -273,7 +273,7 @@ def lerobot_eval(tmp_path: Path) -> Any:
         line = [
             *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}", "--env.render=fast"),
             *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
-            *("--policy.device=cpu", f"--output_dir={tmp_path}"),
+            *("--policy.device=cpu", f"--output_dir={tmp_path}", f"--env.log_dir={tmp_path}"),
         ]
         assert call_lerobot("eval", [*line, *policy]) == 0
 
@@ -298,7 +298,7 @@ def test_the_first_plan_is_made_from_the_first_execution_frame(
 ) -> None:
     policy, words, interval = kind()
     watched = Watched(monkeypatch, policy)
-    lerobot_eval(*words)
+    lerobot_eval(*words, "--env.prompt_in=reset")
     records = read_episodes(tmp_path)
     assert [(record["prompt_steps"], record["steps"]) for record in records] == [(steps, HORIZON) for steps in PROMPTS]
     assert [record["prompt_shown"] for record in records] == [True, True]
@@ -308,7 +308,7 @@ def test_the_first_plan_is_made_from_the_first_execution_frame(
     for row, seed in enumerate((7, 8)):
         planned = np.concatenate([actions[row, :interval] for _, _, actions in watched.plans])[:HORIZON]
         np.testing.assert_array_equal(np.stack(watched.applied[seed]), planned)  # none of them is stale
-    assert read_protocol_file(tmp_path)["prompt_in"] == "reset"
+    assert protocol_of(tmp_path)["prompt_in"] == "reset"
 
 
 def test_a_policy_that_reads_prompts_is_shown_them(
@@ -327,34 +327,4 @@ def test_a_policy_that_reads_prompts_is_shown_them(
     nothing_drawn = "--env.obs_type=environment_state_agent_pos"
     lerobot_eval("--policy.type=memobench_expert", "--env.expert_action=true", "--env.horizon=2", nothing_drawn)
     assert [sum(row == PROMPT for row in rows) for rows in zip(*seen, strict=True)] == PROMPTS
-    assert read_protocol_file(tmp_path)["prompt_in"] == "steps"
-
-
-@pytest.mark.parametrize(
-    ("line", "found"),
-    [
-        (["--policy.type=act"], "reset"),
-        (["--policy.type", "memobench_mem"], "steps"),
-        (["--policy.type=memobench_remote"], "steps"),
-        (["--policy.type=memobench_random"], "reset"),
-        (["--policy.path=checkpoint"], "reset"),
-        (["--config_path=train.yaml"], "reset"),
-        (["--config_path=run"], "steps"),
-        ([], "steps"),
-    ],
-)
-def test_auto_is_by_the_policy_that_lerobot_runs(
-    line: list[str], found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import lerobot_policy_memobench  # noqa: F401
-    from lerobot_memobench.envs.command_line import policy_being_run
-    from lerobot_memobench.envs.observations import prompt_in
-
-    monkeypatch.chdir(tmp_path)
-    for folder in ("checkpoint", "run"):
-        Path(folder).mkdir()
-    Path("checkpoint/config.json").write_text('{"type": "act", "device": "cpu"}')
-    Path("train.yaml").write_text("policy:\n  type: diffusion\n")
-    Path("run/train_config.json").write_text('{"policy": {"type": "memobench_mem"}}')
-    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *line])
-    assert prompt_in(policy_being_run()) == found
+    assert protocol_of(tmp_path)["prompt_in"] == "steps"

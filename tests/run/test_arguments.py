@@ -72,32 +72,6 @@ def test_the_commands_of_the_readme() -> None:
     ]
 
 
-def test_short_forms_of_eval() -> None:
-    flags = evaluated(
-        "env=memobench", "policy=memobench_mem", "tasks=object,spatial", "episodes=3", "replan=20", "batch_size=2",
-        "referent=random", "seed=9", "device=cpu", "horizon=50", "demonstration_prompt=False",
-    )  # fmt: skip
-    assert flags == [
-        "--env.type=memobench",
-        "--policy.type=memobench_mem",
-        "--env.tasks=object,spatial",
-        "--eval.n_episodes=3",
-        "--policy.n_action_steps=20",
-        "--env.replan_steps=20",
-        "--eval.batch_size=2",
-        "--env.referent=random",
-        "--seed=9",
-        "--policy.device=cpu",
-        "--env.horizon=50",
-        "--env.demonstration_prompt=false",
-    ]
-
-
-def test_replan_is_only_told_to_whom_it_concerns() -> None:
-    assert evaluated("env=memobench", "policy=memobench_expert", "replan=5")[2:] == ["--env.replan_steps=5"]
-    assert trained("policy=memobench_mem", "replan=5")[1:] == ["--policy.n_action_steps=5"]
-
-
 def test_short_forms_of_train() -> None:
     flags = trained("policy=act", "dataset=user/name", "steps=50", "batch_size=4", "seed=1")
     assert flags == [

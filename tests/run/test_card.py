@@ -13,15 +13,14 @@ import pytest
 
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreement, outcome
-from lerobot_memobench.evaluation.records import read_card
 from lerobot_memobench.run.card import (
     checkpoint_files,
     drawn_otherwise,
     extended,
     joined_runs,
-    markdown,
     new_card,
     policy_facts,
     training_facts,
@@ -57,7 +56,7 @@ def card(**changes: Any) -> dict[str, Any]:
         "checkpoint": None,
         "trained_on": None,
         "task_files": {"a": "1"},
-        "flags": ["--env.type=memobench", "--env.tasks=a", "--eval.n_episodes=2"],
+        "settings": {"env": {"tasks": "a"}, "policy": {"type": "act"}, "episodes": 2},
         "runs": [run_facts(["lerobot", "eval"], 2)],
     }
     return new_card(**{**parts, **changes})
@@ -65,39 +64,23 @@ def card(**changes: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("missing", ["tasks", "episodes"])
 def test_an_evaluation_goes_on_only_from_a_card_that_says_what_was_asked_for(tmp_path: Path, missing: str) -> None:
-    EpisodeLog(tmp_path, {}).append(record("a"))
+    EpisodeLog(tmp_path).append(record("a"))
     now = card()
     write_card(tmp_path, {**now, "protocol": {key: now["protocol"][key] for key in now["protocol"] if key != missing}})
-    with pytest.raises(MemobenchError, match=f"card.json: found no {missing} in protocol"):
+    with pytest.raises(MemobenchError, match=f"evaluation.json: found no {missing} in protocol"):
         resumed_card(tmp_path, now, print)
-    with pytest.raises(MemobenchError, match=f"card.json: found no {missing} in protocol"):
+    with pytest.raises(MemobenchError, match=f"evaluation.json: found no {missing} in protocol"):
         merge(tmp_path / "out", [tmp_path])
 
 
 def test_a_card_is_read_back_as_it_was(tmp_path: Path) -> None:
     full = with_episodes(card(), [record("a", k) for k in range(3)])
     write_card(tmp_path, full)
-    assert read_card(tmp_path / "card.json") == json.loads(json.dumps(full))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["card.json", "card.md"]
-    text = (tmp_path / "card.json").read_text()
+    assert read_evaluation(tmp_path, whole=True) == json.loads(json.dumps(full))
+    text = (tmp_path / "evaluation.json").read_text()
     assert sum('"scene_hash"' in line for line in text.splitlines()) == 3  # one episode a line
     write_card(tmp_path, card())
-    assert read_card(tmp_path / "card.json")["episodes"] == []
-
-
-def test_what_is_told_for_people() -> None:
-    text = markdown(with_episodes(card(), [record("a")]))
-    for part in ("| tasks | 1: a |", "| horizon | 1200 |", "| type | act |", "lerobot eval", "| mujoco | 3"):
-        assert part in text, part
-
-
-def test_a_card_names_what_the_authors_evaluation_does_otherwise_and_stand_ins() -> None:
-    there = {"world": "libero", "protocol": "upstream"}
-    found = with_episodes(card(protocol=card()["protocol"] | there), [record("a", stand_ins=["cork__3"], **there)])
-    assert found["episodes"][0]["stand_ins"] == ["cork__3"]
-    text = markdown(found)
-    for part in ("| world | libero |", "at most 990 execution steps; two eval", "| stand-ins for missing scans | cork"):
-        assert part in text, part
+    assert read_evaluation(tmp_path)["episodes"] == []
 
 
 def test_an_outcome_leaves_out_the_clock() -> None:
@@ -186,7 +169,7 @@ def test_a_wider_evaluation() -> None:
     assert (both["protocol"]["tasks"], both["protocol"]["episodes"]) == (["a", "b"], 5)
     assert both["protocol"]["horizon"] == 1200
     assert both["task_files"] == {"a": "1", "b": "2"}
-    assert both["flags"] == ["--env.type=memobench", "--eval.n_episodes=5", "--env.tasks=a,b"]
+    assert both["settings"] == {"env": {"tasks": "a,b"}, "policy": {"type": "act"}, "episodes": 5}
     assert both["runs"][0]["times"] == 2
     assert extended(card(shard="1/2"), card(shard="1/2"))["shard"] == "1/2"
     assert extended(card(shard="1/2"), card(shard="2/2"))["shard"] is None
@@ -226,12 +209,12 @@ def test_the_first_disagreement_is_named(changes: dict[str, Any], words: str) ->
     assert words in found
 
 
-def test_a_file_that_is_no_card(tmp_path: Path) -> None:
-    with pytest.raises(MemobenchError, match="cannot be read"):
-        read_card(tmp_path / "card.json")
-    (tmp_path / "card.json").write_text('{"a": 1}')
-    with pytest.raises(MemobenchError, match="no result card"):
-        read_card(tmp_path / "card.json")
+def test_a_card_of_an_earlier_version_is_widened_into_settings() -> None:
+    old = {**card(), "format": 1, "flags": ["--env.type=memobench"]}
+    del old["settings"]
+    both = extended(old, card(protocol={"tasks": ["a"], "episodes": 5, "seed_base": 7}))
+    assert (both["format"], both["settings"]["episodes"]) == (2, 5)
+    assert "flags" not in both
 
 
 # --- what is known of a model checkpoint before anything has been found ---
@@ -267,13 +250,13 @@ def test_episodes_that_drew_their_variants_otherwise_are_neither_gone_on_with_no
     lines[1] = lines[1] | {"variant": other}
     told = f"{bowl}, episode 1: variant {other} there, {here[8]} by its seed here"
     for line in lines:
-        EpisodeLog(tmp_path, {}).append(line)
+        EpisodeLog(tmp_path).append(line)
     write_card(tmp_path, with_episodes(card(), lines))
     with pytest.raises(MemobenchError, match=f"drew their variants otherwise .{told}.: an earlier version"):
         resumed_card(tmp_path, card(), print)
     with pytest.raises(MemobenchError, match=f"{told}.*repeat it with that version"):
         repeat(tmp_path, None, None, lambda plan: 0, print)
     for name, line in zip(("part", "old"), lines, strict=True):
-        EpisodeLog(tmp_path / name, {}).append(line)
+        EpisodeLog(tmp_path / name).append(line)
     with pytest.raises(MemobenchError, match=r"old drew their variants otherwise than .*leave that folder out"):
         merge(tmp_path / "out", [tmp_path / "part", tmp_path / "old"])

@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -37,7 +36,6 @@ from lerobot_memobench.datasets import execution_frames
 from lerobot_memobench.datasets.feature_cache.frames import frame_reader, read_frame_table
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import check_resumed
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.run.training import trained_on
@@ -400,21 +398,6 @@ def test_episodes_that_are_not_there_are_refused(root: Path, episodes: list[int]
     told = re.escape(f"found episodes={named}, and the dataset {root} has 3 episodes; name some of 0 to 2")
     with pytest.raises(MemobenchError, match=told):
         opened(root, act(), episodes=episodes)
-
-
-@pytest.mark.parametrize("resume", [["--resume=true"], ["--resume"], ["--resume=false"], []])
-def test_plain_lerobot_train_goes_on_as_it_was_begun(
-    resume: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    MemobenchMemConfig(device="cpu", push_to_hub=False).save_pretrained(tmp_path)
-    file = tmp_path / "train_config.json"
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", f"--config_path={file}", "--policy.align=semantic", *resume])
-    check_resumed(tmp_path, MemobenchMemConfig(device="cpu", push_to_hub=False, n_action_steps=1))
-    changed = MemobenchMemConfig(device="cpu", push_to_hub=False, align="semantic")
-    check_resumed(tmp_path / "another", changed)
-    refuses = resume in (["--resume=true"], ["--resume"])
-    with pytest.raises(MemobenchError, match="begun with align=none") if refuses else nullcontext():
-        check_resumed(tmp_path, changed)
 
 
 @pytest.mark.slow

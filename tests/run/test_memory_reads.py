@@ -13,7 +13,7 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.observations import OBJECTS, RESET
+from lerobot_memobench.envs.settings import OBJECTS, RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import page_data
 from lerobot_memobench.evaluation.html.write import write_html

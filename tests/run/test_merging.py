@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes
+from lerobot_memobench.envs.evaluation_file import read_evaluation, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.records import read_card, read_protocol
+from lerobot_memobench.evaluation.records import read_protocol
 from lerobot_memobench.run.card import new_card, policy_facts, write_card
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.merging import merge, merge_and_report, part_folders
@@ -21,7 +23,7 @@ from tests.support.logs import SETTINGS
 
 def part(folder: Path, episodes: list[int], task: str = "a", settings: Any = SETTINGS, **changes: Any) -> Path:
     """Write a part: its log with protocol, its films, its card."""
-    log = EpisodeLog(folder, settings)
+    log = EpisodeLog(folder, settings and partial(write_protocol, folder, settings))
     for k in episodes:
         log.append(
             {
@@ -54,7 +56,7 @@ def with_card(folder: Path, shard: str, policy: str = "act", task_hash: str = "1
         checkpoint=None,
         trained_on=None,
         task_files={"a": task_hash},
-        flags=["--env.tasks=a"],
+        settings={"env": {"tasks": "a"}},
         runs=[run_facts(["lerobot", "eval", f"shard={shard}"], 1)],
         shard=shard,
     )
@@ -71,18 +73,18 @@ def test_logs_films_protocol_and_card_are_joined(tmp_path: Path) -> None:
     assert sorted(path.name for path in (out / "videos").iterdir()) == [f"a.{k}.mp4" for k in range(4)]
     assert os.path.samefile(out / "videos" / "a.2.mp4", tmp_path / "p0" / "videos" / "a.2.mp4")
     assert [(out / "memory_reads" / f"a.{k}.json.gz").read_text() for k in range(4)] == [f"reads {k}" for k in range(4)]
-    card = read_card(out / "card.json")
+    card = read_evaluation(out)
     assert len(card["episodes"]) == 4
     assert [run["command"][-1] for run in card["runs"]] == ["shard=1/2", "shard=2/2"]
     assert card["shard"] is None
     # Once more, and with a part that came later.
-    before = (out / "card.json").read_bytes(), (out / "episodes.jsonl").read_bytes()
+    before = (out / "evaluation.json").read_bytes(), (out / "episodes.jsonl").read_bytes()
     assert merge(out, parts) == []
-    assert before == ((out / "card.json").read_bytes(), (out / "episodes.jsonl").read_bytes())
+    assert before == ((out / "evaluation.json").read_bytes(), (out / "episodes.jsonl").read_bytes())
     settings = {**SETTINGS, "policy": {"type": "act", "identity": "act 1"}}
     assert merge(out, [part(tmp_path / "later", [0], task="b", settings=settings)]) == []
     assert len(read_episodes(out)) == 5
-    assert not (out / "card.json").exists()  # it would say nothing of the part without one
+    assert set(read_evaluation(out)) == {"format", "protocol"}  # a card would say nothing of the part without one
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
@@ -94,7 +96,7 @@ def test_the_same_episode_twice_counts_once(tmp_path: Path) -> None:
     parts = [part(tmp_path / "x", [0, 1]), part(tmp_path / "y", [1, 2], wall_s=77.0)]
     assert merge(tmp_path / "out", parts) == []
     assert [record["episode"] for record in read_episodes(tmp_path / "out")] == [0, 1, 2]
-    assert not (tmp_path / "out" / "card.json").exists()  # parts without cards: nobody knows the policy
+    assert set(read_evaluation(tmp_path / "out")) == {"format", "protocol"}  # parts without cards: no policy is known
 
 
 @pytest.mark.parametrize(

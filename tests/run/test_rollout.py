@@ -18,12 +18,14 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs import episode
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.envs.evaluation_file import read_evaluation
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memory_reads import ReadLog, find_reads
 from lerobot_memobench.run.rollout import Actor, roll
 from lerobot_memobench.sim.object_layout import SIZE
 
+STOVE = "turn_on_the_stove_and_turn_it_off"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 PROMPT, HORIZON, PLAN = 6, 9, 4
 STATISTICS = {
@@ -253,3 +255,21 @@ def test_what_chunks_read_is_noted_as_each_episode_ends(tmp_path: Path) -> None:
         ]
         assert [sum(chunk["weights"]) for chunk in chunks] == pytest.approx([1, 1, 1], abs=1e-3)
     assert not (tmp_path / "plain" / "memory_reads").exists()
+
+
+def test_the_default_batch_of_an_object_policy_changes_no_episode(tmp_path: Path) -> None:
+    """Ten rows in one process by default, or as many as there are episodes; each row acts as it would alone."""
+    from lerobot_memobench.cli.lerobot import main
+
+    words = ["policy=memobench_small", f"tasks={STOVE},{HIGHLIGHT}", "episodes=2", "horizon=80", "device=cpu"]
+    for name, more in (("default", []), ("alone", ["batch_size=1"])):
+        assert main(["eval", "env=memobench", *words, *more, f"output_dir={tmp_path / name}"]) == 0
+    sizes = [read_evaluation(tmp_path / name)["runs"][0]["batch_size"] for name in ("default", "alone")]
+    assert sizes == [2, 1]
+    own = {"wall_s", "run"}
+    default, alone = (
+        [{key: value for key, value in line.items() if key not in own} for line in read_episodes(tmp_path / name)]
+        for name in ("default", "alone")
+    )
+    assert default == alone
+    assert len(default) == 4

@@ -12,11 +12,12 @@ from lerobot_memobench.evaluation.report import table
 from lerobot_memobench.evaluation.report_tables import failure_line
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.processes import saying_how_to_go_on
-from lerobot_memobench.run.arguments import Arguments, read_arguments
+from lerobot_memobench.run.arguments import Arguments
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.run.merging import merge_and_report
-from lerobot_memobench.run.plan import EvaluationPlan, is_benchmark, make_plan, take_run_options
+from lerobot_memobench.run.plan import EvaluationPlan, make_plan, read_other, take_run_options
 from lerobot_memobench.run.run import EvaluationReport, run_evaluation
+from lerobot_memobench.run.settings import read_settings
 from lerobot_memobench.run.shards import plan_shards, run_shards, slurm_of
 
 if TYPE_CHECKING:
@@ -28,18 +29,20 @@ SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.lerobot", WITH_PARENT)
 
 
 def evaluate(given: Arguments, command: Sequence[str]) -> int:
-    """Run ``lerobot eval``; an environment of LeRobot's own gets nothing but the checks.
+    """Run ``lerobot eval`` on the benchmark.
 
     Args:
         command: the whole command line, for the card.
     """
     options, given = take_run_options(given)
-    arguments = read_arguments("eval", given)
-    if given.wants_help or not is_benchmark(arguments, options):
-        return call_lerobot("eval", arguments.for_parser)
-    plan = make_plan(arguments, options, command)
+    plan = make_plan(read_settings(given), options, command)
     with saying_how_to_go_on("lerobot", lambda: f"go on with: {plan.going_on}"):
         return evaluate_in_parts(plan) if options.shards else evaluate_here(plan)
+
+
+def evaluate_elsewhere(given: Arguments) -> int:
+    """Run ``lerobot-eval`` on another environment of LeRobot's, after checking the arguments."""
+    return call_lerobot("eval", read_other(given).for_parser)
 
 
 def evaluate_here(plan: EvaluationPlan, say_where: bool = True) -> int:

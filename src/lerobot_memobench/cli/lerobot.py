@@ -18,7 +18,14 @@ from pathlib import Path
 from lerobot_memobench.cli.console import WITH_PARENT, run_command, tell
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import as_path
-from lerobot_memobench.run.arguments import SHORT_FORMS, check_task_names, read_arguments, split_arguments
+from lerobot_memobench.jobs.threads import ACTING, use_threads
+from lerobot_memobench.run.arguments import (
+    SHORT_FORMS,
+    check_task_names,
+    is_of_benchmark,
+    read_arguments,
+    split_arguments,
+)
 from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands
 
 
@@ -46,9 +53,11 @@ def run(line: Sequence[str]) -> int:
         return train(given, line[1:], tell)
     check_task_names(given)
     if name == "eval":
-        from lerobot_memobench.cli.evaluate import evaluate
+        use_threads(ACTING)  # before torch is imported
+        from lerobot_memobench.cli.evaluate import evaluate, evaluate_elsewhere
 
-        return evaluate(given, ("lerobot", *line))
+        ours = is_of_benchmark(given) and not given.wants_help
+        return evaluate(given, ("lerobot", *line)) if ours else evaluate_elsewhere(given)
     return call_lerobot(name, read_arguments(name, given).for_parser)
 
 

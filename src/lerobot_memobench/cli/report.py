@@ -165,7 +165,7 @@ def merge(
 
 
 def rerun(
-    card: Annotated[Path, typer.Argument(help="A card.json, or the folder of an evaluation that holds one.")],
+    card: Annotated[Path, typer.Argument(help="The folder of an evaluation, or its evaluation.json.")],
     out: Annotated[Path | None, typer.Option(help="Folder of the repetition; a dated one when left out.")] = None,
     server: Annotated[
         str | None, typer.Option(help="Where the card's policy server is here, host:port; 127.0.0.1 needs no saying.")

@@ -18,7 +18,8 @@ from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import check_clock, objects_column
 from lerobot_memobench.envs.command_line import quiet
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, obs_type_of, reads_prompt
+from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.protocol import CLOCK

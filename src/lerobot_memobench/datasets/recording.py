@@ -150,7 +150,7 @@ def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
         return None
     steps = episode.progress.steps
     end = "and no longer to be" if episode.lost else "the expert's plan over"
-    how = f"in {episode.horizon} steps" if steps >= episode.horizon else f"by step {steps}, {end}"
+    how = f"in {episode.settings.horizon} steps" if steps >= episode.settings.horizon else f"by step {steps}, {end}"
     completed = f"{episode.progress.index} of {len(demo.task.checkpoints)} checkpoints completed"
     return f"goal not reached {how} ({completed})"
 

@@ -1,7 +1,7 @@
-"""Who acts, on what inputs, and which episodes were asked for: what LeRobot's command line tells an environment.
+"""The policy that acts, its inputs, and the episodes that were asked for, as the episode log names them.
 
-An environment's configuration holds nothing of the policy, and it is the environment that writes the log: what a line
-leaves out, such as whose episode it is, nobody can tell afterwards.
+The environment writes the log and does not know the policy; `lerobot eval` passes this to it. LeRobot's own commands do
+not: their logs name no policy.
 """
 
 from __future__ import annotations
@@ -17,16 +17,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.command_line import in_file, quiet, training_runs
+from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.episode_log import INPUTS, POLICY
+from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.observations import policy_inputs
-from lerobot_memobench.io import file_hash, is_there
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.io import file_hash
 from lerobot_memobench.protocol import SEALED, SPLITS
 
 logger = logging.getLogger(__name__)
 
-SEALED_LEDGER, SEALED_RUN = "sealed_tests.jsonl", "sealed.json"
-"""Files of `run.sealed`: the count of a policy's runs on the sealed seeds, and an evaluation's own run."""
+SEALED_LEDGER = "sealed_tests.jsonl"
+"""File of `run.sealed`: the count of a policy's runs on the sealed seeds."""
 NOT_THE_CHECKPOINT = (
     *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes", SEALED_LEDGER),
     *("training_curve.png", "training_curve.json"),
@@ -37,10 +39,10 @@ ELSEWHERE = (
     *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
     *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
 )
-"""Settings of a policy that say where it runs or where it goes, not what it does."""
+"""Settings of where a policy runs or is published; its actions do not depend on them."""
 
 DIGITS = 12
-"""Of a hash that tells policies apart."""
+"""Digits of the hash that identifies a policy."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,10 @@ class Acting:
     """Whose episodes are being run.
 
     Attributes:
-        policy: ``type``, ``identity`` and, of a checkpoint in a folder, ``sha256``; {} where nobody knows.
-        inputs: of the policy, in words; None where nobody knows.
+        policy: ``type``, ``identity`` and, of a checkpoint in a folder, ``sha256``; {} where not known.
+        inputs: of the policy, in words; None where not known.
         run: names this run of LeRobot's evaluation; a log may hold several, of one policy.
-        seeds: of the episodes that were asked for; None where nobody knows. LeRobot runs whole batches, and what it
+        seeds: of the episodes that were asked for; None where not known. LeRobot runs whole batches, and what it
             runs beyond these is no part of the evaluation.
     """
 
@@ -66,12 +68,12 @@ class Acting:
 
     @property
     def protocol(self) -> dict[str, Any]:
-        """What goes beside the log, as far as it is known."""
+        """The part of the protocol that names inputs and policy, where known."""
         return _known({INPUTS: self.inputs, POLICY: dict(self.policy) or None})
 
     @property
     def line(self) -> dict[str, Any]:
-        """What goes on every line of the log, as far as it is known."""
+        """The fields of every line of the log, where known."""
         return _known({POLICY: self.policy.get("identity"), "run": self.run, INPUTS: self.inputs})
 
 
@@ -83,58 +85,47 @@ def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in facts.items() if value is not None}
 
 
-def acting(policy: Any | None, path: str | None, seeds: range | None, obs_type: str, oracle_memory: bool) -> Acting:
-    """Return who acts in environments that observe this.
+def acting(policy: Any, path: str | None, seeds: range | None, settings: EnvSettings) -> Acting:
+    """Return the policy that acts in environments of these settings.
 
     Args:
-        policy: its configuration; where only its type is known, the class of it; None where nothing is.
+        policy: its configuration.
         path: of its checkpoint, None for a policy without one.
         seeds: see `Acting`.
     """
-    if policy is None:
-        return NOBODY
     run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
-    return Acting(_identity(policy, path, run), policy_inputs(policy, obs_type, oracle_memory), run, seeds)
+    inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
+    return Acting(_identity(policy, path), inputs, run, seeds)
 
 
 # --- identity ---
 
 
-def _identity(policy: Any, path: str | None, run: str) -> dict[str, Any]:
-    """Return what tells a policy from others: its type, its checkpoint, and what was set otherwise than there.
-
-    Of a policy in training, whose weights are nowhere else yet, the run is all there is to tell.
-    """
-    from lerobot.configs import PreTrainedConfig
-
-    kind = PreTrainedConfig.get_choice_name(policy if isinstance(policy, type) else type(policy))
-    if training_runs():
-        return {"type": kind, "identity": f"{kind} in training {run}"}
+def _identity(policy: Any, path: str | None) -> dict[str, Any]:
+    """Return the type of a policy and one hash of its checkpoint and of the settings that differ from it."""
     weights = None if path is None else checkpoint_hash(path)
     with quiet():
         plain = _unchanged(policy, path)
-    facts = json.dumps([kind, weights, _changes(policy, plain)], sort_keys=True, default=str)
-    found = {"type": kind, "identity": f"{kind} {hashlib.sha256(facts.encode()).hexdigest()[:DIGITS]}"}
+    facts = json.dumps([policy.type, weights, _changes(policy, plain)], sort_keys=True, default=str)
+    found = {"type": policy.type, "identity": f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:DIGITS]}"}
     return found | ({"sha256": weights} if path is not None and Path(path).is_dir() else {})
 
 
 def _unchanged(policy: Any, path: str | None) -> Any:
-    """Return the configuration that a policy would have if nothing were said of it."""
+    """Return the configuration that a policy would have by default."""
     from lerobot.configs import PreTrainedConfig
 
     if path is not None:
         return PreTrainedConfig.from_pretrained(path)
-    if isinstance(policy, type):
-        return policy
     try:
         return type(policy)()
-    except TypeError:  # somebody's that asks for a setting
+    except TypeError:  # a plugin's that requires a setting
         return policy
 
 
 def _changes(policy: Any, plain: Any) -> dict[str, Any]:
-    """Return the settings of a policy that are not as they would be unasked; a file counts by its content."""
-    before, now = ({}, in_file(POLICY) or {}) if isinstance(policy, type) else (encoded(plain), encoded(policy))
+    """Return the settings of a policy that differ from its default; a file counts by its content."""
+    before, now = encoded(plain), encoded(policy)
     return {k: _content(v) for k, v in now.items() if k not in (*ELSEWHERE, "type") and before.get(k) != v}
 
 
@@ -195,12 +186,12 @@ def note_sealed(seed: int, log_dir: Path | None) -> None:
     """Log, once per process, that a scene of the sealed test is used outside of a counted run of it.
 
     Args:
-        seed: of the scene. log_dir: folder of the episode log; a counted run (`run.sealed`) has its number there, or
-            beside it, where it is a part of one.
+        seed: of the scene.
+        log_dir: folder of the episode log; the evaluation's file holds the number of a counted run (`run.sealed`).
     """
     if seed not in SPLITS[SEALED]:
         return
-    if log_dir is None or not any(is_there(folder / SEALED_RUN) for folder in (log_dir, log_dir.parent)):
+    if log_dir is None or "sealed" not in read_evaluation(log_dir):
         _log_sealed(SPLITS[SEALED])
 
 

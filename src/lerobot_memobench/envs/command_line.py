@@ -1,38 +1,14 @@
-"""What LeRobot's command line says beside the environment: its configuration holds no policy, training or names."""
+"""Overrides and names from LeRobot's command line, and its log lines kept quiet."""
 
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
-
-if TYPE_CHECKING:
-    from lerobot.configs import PreTrainedConfig
-
-
-def policy_being_run() -> PreTrainedConfig | type | None:
-    """Return the configuration of the policy on LeRobot's command line; where only its type is told, in a file, the
-    class of it; None where none is told.
-
-    An environment's configuration does not hold the policy; LeRobot's parser tells it.
-    """
-    import draccus
-    from lerobot.configs import PreTrainedConfig, parser
-
-    path, name = parser.get_path_arg("policy"), parser.get_type_arg("policy")
-    told = overrides("policy")
-    with quiet():
-        if path is not None:
-            told = [*parser.get_yaml_overrides("policy"), *told]
-            return PreTrainedConfig.from_pretrained(path, cli_overrides=told)
-        known: dict[str, type] = PreTrainedConfig.get_known_choices()
-        kind = known.get(str(name or in_file("policy", "type")))
-        return kind if kind is None or name is None else draccus.parse(kind, args=told)
 
 
 def overrides(key: str, flags: Sequence[str] | None = None) -> list[str]:
@@ -53,11 +29,6 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         logging.disable(level)
-
-
-def training_runs() -> bool:
-    """Return whether a dataset is on LeRobot's command line: then a policy is trained on it, whatever it saw before."""
-    return any(argument.startswith("--dataset.") for argument in sys.argv[1:]) or in_file("dataset") is not None
 
 
 def rename_map() -> dict[str, str]:
@@ -96,23 +67,3 @@ def in_file(*keys: str, flags: Sequence[str] | None = None) -> Any | None:
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
         return None
     return found
-
-
-def asked_seeds() -> range | None:
-    """Return the seeds of each task's episodes on LeRobot's command line, None where it draws without seeds."""
-    from lerobot.configs.default import EvalConfig
-    from lerobot.configs.eval import EvalPipelineConfig
-
-    count = _number("eval.n_episodes", EvalConfig.n_episodes)
-    first = _number("seed", EvalPipelineConfig.seed)
-    return range(first, first + count) if isinstance(first, int) and isinstance(count, int) else None
-
-
-def _number(name: str, default: int | None) -> Any:
-    from lerobot.configs import parser
-
-    told = parser.parse_arg(name)
-    if told is not None:
-        return yaml.safe_load(told)
-    found = in_file(*name.split("."))
-    return default if found is None else found

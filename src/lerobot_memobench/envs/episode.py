@@ -8,25 +8,25 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.envs.pacing import NOTHING, Pacing, steps_per_action
+from lerobot_memobench.envs.pacing import NOTHING, Pacing
 from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
-from lerobot_memobench.errors import check_choice
+from lerobot_memobench.envs.settings import DEFAULTS, EnvSettings, steps_per_action
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import (
     ACTION_DIM,
-    BY_PAPER,
     CAMERAS,
     ENDED,
     EXECUTION,
     HORIZON,
     IDLE_STEPS,
+    IMAGE_SIZE,
     NO_CLOCK,
     PROMPT,
     PROMPT_HORIZON,
@@ -45,7 +45,7 @@ from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import DRAWN, REFERENTS, STRICT, Task, referent_text
+from lerobot_memobench.tasks.task import STRICT, Task, referent_text
 
 
 class Fault(NamedTuple):
@@ -60,14 +60,10 @@ class Episode:
 
     Args:
         task: the published task.
-        referent: `fixed`, the catalogue's goal, or `random`, one of the task's variants by seed; of the strict suite
-            one of the variants always, which is told as `drawn`.
-        demonstration_prompt: whether tasks that have a prompt begin with it; what it hides is hidden unseen without.
-        horizon: execution steps before truncation, of actions at full speed.
-        protocol: `paper`, or `upstream`, whose clock runs in the stabilisation steps too, and whose episodes end when
-            all checkpoints have held. What goes with it is set by whoever asks for it (`envs.upstream`).
-        render: size and quality of frames.
-        pause_steps, speed, replan_steps: see `pacing.Pacing`.
+        settings: of the environment; those of an episode are ``referent``, ``demonstration_prompt``, ``horizon``,
+            ``protocol``, ``render`` and the pacing. Objects hidden by a prompt that is not shown are hidden unseen.
+        render: size and quality of frames; as in ``settings`` when None.
+        changes: settings by name, other than in ``settings``.
 
     Attributes:
         task: the task of this episode: a variant of the given one when the referent is random.
@@ -81,24 +77,14 @@ class Episode:
     """
 
     def __init__(
-        self,
-        task: Task,
-        *,
-        referent: str = "fixed",
-        demonstration_prompt: bool = True,
-        horizon: int = HORIZON,
-        protocol: str = BY_PAPER,
-        render: RenderSettings | None = None,
-        pause_steps: int = 0,
-        speed: float = 1.0,
-        replan_steps: int | None = None,
+        self, task: Task, settings: EnvSettings = DEFAULTS, *, render: RenderSettings | None = None, **changes: Any
     ) -> None:
-        check_choice("referent", referent, (*REFERENTS, DRAWN) if task.drawn else REFERENTS)
+        self.settings = settings = settings.changed(**changes)
+        render = render or RenderSettings(IMAGE_SIZE, IMAGE_SIZE, settings.render)
         self.published = task
-        self.referent, self.horizon, self.protocol = referent_text(referent, task.drawn), horizon, protocol
-        self._limit = horizon * steps_per_action(speed)
-        self._paced = pause_steps, speed, replan_steps
-        self.demonstration_prompt = demonstration_prompt and task.prompt is not None
+        self.referent = referent_text(settings.referent, task.drawn)
+        self._limit = settings.horizon * steps_per_action(settings.speed)
+        self.demonstration_prompt = settings.demonstration_prompt and task.prompt is not None
         self.sim = Simulation(task, render)
         self._slots: ObjectSlots | None = None
         self.task = task
@@ -123,7 +109,7 @@ class Episode:
             task = self.published.variant(variant)
         self.task = task
         self.choice = None if variant is None else Choice(task)
-        if self.protocol == UPSTREAM:
+        if self.settings.protocol == UPSTREAM:
             self.progress = Progress(task, UPSTREAM_EVALUATIONS)
             self.sim.reset(self.seed, self.progress.settle)
         else:
@@ -133,7 +119,7 @@ class Episode:
         self._start = self.sim.snapshot()
         self.step_index = 0
         self.exec_start: int | None = None
-        self.pacing = Pacing(*self._paced, self._rng(4))
+        self.pacing = Pacing(self.settings, self._rng(4))
         self.rested = False
         self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, dtype=np.float32)
         self.prompt_shown: bool | None = None
@@ -182,7 +168,7 @@ class Episode:
             return
         self.sim.begin_execution()
         self.exec_start = self.step_index
-        # What holds already, such as a thing on the plate that it is to leave, is nobody's mistake.
+        # What holds already, such as a thing on the plate that it is to leave, is no mistake.
         self._wrong = [atom for atom in _wrong_atoms(self.task) if not self.sim.holds(atom)]
 
     @property
@@ -229,20 +215,20 @@ class Episode:
 
     @property
     def lost(self) -> bool:
-        """The goal can no longer be reached; told of strict tasks only, the published ones run to their horizon."""
+        """The goal can no longer be reached; for strict tasks only; published ones run to their horizon."""
         return self.task.suite == STRICT and self.phase == EXECUTION and self.progress.lost
 
     @property
     def cut_off(self) -> bool:
         """The horizon ended it, and is shorter than the protocol's: what was missing might have come."""
-        whole = UPSTREAM_HORIZON if self.protocol == UPSTREAM else HORIZON
-        return self.horizon < whole and self.exec_steps >= self._limit and not (self.success or self.lost)
+        whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else HORIZON
+        return self.settings.horizon < whole and self.exec_steps >= self._limit and not (self.success or self.lost)
 
     @property
     def closed(self) -> bool:
         """All checkpoints have held, in whatever order: in the authors' evaluation that is the end."""
         first = self.progress.first_step
-        return self.protocol == UPSTREAM and bool(first) and None not in first
+        return self.settings.protocol == UPSTREAM and bool(first) and None not in first
 
     @property
     def done(self) -> bool:
@@ -274,7 +260,7 @@ class Episode:
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong)
 
     def _act(self, action: ArrayLike) -> Fault | None:
-        """Carry out what the policy says; return what went wrong."""
+        """Carry out the action of the policy; return the fault, if any."""
         try:
             numbers = as_action(action, np.float32)  # before it is clipped: infinity would become 1
             moved = self.pacing.step(np.clip(numbers, -1.0, 1.0))
@@ -333,7 +319,7 @@ def referent_of(task: Task, seed: int) -> Task:
     """Return the variant of a task that a random referent shows in the episode of a seed.
 
     Variants are drawn in balance: from the first seed of a split on (`protocol.SPLITS`), every run of as many seeds as
-    there are variants shows each of them once, in an order drawn anew. So each is right equally often, in a dataset as
+    there are variants shows each of them once, in a new order. So each is right equally often, in a dataset as
     in an evaluation, and which one it is says nothing about where things stand.
     """
     if task.num_variants == 1:

@@ -1,9 +1,8 @@
-"""The episode log of an evaluation, one JSON line per finished rollout, and the protocol file beside it.
+"""The episode log of an evaluation, one JSON line per finished rollout.
 
 Each process appends to a file of its own, ``<dir>/episodes/<task>.<pid>.jsonl``, so workers never wait for one another
-and a killed run loses at most the line being written. ``read_episodes`` merges them. Settings that the lines leave out
-and that decide whether two evaluations may be compared (horizon, rendering) are in ``<dir>/protocol.json``, written
-with the first line, also by plain ``lerobot-eval`` and from async workers.
+and a killed run loses at most the line being written. ``read_episodes`` merges them. The settings of the evaluation are
+in another file, see `evaluation_file`.
 """
 
 from __future__ import annotations
@@ -12,12 +11,13 @@ import json
 import logging
 import os
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDict
 
 from annotated_types import Ge, Le
 
+from lerobot_memobench.envs.settings import GOALS, IDLE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -32,13 +32,12 @@ from lerobot_memobench.io import (
     file_name,
     packed,
     parsed,
-    read_json,
     write_file,
 )
-from lerobot_memobench.protocol import BY_PAPER, IDLE_STEPS
+from lerobot_memobench.protocol import BY_PAPER
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import MEMOBENCH, PUBLISHED, STRICT, Task
+from lerobot_memobench.tasks.task import MEMOBENCH, PUBLISHED, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
@@ -47,7 +46,6 @@ logger = logging.getLogger(__name__)
 
 EPISODES_FOLDER = "episodes"
 MERGED_FILE = "episodes.jsonl"
-PROTOCOL_FILE = "protocol.json"
 WRITTEN_AT = "written_at"
 """In the workers' files only: when the line was written, s since 1970. It decides which of two lines is newer."""
 
@@ -83,7 +81,7 @@ class Outcome(TypedDict, total=False):
         choice: where each scene is run with each variant: which one was acted on; None: none of them.
         answered: whether an answer was given; False with a choice of None: none was.
         variants: then, of the task: how many there are to choose from.
-        chance: then, of the task: the rate of right choices without the past; None where the instruction tells.
+        chance: then, of the task: the rate of right choices without the past; None where the instruction names it.
         failure: class of the failure; None for a success.
         suite: of tasks that are not published: strict.
         world: of scenes that are not the package's own: libero.
@@ -147,12 +145,11 @@ class EpisodeRecord(Outcome):
     written_at: NotRequired[Number]
 
 
-def episode_record(episode: Episode, number: int, replan_steps: int | None, wall_s: float) -> dict[str, Any]:
-    """Return an episode's line for the log (`EpisodeRecord` says what its fields mean).
+def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, Any]:
+    """Return an episode's line for the log (fields: `EpisodeRecord`).
 
     Args:
         number: of the episode in its evaluation, from 0 on.
-        replan_steps: actions that the policy executes per prediction, where it is known.
         wall_s: seconds that the episode took.
     """
     progress, task, fault = episode.progress, episode.task, episode.fault
@@ -166,7 +163,7 @@ def episode_record(episode: Episode, number: int, replan_steps: int | None, wall
         "seed": episode.seed,
         "referent": episode.referent,
         "variant": task.variant_index,
-        "replan_steps": replan_steps,
+        "replan_steps": episode.settings.replan_steps,
         "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
         "prompt_shown": episode.prompt_shown,
         "steps": episode.exec_steps,
@@ -183,7 +180,7 @@ def episode_record(episode: Episode, number: int, replan_steps: int | None, wall
         **({} if fault is None else {"fault": fault.why}),
         **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
         **({} if task.world == MEMOBENCH else {"world": task.world, "stand_ins": list(episode.stand_ins)}),
-        **({} if episode.protocol == BY_PAPER else {"protocol": episode.protocol}),
+        **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),
         "scene_hash": episode.scene_hash,
         "wall_s": round(wall_s, 3),
     }
@@ -225,12 +222,12 @@ class EpisodeLog:
     """Appends finished rollouts of this process to ``directory``, which is made when the first one ends.
 
     Args:
-        protocol: settings of the evaluation, written beside the log before its first line.
+        begin: called once, before the first line is written; it may refuse.
     """
 
-    def __init__(self, directory: str | Path, protocol: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, directory: str | Path, begin: Callable[[], object] | None = None) -> None:
         self.directory = Path(directory)
-        self._protocol = protocol
+        self._begin = begin
 
     def append(self, record: Mapping[str, Any]) -> Path:
         """Write one rollout to disk, for good when this returns; return the file it went to.
@@ -252,9 +249,9 @@ class EpisodeLog:
             ) from error
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if self._protocol is not None:
-                write_protocol(self.directory, self._protocol)
-                self._protocol = None
+            if self._begin is not None:
+                self._begin()
+                self._begin = None
             with path.open("ab+") as file:
                 if _ends_torn(file):  # a killed process with the same number was here before
                     line = b"\n" + line
@@ -379,7 +376,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
 
 
 def _check_one_policy(directory: Path, policies: Mapping[str | None, tuple[Path, Mapping[str, Any]]]) -> None:
-    """Refuse a log of several policies (identity -> a line of it and its file): its rates would be nobody's."""
+    """Refuse a log of several policies (identity -> a line of it and its file): rates would mix them."""
     known = [(name, *place) for name, place in policies.items() if name is not None]
     if len(known) > 1:
         told = " and ".join(f"{name} ({record['task']}, in {file.name})" for name, file, record in known[:2])
@@ -429,37 +426,14 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 # --- the protocol ---
 
 
-SETTINGS = (
-    "suite",
-    "world",
-    "protocol",
-    "seed_base",
-    "obs_type",
-    "referent",
-    "demonstration_prompt",
-    "prompt_in",
-    "horizon",
-    "replan_steps",
-    "render",
-    "render_every",
-    "oracle_memory",
-    "pause_steps",
-    "speed",
-    "evidence",
-)
-"""Settings that must agree for two evaluations to be one, or to be compared."""
-IDLE = "idle"
-"""Control steps that the robot of a strict task idles at most before the execution. It is no choice: protocols hold it
-because the first strict evaluations were without."""
-GOALS, STRICT_GOALS = "goals", 2
-"""Revision of the goals of strict tasks: 1 could be reached without a memory, by notes in the scene and a clock."""
 UNTOLD: dict[str, Any] = {
     **{"suite": PUBLISHED, "world": MEMOBENCH, "protocol": BY_PAPER},
-    **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1},
+    **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, "render_every": 1},
 }
-"""What a protocol means that leaves these out: there was nothing else when it was written."""
+"""Values of settings that a protocol leaves out: there were no others when it was written. ``render_every`` is a
+setting of earlier versions: control steps per drawn picture."""
 INPUTS = "inputs"
-"""Inputs of the policy, in the words of `observations.policy_inputs`; absent where nobody wrote them down."""
+"""Inputs of the policy, in the words of `observations.policy_inputs`; absent in logs from before they were recorded."""
 OF_THE_POLICY = ("prompt_in", INPUTS)
 """Settings that follow from the policy: evaluations of two policies may differ in them, which is told, parts of one may
 not."""
@@ -469,81 +443,6 @@ POLICY = "policy"
 MOST_EPISODES = 100_000
 """Of one task. Every episode that was asked for and is missing is counted, so a file must not ask for any number."""
 Episodes = Annotated[int, Ge(0), Le(MOST_EPISODES)]
-
-
-class Settings(TypedDict, total=False):
-    """Settings of an evaluation; one in which joined episodes differ is a list of its values.
-
-    Attributes:
-        suite: published or strict.
-        world: memobench, the package's own, or libero, the paper's.
-        protocol: paper, or upstream, the authors' evaluation.
-        seed_base: seed of episode 0.
-        obs_type: what the environment observes.
-        referent: fixed, random or drawn.
-        demonstration_prompt: whether prompted tasks begin with their demonstration prompt.
-        horizon: execution steps after which an episode ends.
-        replan_steps: actions executed per prediction; None for the policy's own number.
-        render: quality of the pictures.
-        render_every: control steps per drawn picture.
-        oracle_memory: whether the instruction tells what was done so far.
-        pause_steps, speed: of the execution, see `pacing`.
-        evidence: whether each scene is run with each variant.
-        idle, goals: see `IDLE`, `GOALS`; of strict tasks alone.
-        inputs: what the policy was given.
-    """
-
-    suite: Name
-    world: Name
-    protocol: Name
-    seed_base: Whole | list[Whole]
-    obs_type: Name | None
-    referent: Name | list[Name]
-    demonstration_prompt: bool | None
-    horizon: Count | None
-    replan_steps: Count | list[Count | None] | None
-    render: Name | None
-    render_every: Count | None
-    oracle_memory: bool | None
-    pause_steps: Whole
-    speed: Number
-    idle: Count | None
-    goals: Count
-    evidence: bool
-    inputs: Name | None
-
-
-class PolicyIdentity(TypedDict, total=False):
-    """Whose episodes they are, of evaluations without a card: see `acting.Acting`."""
-
-    type: Name | None
-    identity: Name
-    sha256: str | None
-
-
-class Protocol(Settings, total=False):
-    """``protocol.json``, and the protocol of a card."""
-
-    tasks: list[Name]
-    episodes: Episodes
-    policy: PolicyIdentity
-
-
-class WholeProtocol(Settings):
-    """The protocol of a card from which an evaluation is resumed: it says how much was asked for.
-
-    Attributes:
-        tasks: their names, sorted.
-        episodes: asked for of each task.
-    """
-
-    tasks: list[Name]
-    episodes: Episodes
-
-
-def revision(suite: str) -> dict[str, int]:
-    """Return the part of a suite's protocol that changed with versions: idling and goals of strict tasks."""
-    return {IDLE: IDLE_STEPS, GOALS: STRICT_GOALS} if suite == STRICT else {}
 
 
 def differences(
@@ -589,38 +488,3 @@ def _text(value: Any) -> str:
         return cut(str(value))
     shown = ", ".join(cut(str(each)) for each in value[:3])
     return f"{shown}, … ({len(value)})" if len(value) > 3 else shown
-
-
-def read_protocol_file(directory: Path) -> dict[str, Any]:
-    """Return the settings written beside a log, {} where there are none.
-
-    Raises:
-        MemobenchError: the file is none of this package's.
-    """
-    try:
-        found: dict[str, Any] = read_json(
-            directory / PROTOCOL_FILE, Protocol, "remove the file, or evaluate into another folder"
-        )
-    except FileNotFoundError:
-        return {}
-    return found
-
-
-def check_protocol(directory: Path, settings: Mapping[str, Any]) -> bool:
-    """Return whether the folder holds this protocol already; raise where it holds another one."""
-    earlier = read_protocol_file(directory)
-    found = differences(earlier, settings, policy=True) if earlier else []
-    if found:
-        what = "policy" if all(each.startswith(f"{POLICY}.") for each in found) else "protocol"
-        raise MemobenchError(
-            f"{directory} holds episodes of another {what} ({'; '.join(found)}, the first value being that of the "
-            "episodes there); evaluate into another folder"
-        )
-    return bool(earlier)
-
-
-def write_protocol(directory: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings beside a log, whole or not at all; leave equal ones as they are, refuse others."""
-    if check_protocol(directory, settings):
-        return
-    write_file(directory / PROTOCOL_FILE, json.dumps(dict(settings), indent=1) + "\n", durable=True)

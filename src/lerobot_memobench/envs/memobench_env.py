@@ -6,8 +6,9 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -16,53 +17,35 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.acting import NOBODY, Acting, note_sealed
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.episode_log import (
-    EpisodeLog,
-    episode_record,
-    has_log,
-    not_run_record,
-    read_log,
-    revision,
-)
+from lerobot_memobench.envs.episode_log import EpisodeLog, episode_record, has_log, not_run_record, read_log
+from lerobot_memobench.envs.evaluation_file import write_protocol
 from lerobot_memobench.envs.observations import (
-    EVERY,
     METADATA,
-    OBS_TYPES,
-    PIXELS,
-    RESET,
     REWARDS,
     SPARSE,
-    STEPS,
     Observer,
     action_space,
     blank,
-    check_counts,
     observation_space,
 )
-from lerobot_memobench.envs.pacing import check_pacing, longest
-from lerobot_memobench.envs.upstream import upstream_settings
+from lerobot_memobench.envs.pacing import longest
+from lerobot_memobench.envs.settings import AUTO, DEFAULTS, EVERY, RESET, STEPS, EnvSettings
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
 from lerobot_memobench.protocol import (
     ACTION_DIM,
-    BY_PAPER,
-    EVALUATION_SEED,
     EXECUTION,
-    HORIZON,
     IDLE_STEPS,
     IMAGE_SIZE,
     PROMPT,
     PROMPT_HORIZON,
-    PROTOCOLS,
     UNSEEDED,
-    UPSTREAM,
 )
-from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
-from lerobot_memobench.tasks.evidence import check_referent, scene_and_variant
+from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-from lerobot_memobench.tasks.task import MEMOBENCH, World, referent_text
+from lerobot_memobench.tasks.task import World
 
 logger = logging.getLogger(__name__)
 
@@ -87,13 +70,13 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     Args:
         task: a name in the catalogue of either suite, or a task's folder.
+        settings: of the environment; ``suite`` follows from the task, and ``prompt_in=auto`` means `STEPS`.
         log_dir: where finished episodes are logged; nowhere when None.
-        acting: whose episodes they are; one that it does not count is neither logged nor recorded.
+        acting: the policy whose episodes these are; episodes that were not asked for are neither logged nor recorded.
         reward: `sparse`, 1 at success; or `checkpoints`, of K memory checkpoints 1 / (K + 1) when one is completed in
             order, and as much at success. An episode's rewards add up to 1 at most, and to 1 only where it succeeds.
         render_mode: gymnasium's; there is one.
-
-    The other arguments are the settings of `MemobenchEnvConfig`.
+        changes: settings by name, other than in ``settings``, such as ``obs_type``.
     """
 
     metadata = METADATA
@@ -101,95 +84,43 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def __init__(
         self,
         task: str,
+        settings: EnvSettings = DEFAULTS,
         *,
-        world: World = MEMOBENCH,
-        protocol: str = BY_PAPER,
         log_dir: str | None = None,
-        obs_type: str = PIXELS,
-        referent: str = "fixed",
-        demonstration_prompt: bool = True,
-        prompt_in: str = STEPS,
-        reward: str = SPARSE,
-        horizon: int = HORIZON,
-        render: str = "default",
-        render_every: int = 1,
-        replan_steps: int | None = None,
-        expert_action: bool = False,
-        blind_action: bool = False,
-        oracle_memory: bool = False,
-        pause_steps: int = 0,
-        speed: float = 1.0,
-        evidence: bool = False,
-        videos: int | None = None,
-        seed_base: int = EVALUATION_SEED,
         acting: Acting = NOBODY,
+        reward: str = SPARSE,
         render_mode: str = "rgb_array",
+        **changes: Any,
     ) -> None:
-        check_choice("protocol", protocol, PROTOCOLS)
-        check_choice("obs_type", obs_type, OBS_TYPES)
         check_choice("reward", reward, REWARDS)
-        check_choice("prompt_in", prompt_in, (STEPS, RESET))
-        check_counts(horizon=horizon, render_every=render_every)
-        check_pacing("", pause_steps, speed)
+        self._task = load_task(task) if suite_of(task) is None else get_task(task)
+        settings = settings.changed(**{**changes, "suite": self._task.suite})
+        if settings.prompt_in == AUTO:
+            settings = settings.changed(prompt_in=STEPS)
+        self.settings = settings
         self.render_mode = render_mode
-        self._task = (load_task(task) if suite_of(task) is None else get_task(task)).in_world(world)
+        self._task = self._task.in_world(cast("World", settings.world))
         self.task = self._task.name
         if log_dir is not None:  # now, not when the first episode has been simulated
             file_name(self.task, "the name of a task")
         self._episode: Episode | None = None
-        self._oracle_memory = oracle_memory
         self._describe(0)
         self._reward = reward
-        agreed = {
-            "suite": self._task.suite,
-            "world": world,
-            "protocol": protocol,
-            "seed_base": seed_base,
-            "obs_type": obs_type,
-            "referent": referent_text(referent, self._task.drawn),
-            "demonstration_prompt": demonstration_prompt,
-            "prompt_in": prompt_in,
-            "horizon": horizon,
-            "replan_steps": replan_steps,
-            "render": render,
-            "render_every": render_every,
-            "oracle_memory": oracle_memory,
-            "pause_steps": pause_steps,
-            "speed": speed,
-            **revision(self._task.suite),
-            "evidence": evidence,
-            **acting.protocol,
-        }
-        if protocol == UPSTREAM:
-            agreed |= upstream_settings("", agreed)
-        self._longest = longest(agreed["horizon"], pause_steps, speed, replan_steps)
-        self.observation_space = observation_space(expert_action, render_every, obs_type, blind_action, self._longest)
+        self._longest = longest(settings)
+        self.observation_space = observation_space(settings, self._longest)
         self.action_space = action_space()
         self._acting = acting
-        self._log = EpisodeLog(log_dir, agreed) if log_dir is not None else None
         self._log_dir = Path(log_dir) if log_dir is not None else None
-        self._recorded = videos or 0
+        self._log = self._opened_log(log_dir) if log_dir is not None else None
         self._video: VideoRecorder | None = None
-        self._observer = Observer(obs_type, render_every)
-        self._referent = str(agreed["referent"])
-        if evidence:
-            check_referent("", self._referent)
-        self._settings: dict[str, Any] = {
-            "referent": referent,
-            "demonstration_prompt": agreed["demonstration_prompt"],
-            "horizon": agreed["horizon"],
-            "protocol": protocol,
-            "render": RenderSettings(IMAGE_SIZE, IMAGE_SIZE, render),
-            "pause_steps": pause_steps,
-            "speed": speed,
-            "replan_steps": replan_steps,
-        }
-        self._prompt_in, self._evidence = prompt_in, evidence
-        self._replan_steps = replan_steps
-        self._expert_action, self._blind_action, self._seed_base = expert_action, blind_action, seed_base
+        self._observer = Observer(settings.obs_type)
         self._began = self._closed = False
         self._not_run: str | None = None
         self._warned: set[str] = set()
+
+    def _opened_log(self, folder: str) -> EpisodeLog:
+        protocol = self.settings.protocol_block | self._acting.protocol
+        return EpisodeLog(folder, partial(write_protocol, Path(folder), protocol))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy is made of: all but the running episode, with its scene and generators."""
@@ -199,16 +130,16 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def episode(self) -> Episode:
         """The running episode; its scene is compiled in the process that first asks."""
         if self._episode is None:
-            self._episode = Episode(self._task, **self._settings)
+            self._episode = Episode(self._task, self.settings)
         return self._episode
 
     @property
     def _max_episode_steps(self) -> int:
         """Upper bound for LeRobot's loop: what it steps through. The horizon counts execution steps without pauses."""
         task = self._task
-        if self._prompt_in == RESET:
+        if self.settings.prompt_in == RESET:
             return self._longest
-        prompt = self._settings["demonstration_prompt"] and task.prompt is not None
+        prompt = self.settings.demonstration_prompt and task.prompt is not None
         longest_prompt = PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
         return self._longest + (longest_prompt if prompt else 0) + (IDLE_STEPS if task.idles else 0)
 
@@ -225,9 +156,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._started = time.monotonic()
         self._began, self._closed, self._over, self._not_run = True, False, False, None
         self._discard_video()
-        self._number = number = seed - self._seed_base
-        scene, variant = scene_and_variant(self._task, number) if self._evidence else (number, None)
-        self._scene_seed = self._seed_base + scene
+        settings = self.settings
+        self._number = number = seed - settings.seed_base
+        scene, variant = scene_and_variant(self._task, number) if settings.evidence else (number, None)
+        self._scene_seed = settings.seed_base + scene
         note_sealed(self._scene_seed, self._log_dir)
         with self._noting():
             self.episode.reset(self._scene_seed, variant, keep_prompt=named)
@@ -235,12 +167,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             return blank(self.observation_space), self._info()
         self._describe(0)
         self._observer.begin(self.episode)
-        recorded = (self._recorded == EVERY or 0 <= number < self._recorded) and self._acting.counts(seed)
+        recorded = (settings.videos == EVERY or 0 <= number < settings.videos) and self._acting.counts(seed)
         if self._log_dir is not None and recorded:
             self._video = VideoRecorder(self._log_dir / "videos" / f"{self.task}.{number}.mp4")
             self._video.add(self.render())
         with self._noting():
-            if self._prompt_in == RESET and self.episode.phase == PROMPT:
+            if settings.prompt_in == RESET and self.episode.phase == PROMPT:
                 self._play_prompt()
         return self._observation(), self._info()
 
@@ -268,7 +200,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._log is None and self._not_run is None and (fault := self.episode.fault) is not None:
             raise MemobenchError(f"the episode has ended ({fault.why}); begin another by reset()")
         if self._not_run is None:
-            # A dataset's labels count what was completed before a frame; what this step completes is told one later.
+            # A dataset's labels count checkpoints before a frame; those of this step count one frame later.
             completed = self.episode.progress.index
             with self._noting():
                 self.episode.step(action)
@@ -308,7 +240,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @contextmanager
     def _noting(self) -> Iterator[None]:
-        """Note why an episode cannot be run, where there is a log to say it in."""
+        """Note the reason why an episode cannot be run, if it is logged; else raise."""
         try:
             yield
         except MemobenchError as error:
@@ -346,7 +278,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         """Set the instruction, which LeRobot asks for at every step; the oracle's has the memory text behind it."""
         task = self._task if self._episode is None else self._episode.task
         self.task_description = task.language
-        if self._oracle_memory:
+        if self.settings.oracle_memory:
             self.task_description = with_memory(task.language, memory_text(task, completed))
 
     def scene_hash(self) -> str:
@@ -359,10 +291,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._check_began("record")
         if self._not_run is None:
             seconds = time.monotonic() - self._started
-            found = episode_record(self.episode, self._number, self._replan_steps, seconds)
+            found = episode_record(self.episode, self._number, seconds)
         else:
-            variants = len(self._task.random_variants) if self._evidence else None
-            found = not_run_record(self._task, self._number, self._scene_seed, self._referent, self._not_run, variants)
+            variants = len(self._task.random_variants) if self.settings.evidence else None
+            referent = self.settings.referent
+            found = not_run_record(self._task, self._number, self._scene_seed, referent, self._not_run, variants)
         return found | self._acting.line
 
     def _observation(self) -> dict[str, Any]:
@@ -370,14 +303,14 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             return blank(self.observation_space)
         episode = self.episode
         observation: dict[str, Any] = {
-            **self._observer.observation(episode.step_index),
+            **self._observer.observation(),
             "agent_pos": episode.sim.proprio(),
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.clock], dtype=np.float32),
         }
-        if self._expert_action:
+        if self.settings.expert_action:
             observation["expert_action"] = self._asked(episode.expert_action)
-        if self._blind_action:
+        if self.settings.blind_action:
             observation["blind_action"] = self._asked(episode.blind_action)
         return observation
 
@@ -409,7 +342,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observer.frame(self.episode) if self._not_run is None else _black()
 
     def close(self) -> None:
-        """Let the scene go; the next reset compiles or fetches it anew. Closing twice does no harm."""
+        """Let the scene go; the next reset compiles or fetches it again. It may be closed twice."""
         self._discard_video()
         self._episode = None
         self._began, self._closed = False, True
@@ -421,7 +354,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment whose logged episodes end at their first step, as the log says, without being simulated.
+    """An environment whose logged episodes end at their first step with the logged outcome, without being simulated.
 
     The batch keeps its size and every other row its place, so a policy gives the rows that do run the actions that it
     would have given them in an undisturbed evaluation. Observations of a skipped episode are blank.
@@ -429,12 +362,12 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     Args:
         make: makes a `MemobenchEnv`.
         log_dir: folder of the log, read once, at the first reset.
-        referent, seed_base: as the environment's own.
+        settings: the environment's.
     """
 
-    def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, referent: str, seed_base: int) -> None:
+    def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, settings: EnvSettings) -> None:
         super().__init__(make())
-        self._log_dir, self._referent, self._seed_base = log_dir, referent, seed_base
+        self._log_dir, self._referent, self._seed_base = log_dir, settings.referent, settings.seed_base
         self._logged: dict[int, dict[str, Any]] | None = None
         self._skipped: dict[str, Any] | None = None
 
@@ -446,7 +379,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         return blank(self.observation_space), self._info(False)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Advance, or end as the log says."""
+        """Advance, or end with the logged outcome."""
         if self._skipped is None:
             return self.env.step(action)
         success = self._skipped["success"]

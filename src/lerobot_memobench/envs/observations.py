@@ -1,4 +1,4 @@
-"""What a policy observes and what it answers: `obs_type`, names, shapes and units, and when frames are drawn.
+"""Observations and actions: names, shapes and units, which of them a policy reads, and when frames are drawn.
 
 Cheap to import: no simulator, no LeRobot.
 """
@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS, RESET, STEPS, EnvSettings
 from lerobot_memobench.envs.video import annotate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import (
@@ -19,7 +20,6 @@ from lerobot_memobench.protocol import (
     CONTROL_HZ,
     ENDED,
     EXECUTION,
-    HORIZON,
     IDLE_STEPS,
     IMAGE_SIZE,
     PROMPT,
@@ -34,26 +34,9 @@ if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
     from lerobot_memobench.sim.raster.drawlist import Image
 
-PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
-OBS_TYPES = (PIXELS, OBJECTS, BOTH)
-"""Values of ``env.obs_type``, by LeRobot's names: what is observed beside the arm's state."""
-
-AUTO, STEPS, RESET = "auto", "steps", "reset"
-PROMPT_IN = (AUTO, STEPS, RESET)
-"""Values of ``env.prompt_in``: the demonstration prompt plays in steps that the policy observes, or within `reset`.
-
-A policy that reads prompts declares it on the class of its configuration, ``reads_prompt: ClassVar[bool] = True``: it
-waits while `observation.phase` is 0, and plans anew when it becomes 1. Any other policy would act on a recording, and
-its queue would still hold those actions when the scene is restored. To it an episode begins at its first execution
-frame.
-"""
-
 SPARSE, CHECKPOINTS = "sparse", "checkpoints"
 REWARDS = (SPARSE, CHECKPOINTS)
 """Values of ``reward``, see `memobench_env.MemobenchEnv`."""
-
-EVERY = -1
-"""Value of ``env.videos``: record every episode."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
 
@@ -62,7 +45,7 @@ METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL
 PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, MEMORY_TEXT = (
     *("pixels", "detections", "privileged object state", "privileged simulator state", "oracle memory text"),
 )
-"""What a policy may read, as reports say it. Detections: objects that a detector finds in pixels."""
+"""Inputs of a policy, in the words of reports. Detections: objects that a detector finds in pixels."""
 NOTHING = "nothing"
 
 READ_OBJECTS = ("act", "diffusion", "tdmpc", "gaussian_actor")
@@ -108,12 +91,12 @@ def check_obs_type(policy: Any, obs_type: str) -> None:
 
 
 def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
-    """Return a policy's inputs beside the arm's state in words; all of ``obs_type`` where they are not known.
+    """Return a policy's inputs in words, apart from the arm's state; all of ``obs_type`` where they are not known.
 
     Args:
         policy: its configuration, or the class of it. One that names its ``inputs`` is taken at its word.
         obs_type: the environment's.
-        oracle_memory: whether the instruction tells what was done so far.
+        oracle_memory: whether the instruction ends with the completed checkpoints.
     """
     found = getattr(policy, "inputs", None)
     if not isinstance(found, tuple):
@@ -172,20 +155,15 @@ def _pictures(obs_type: str) -> dict[str, str]:
     return {} if obs_type == OBJECTS else {f"pixels/{name}": f"observation.images.{name}" for name in CAMERAS}
 
 
-def observation_space(
-    expert_action: bool,
-    render_every: int = 1,
-    obs_type: str = PIXELS,
-    blind_action: bool = False,
-    horizon: int = HORIZON,
-) -> spaces.Dict:
+def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
     """Return the space of observations, with the actions of the scripted expert or the blind routine on request.
 
-    Where not every step is drawn, ``picture_age`` has the control steps since the pictures were drawn. ``step`` is
-    `NO_CLOCK` or `ENDED` in the execution of strict tasks.
+    Args:
+        settings: of the environment. ``step`` is `NO_CLOCK` or `ENDED` in the execution of strict tasks.
+        longest: most control steps of an execution.
     """
     reach = np.repeat(np.array([3.0, 2 * np.pi, 0.1], np.float32), (3, 3, 2))  # m, rad, m
-    longest = PROMPT_HORIZON + IDLE_STEPS + horizon
+    longest += PROMPT_HORIZON + IDLE_STEPS
     parts: dict[str, spaces.Space[Any]] = {
         "agent_pos": spaces.Box(-reach, reach, (PROPRIO_DIM,), np.float32),
         # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
@@ -193,30 +171,17 @@ def observation_space(
         "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
         "step": spaces.Box(ENDED, longest, (1,), np.float32),
     }
-    if obs_type != OBJECTS:
+    if settings.obs_type != OBJECTS:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         parts["pixels"] = spaces.Dict(dict.fromkeys(CAMERAS, image))
-        if render_every > 1:
-            parts["picture_age"] = spaces.Box(0, longest, (1,), np.float32)
-    if obs_type != PIXELS:
+    if settings.obs_type != PIXELS:
         low, high = (np.tile(np.repeat(ends, [*FIELDS.values()]), SLOTS) for ends in zip(*BOUNDS.values(), strict=True))
         parts["environment_state"] = spaces.Box(low.astype(np.float32), high.astype(np.float32), (SIZE,), np.float32)
-    if expert_action:
+    if settings.expert_action:
         parts["expert_action"] = action_space()
-    if blind_action:
+    if settings.blind_action:
         parts["blind_action"] = action_space()
     return spaces.Dict(parts)
-
-
-def check_counts(prefix: str = "", **counts: int) -> None:
-    """Refuse numbers of steps that are no whole numbers from 1 on; ``prefix`` stands before a setting's name.
-
-    Raises:
-        MemobenchError: one is not.
-    """
-    for name, number in counts.items():
-        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 1:
-            raise MemobenchError(f"{prefix}{name} is {number!r}; expected a whole number from 1 on")
 
 
 def action_space() -> spaces.Space[NDArray[np.float32]]:
@@ -239,16 +204,14 @@ class Observer:
 
     Args:
         obs_type: one of `OBS_TYPES`.
-        render_every: pictures are drawn every so many execution steps, and repeated in between; objects are not.
 
     Attributes:
-        needed: whether the frames that follow are read. An observation that nobody reads repeats an earlier one; the
-            first and the last frame of the execution are always of the present.
+        needed: whether the policy reads the frames that follow. Otherwise an observation repeats an earlier one; the
+            first and the last frame of the execution are always current.
     """
 
-    def __init__(self, obs_type: str, render_every: int) -> None:
+    def __init__(self, obs_type: str) -> None:
         self._has_pictures, self._has_objects = obs_type != OBJECTS, obs_type != PIXELS
-        self._render_every = render_every
         self.needed = True
 
     def begin(self, episode: Episode) -> None:
@@ -263,11 +226,10 @@ class Observer:
         always = episode.done or episode.step_index == episode.exec_start
         if not episode.still:
             self._pictures_rest = self._objects_rest = False
-        due = episode.phase == PROMPT or episode.exec_steps % self._render_every == 0
         if self._has_objects and (always or self.needed) and not self._objects_rest:
             self._objects = episode.objects()
             self._objects_rest = episode.still
-        if self._has_pictures and (always or (due and (self.needed or recorded))):
+        if self._has_pictures and (always or self.needed or recorded):
             self._draw(episode)
 
     def _draw(self, episode: Episode) -> None:
@@ -276,13 +238,11 @@ class Observer:
         self._pictures_rest = episode.still
         self._picture_step = episode.step_index
 
-    def observation(self, step_index: int) -> dict[str, Any]:
+    def observation(self) -> dict[str, Any]:
         """Return the pictures and objects of an episode's observation, see `observation_space`."""
         found: dict[str, Any] = {}
         if self._has_pictures:
             found["pixels"] = dict(self._images)
-            if self._render_every > 1:
-                found["picture_age"] = np.array([step_index - (self._picture_step or 0)], dtype=np.float32)
         if self._has_objects:
             found["environment_state"] = self._objects.copy()  # repeated where it is not read
         return found

@@ -1,11 +1,11 @@
-"""How an execution is paced: pauses in which the robot rests, and slower actions. Both tell a memory from a clock.
+"""Pacing of an execution: pauses in which the robot rests, and slower actions. Both distinguish a memory from a clock.
 
-The environment makes them alone, so they hold for any policy: it is asked at every control step as always, and its
-clock goes on. What was done and seen stays the same; only when it happened does not.
+The environment applies them to any policy: it asks the policy at every control step, and the clock runs. Actions and
+observations stay the same; their times change.
 
-A policy that plans a chunk of ``replan_steps`` actions must not lose a part of one, or its hand would be disturbed and
-not its sense of time. So a pause begins and ends where a chunk does. Slower, a chunk is stretched as a whole, and those
-that are planned until it has been carried out have no effect.
+A policy that plans chunks of ``replan_steps`` actions must not lose part of a chunk: that would disturb its motion and
+not its sense of time. So a pause begins and ends between two chunks. At a lower speed a chunk is stretched as a whole;
+actions planned before it has been carried out have no effect.
 """
 
 from __future__ import annotations
@@ -13,22 +13,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.envs.settings import EnvSettings, steps_per_action
 from lerobot_memobench.protocol import ACTION_DIM
 
 GAP = (20, 120)
 """Execution steps between two pauses, drawn uniformly from these, both included."""
-SLOWEST = 10
-"""Control steps that an action may take."""
 
 
 class Pacing:
     """What of a policy's actions takes effect in an execution, and when.
 
     Args:
-        pause_steps: control steps of a pause; 0: there are none.
-        speed: 1, or 1/n where an action takes n control steps, in each of which its displacement is an nth.
-        replan_steps: actions that the policy executes per prediction; 1 when None.
+        settings: ``pause_steps``; ``speed``, 1/n where an action takes n control steps, in each of which its
+            displacement is an nth; ``replan_steps``, actions that the policy executes per prediction.
         rng: source of the moments at which pauses begin.
 
     Attributes:
@@ -36,9 +33,9 @@ class Pacing:
         paused_steps: control steps of pauses so far.
     """
 
-    def __init__(self, pause_steps: int, speed: float, replan_steps: int | None, rng: np.random.Generator) -> None:
-        self._chunk, self._stretch = replan_steps or 1, steps_per_action(speed)
-        self._pause = _whole_chunks(pause_steps, self._chunk)
+    def __init__(self, settings: EnvSettings, rng: np.random.Generator) -> None:
+        self._chunk, self._stretch = settings.replan_steps or 1, steps_per_action(settings.speed)
+        self._pause = _whole_chunks(settings.pause_steps, self._chunk)
         self.pauses = self._pause > 0
         self._rng = rng
         self._actions: list[NDArray[np.float32]] = []  # of the chunk that is carried out
@@ -74,31 +71,10 @@ class Pacing:
         return slowed
 
 
-def steps_per_action(speed: float) -> int:
-    """Return how many control steps an action takes at a speed."""
-    return round(1 / speed)
-
-
-def check_pacing(prefix: str, pause_steps: int, speed: float) -> None:
-    """Refuse what is no length of a pause or no speed; ``prefix`` stands before a setting's name.
-
-    Raises:
-        MemobenchError: it is none.
-    """
-    if isinstance(pause_steps, bool) or not isinstance(pause_steps, int | np.integer) or pause_steps < 0:
-        raise MemobenchError(f"{prefix}pause_steps is {pause_steps!r}; expected a whole number of control steps, or 0")
-    numeric = isinstance(speed, int | float) and not isinstance(speed, bool)
-    if not numeric or not 1 / SLOWEST <= speed <= 1 or abs(steps_per_action(speed) * speed - 1) > 0.02:
-        raise MemobenchError(
-            f"{prefix}speed is {speed!r}; expected 1, 0.5, 0.33, 0.25 and so on down to {1 / SLOWEST}: an action takes "
-            "a whole number of control steps"
-        )
-
-
-def longest(horizon: int, pause_steps: int, speed: float, replan_steps: int | None) -> int:
-    """Return the most control steps that an execution of so many steps at full speed takes, pauses included."""
-    steps = horizon * steps_per_action(speed)
-    return steps + steps // GAP[0] * _whole_chunks(pause_steps, replan_steps or 1)
+def longest(settings: EnvSettings) -> int:
+    """Return the most control steps that an execution takes, pauses included."""
+    steps = settings.horizon * steps_per_action(settings.speed)
+    return steps + steps // GAP[0] * _whole_chunks(settings.pause_steps, settings.replan_steps or 1)
 
 
 def _whole_chunks(steps: int, chunk: int) -> int:

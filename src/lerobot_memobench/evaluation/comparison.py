@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode_log import OF_THE_POLICY, SETTINGS, differences
+from lerobot_memobench.envs.episode_log import OF_THE_POLICY, differences
+from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed, published_table
 from lerobot_memobench.evaluation.headline import headline

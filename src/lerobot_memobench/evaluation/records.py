@@ -11,212 +11,29 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
-
-from annotated_types import Ge, Le, MinLen
+from typing import Any
 
 from lerobot_memobench.envs.episode_log import (
     EXTENT,
     MOST_EPISODES,
     POLICY,
-    SETTINGS,
     UNTOLD,
-    CheckpointRecord,
-    Outcome,
-    Protocol,
-    WholeProtocol,
     differences,
     notes_on_not_run,
     read_episodes,
     read_log,
-    read_protocol_file,
 )
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
+from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.evidence import FoundEvidence, evidence_of, ran_evidence
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
-from lerobot_memobench.io import LARGEST, Count, Name, Whole, count_of, is_there, read_json
-
-# --- types of the result card; `run.card` explains its parts ---
-
-
-class PolicySettings(TypedDict, total=False):
-    """Whatever a policy can be set to; what reports and `memobench rerun` read of it."""
-
-    n_action_steps: Count | None
-    perception: str | None
-    detector: str | None
-
-
-class Policy(TypedDict, total=False):
-    """What identifies a policy; {} where nothing is known of it.
-
-    Attributes:
-        type: as it is registered with LeRobot.
-        seed: LeRobot's, of this evaluation.
-        settings: its whole configuration.
-        sha256: hash over the checkpoint's files.
-        detector_sha256: hash of its detector's weights.
-    """
-
-    type: Name | None
-    seed: Whole | None
-    settings: PolicySettings
-    sha256: str | None
-    detector_sha256: str
-
-
-class Checkpoint(TypedDict):
-    """Where a policy's weights were, and the hash of each file.
-
-    Attributes:
-        path: folder, repository, or name of a policy of the package.
-        revision: commit of a repository's copy.
-        files: name -> SHA-256.
-    """
-
-    path: str
-    revision: NotRequired[str | None]
-    files: NotRequired[dict[str, str]]
-
-
-BatchSize = Annotated[int, Ge(1), Le(LARGEST)]
-
-
-class Start(TypedDict):
-    """One start of the evaluation, on one machine.
-
-    Attributes:
-        command: as it was typed.
-        batch_size: environments at once.
-        versions: of Python and packages.
-        git_commit: of a checkout of this package.
-        machine: processor, cores, GPU, system.
-        gl: what drew the pictures, of cards from when OpenGL could; {} where none were drawn.
-        times: starts that were alike.
-    """
-
-    command: list[str]
-    batch_size: BatchSize
-    versions: dict[str, str]
-    git_commit: str | None
-    machine: dict[str, Any]
-    gl: NotRequired[dict[str, Any]]
-    times: NotRequired[Count]
-
-
-class SealedStart(TypedDict):
-    """A start of an evaluation on the sealed seeds.
-
-    Attributes:
-        started: when.
-        suite: published or strict.
-        world: of scenes that are not the package's own: libero.
-        referent: fixed, random or drawn.
-        replan_steps: actions executed per prediction; None for the policy's own number.
-        tasks: how many.
-        episodes: of each.
-    """
-
-    started: str
-    suite: Name
-    world: NotRequired[Name]
-    referent: Name
-    replan_steps: Count | None
-    tasks: Count
-    episodes: Count
-
-
-class SealedRun(TypedDict):
-    """How often a policy was started on the sealed seeds (`memobench test-sealed`).
-
-    Attributes:
-        started: when. policy: hash of what it loads. scenes: hash of task files, referent, seed and episodes.
-        release: of this package.
-        run: this start's number, from 1 on, among those of the policy with the release.
-        earlier: the starts before it.
-    """
-
-    started: NotRequired[str]
-    policy: NotRequired[str]
-    scenes: NotRequired[str]
-    release: str
-    run: Count
-    earlier: list[SealedStart]
-
-
-class CardEpisode(Outcome):
-    """What an episode came to.
-
-    Attributes:
-        task: name in the catalogue.
-        episode: its number.
-        memory_type: temporal, spatial, object or procedural.
-        success: whether the goal held at the end.
-        checkpoints: the memory checkpoints, in the task's order.
-    """
-
-    task: Name
-    episode: Whole
-    memory_type: NotRequired[str]
-    success: NotRequired[bool]
-    checkpoints: NotRequired[list[CheckpointRecord]]
-
-
-class StartFacts(TypedDict, total=False):
-    """What is taken from a start where the rest of it does not matter."""
-
-    command: list[str]
-    batch_size: BatchSize
-    versions: dict[str, str]
-
-
-class Card(TypedDict):
-    """What reports take from a card: all but the protocol may be absent."""
-
-    protocol: Protocol
-    policy: NotRequired[Policy]
-    checkpoint: NotRequired[Checkpoint | None]
-    runs: NotRequired[list[StartFacts]]
-    sealed: NotRequired[SealedRun]
-    episodes: NotRequired[list[CardEpisode]]
-
-
-class WholeCard(TypedDict):
-    """A card from which an evaluation is gone on with, merged or repeated.
-
-    Attributes:
-        format: of the card: 1.
-        written: when.
-        protocol: tasks, episodes, and the settings that must agree for two evaluations to compare.
-        policy: what must agree for an evaluation to be gone on with.
-        checkpoint: of the policy; None where it has none.
-        trained_on: LeRobot's settings of the dataset that it was trained on.
-        task_files: task -> hash of its files.
-        flags: LeRobot's flags, complete but for folders: `memobench rerun` repeats them.
-        shard: the part, or None.
-        runs: each start, on each machine.
-        sealed: of an evaluation on the sealed seeds: how often they were looked at.
-        episodes: what was found.
-    """
-
-    format: Literal[1]
-    written: NotRequired[str]
-    protocol: WholeProtocol
-    policy: Policy
-    checkpoint: Checkpoint | None
-    trained_on: dict[str, Any] | None
-    task_files: dict[str, str]
-    flags: list[str]
-    shard: str | None
-    runs: Annotated[list[Start], MinLen(1)]
-    sealed: NotRequired[SealedRun]
-    episodes: list[CardEpisode]
-
+from lerobot_memobench.io import count_of
 
 # --- the protocol ---
 
-CARD_FILE = "card.json"
+CARD_FILE = EVALUATION_FILE
 
 
 def read_protocol(folder: str | Path) -> dict[str, Any]:
@@ -225,15 +42,15 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
     as found in the log where no file records it; ``suite``, ``world``, ``protocol`` as far as they
     are not the default; ``seed_base``, ``referent``,
-    ``demonstration_prompt``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render``, ``render_every`` as
+    ``demonstration_prompt``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render`` as
     far as known; ``inputs``, of the policy; ``policy``, the known facts of the policy ({} where no file records them).
 
     Raises:
         MemobenchError: there is no evaluation in the folder.
     """
     folder = Path(folder)
-    card = card_of(folder)
-    told: dict[str, Any] = {**card.get("protocol", {}), **read_protocol_file(folder)}
+    card = read_evaluation(folder)
+    told: dict[str, Any] = card.get("protocol", {})
     if not {*EXTENT, *SETTINGS} - {*UNTOLD} <= set(told):
         told = {**protocol_of_log(read_episodes(folder)), **told}
     return {**told, POLICY: card.get(POLICY) or told.get(POLICY) or {}}
@@ -277,31 +94,6 @@ def of_all(records: Iterable[Mapping[str, Any]], key: str) -> str:
     return str(found)
 
 
-def read_card(path: Path, *, whole: bool = False) -> dict[str, Any]:
-    """Return a result card (see `run.card`).
-
-    Args:
-        whole: nothing of it may be left out, as reports allow.
-
-    Raises:
-        MemobenchError: it is missing or none.
-    """
-    try:
-        found: dict[str, Any] = read_json(
-            path, WholeCard if whole else Card, "it is no result card as `lerobot eval` writes it"
-        )
-    except FileNotFoundError:
-        raise MemobenchError(
-            f"the card {path} cannot be read (it is missing); name a {CARD_FILE} that `lerobot eval` wrote"
-        ) from None
-    return found
-
-
-def card_of(folder: Path) -> dict[str, Any]:
-    """Return what reports take from the card of an evaluation, {} where it has none."""
-    return read_card(folder / CARD_FILE) if is_there(folder / CARD_FILE) else {}
-
-
 # --- evaluations ---
 
 HASH_DIGITS = 8
@@ -336,7 +128,7 @@ class Run:
     @cached_property
     def card(self) -> dict[str, Any]:
         """What reports take from its card, {} where it has none."""
-        return card_of(self.folder)
+        return read_evaluation(self.folder)
 
     @cached_property
     def replan_steps(self) -> int | None:
@@ -425,7 +217,7 @@ def asked_for(folder: Path, lines: list[dict[str, Any]], notes: list[str]) -> li
     ``notes`` gets a sentence for those that are left out, for disagreements of log and card, and for episodes that
     were not run.
     """
-    card = card_of(folder)
+    card = read_evaluation(folder)
     count, base = (card.get("protocol", {}).get(key) for key in ("episodes", "seed_base"))
     kept = lines
     if count is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -288,21 +287,6 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
             f"--policy.{name}={asked} cannot be followed: '{source}' was trained with {held}, and {why}; "
             f"leave {name} out, or train with it"
         )
-
-
-def check_resumed(source: str | Path, policy: PreTrainedConfig) -> None:
-    """Refuse that LeRobot's own ``--resume`` goes on with a training under settings that it was not begun with.
-
-    Args:
-        source: the checkpoint that is loaded; nothing is checked where the command line resumes none, or another.
-        policy: configuration under which it would go on; errors as of `check_as_begun`.
-    """
-    from lerobot.configs import parser
-
-    file, resume = parser.parse_arg("config_path"), parser.parse_arg("resume")
-    resumes = "--resume" in sys.argv if resume is None else resume.lower() == "true"
-    if resumes and file is not None and Path(source).resolve() in (Path(file).resolve(), Path(file).resolve().parent):
-        check_as_begun(source, policy, as_trained(source, policy))
 
 
 def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTrainedConfig) -> None:

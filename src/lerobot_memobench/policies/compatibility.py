@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from draccus.utils import DecodingError
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, obs_type_of
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import (
-    check_as_trained,
-    check_checkpoint,
-    check_weights,
-    shipped_policies,
-    statistics_shapes,
-)
+from lerobot_memobench.policies.checkpoint import statistics_shapes
 from lerobot_memobench.protocol import ENDED, NO_CLOCK
 
 if TYPE_CHECKING:
@@ -41,9 +33,6 @@ SIZE_COUNTS = {
 they have one. All others bring every picture to a size of their own."""
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 """What the names of the cameras begin with that LeRobot's ``policy.empty_cameras`` adds: nobody has them."""
-PICTURE_AGE = "picture_age"
-"""Observation: control steps since its pictures were drawn, of an environment that does not draw every step."""
-REFUSAL = "leave env.render_every at 1 for a policy that remembers the frames between its plans"
 
 
 def cure(missing: str, observed: Collection[str]) -> str:
@@ -61,52 +50,22 @@ def cure(missing: str, observed: Collection[str]) -> str:
     return f"it has {cameras or 'none'}. Map its names with --rename_map."
 
 
-def refuse_short_name(path: str) -> None:
-    """Refuse the name of a policy of this package where LeRobot's own command would look for it on the hub.
-
-    Raises:
-        DecodingError: LeRobot prints it as one sentence.
-    """
-    folder = shipped_policies().get(path)
-    if folder is None or Path(path).is_dir():
-        return
-    from lerobot.configs.policies import PreTrainedConfig
-
-    shown = obs_type_of(PreTrainedConfig.from_pretrained(folder))
-    raise DecodingError(
-        (),
-        f"--policy.path={path} is a policy of this package, which LeRobot finds by its folder: use "
-        f"--policy.path={folder} --env.obs_type={shown}, or `lerobot eval env=memobench policy={path}`",
-    )
-
-
-def check_policy(
-    path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
-) -> None:
-    """Refuse a checkpoint that is not whole, or that was trained on other inputs than it will get.
-
-    Args:
-        path: its folder, or a repository. policy: its configuration, of the checkpoint's own features.
-        shown: the environment's features by their names at the policy, and its action.
-        renamed: LeRobot's ``rename_map``: names of the environment's -> names of the policy's.
-
-    Raises:
-        MemobenchError: it is refused.
-    """
-    check_checkpoint(path)
-    check_as_trained(path, policy)
-    check_features(path, policy, shown, renamed)
-    check_weights(path, policy)
-
-
 def check_features(
     path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
 ) -> None:
     """Refuse to show a checkpoint other cameras, or numbers or pictures of other sizes, than it was trained on.
 
     LeRobot compares names of cameras alone, and those only without a ``rename_map``; policies that pad what they are
-    given, and those that take pictures of any size, would act on what they have never seen. Arguments and errors are
-    those of `check_policy`.
+    given, and those that take pictures of any size, would act on inputs that they have never seen.
+
+    Args:
+        path: folder of the checkpoint, or a repository.
+        policy: its configuration, of the checkpoint's own features.
+        shown: the environment's features by their names at the policy, and its action.
+        renamed: LeRobot's ``rename_map``: names of the environment's -> names of the policy's.
+
+    Raises:
+        MemobenchError: it is refused.
     """
     if getattr(policy, "perception", None) == "any" or not policy.input_features:
         return
@@ -198,16 +157,6 @@ def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, Policy
                 f"the policy {path} was trained on pictures {name} of {seen} pixels and takes them as they come, and "
                 f"the environment shows {here}; train it on pictures of that size{also}"
             )
-
-
-def require_fresh(picture_age: int | None) -> None:
-    """Refuse a frame that is to be remembered and shows an earlier step; None where every step is drawn.
-
-    Raises:
-        MemobenchError: its pictures are some control steps old.
-    """
-    if picture_age:
-        raise MemobenchError(f"the pictures of a frame are {picture_age} control steps old; {REFUSAL}")
 
 
 Clock = tuple[int, int]

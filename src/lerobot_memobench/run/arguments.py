@@ -193,7 +193,7 @@ class LerobotArguments:
     def for_parser(self) -> tuple[str, ...]:
         """The flags for LeRobot's parser: texts that it would read as YAML or JSON values are quoted."""
         known = {} if self.config is None else dict(settings(self.config, self.chosen))
-        return tuple(_for_parser(flag, known) for flag in self.flags)
+        return tuple(for_parser(flag, known) for flag in self.flags)
 
     def get(self, key: str) -> str | None:
         """Return the value of ``--key``, None without one."""
@@ -225,7 +225,12 @@ class LerobotArguments:
         return replace(self.changed(f"{key}.type", name), chosen=chosen)
 
 
-def _for_parser(flag: str, known: Mapping[str, Any]) -> str:
+def for_parser(flag: str, known: Mapping[str, Any]) -> str:
+    """Return a flag for LeRobot's parser: a text that it would read as a YAML or JSON value is quoted.
+
+    Args:
+        known: dotted key -> type of each setting.
+    """
     key, _, text = flag.removeprefix("--").partition("=")
     kind = without_none(known.get(key))
     if kind not in (str, Path) or key.rpartition(".")[2] in CHOICE_KEYS or text in NO_VALUE:
@@ -251,14 +256,11 @@ def read_arguments(command: str, given: Arguments) -> LerobotArguments:
     """
     config = config_class(load_command(command))
     register_plugins()
-    _load_packages(given)
-    file = read_config_file(given.value(CONFIG_FILE))
-    if command == "eval" and config is not None and _is_of_benchmark(given, file):
-        return translate(command, with_file(given.without(CONFIG_FILE), file, config), config, {})
-    return translate(command, given, config, file)
+    load_packages(given)
+    return translate(command, given, config, read_config_file(given.value(CONFIG_FILE)))
 
 
-def _load_packages(given: Arguments) -> None:
+def load_packages(given: Arguments) -> None:
     """Import the packages that LeRobot is told to look for plugins in, so that what they register is known."""
     from lerobot.configs import parser
 
@@ -272,8 +274,9 @@ def _load_packages(given: Arguments) -> None:
                 raise MemobenchError(f"{key.removeprefix('--')}={value} cannot be imported ({error})") from None
 
 
-def _is_of_benchmark(given: Arguments, file: Mapping[str, Any]) -> bool:
-    section = file.get("env")
+def is_of_benchmark(given: Arguments) -> bool:
+    """Return whether a command line of `lerobot eval`, or its configuration file, names the benchmark."""
+    section = read_config_file(given.value(CONFIG_FILE)).get("env")
     in_file = section.get("type") if isinstance(section, Mapping) else section
     return dict(given.pairs).get("env", given.value("env.type") or in_file) == "memobench"
 

@@ -1,17 +1,7 @@
-"""The result card of an evaluation: what is needed to understand, repeat and check it, in ``card.json``.
+"""The result card of an evaluation, ``evaluation.json``: everything needed to understand, repeat and check it.
 
-::
-
-    protocol      tasks, episodes, and the settings that must agree for two evaluations to compare
-    policy        type, settings, seed, hash of its checkpoint: what must agree for an evaluation to be gone on with
-    checkpoint    where it was, hash of each file;  trained_on: the dataset it was trained on
-    task_files    hash of each task's files
-    flags         LeRobot's flags, complete but for folders: `memobench rerun` repeats them;  shard: the part, or null
-    runs          each start, on each machine: command line, versions, commit, machine
-    sealed        on the sealed seeds alone: how often this policy was run on them with this release, and when
-    episodes      what was found: outcome, checkpoints' steps and scene hash of every episode
-
-It is written when an evaluation starts, and again with what was found when it ends. ``card.md`` is the same for people.
+It is written when an evaluation starts, and again with the outcomes when it ends. `evaluation_file.WholeCard` lists its
+parts.
 """
 
 from __future__ import annotations
@@ -24,24 +14,15 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from lerobot_memobench.envs.acting import ELSEWHERE, checkpoint_files, encoded, tree_hash
-from lerobot_memobench.envs.episode_log import EXTENT, INPUTS, SETTINGS, key_of
+from lerobot_memobench.envs.episode_log import INPUTS, key_of
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, FORMAT
 from lerobot_memobench.envs.observations import policy_inputs
-from lerobot_memobench.envs.upstream import DIFFERENCES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
-from lerobot_memobench.evaluation.metrics import stand_ins_of
-from lerobot_memobench.evaluation.records import CARD_FILE
-from lerobot_memobench.evaluation.tables import markdown_text
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
-from lerobot_memobench.protocol import UPSTREAM
-from lerobot_memobench.run.arguments import without_flags
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.plan import EvaluationPlan
-
-FORMAT = 1
-CARD_MARKDOWN = "card.md"
-
 
 # --- the card of a plan, before anything has been found ---
 
@@ -51,32 +32,22 @@ def card_of(plan: EvaluationPlan) -> dict[str, Any]:
     shard = plan.options.shard
     card = new_card(
         protocol=_protocol_of(plan),
-        policy={} if plan.policy is None else policy_facts(encoded(plan.policy), plan.seed),
+        policy=policy_facts(encoded(plan.policy), plan.seed),
         checkpoint=None,
         trained_on=None,
         task_files=_task_files(plan),
-        flags=_flags_of(plan),
+        settings=plan.settings.portable,
         runs=[run_facts(plan.command, plan.batch)],
         shard=None if shard is None else str(shard),
     )
     return with_checkpoint(card, plan.policy_path)
 
 
-def _flags_of(plan: EvaluationPlan) -> list[str]:
-    """Return the plan's flags as another machine may use them: a policy of this package goes by its name."""
-    key = "--policy.path="
-    return [
-        key + portable_path(flag.removeprefix(key)) if flag.startswith(key) else flag for flag in plan.portable_flags
-    ]
-
-
 def _protocol_of(plan: EvaluationPlan) -> dict[str, Any]:
     names = sorted(task.name for task in plan.grid.tasks)
     environment = plan.environment
-    found = {"tasks": names, "episodes": plan.grid.runs, **environment.agreed_settings}
-    if plan.policy is not None:
-        found[INPUTS] = policy_inputs(plan.policy, environment.obs_type, environment.oracle_memory)
-    return found
+    inputs = policy_inputs(plan.policy, environment.obs_type, environment.oracle_memory)
+    return {"tasks": names, "episodes": plan.grid.runs, **environment.settings.protocol_block, INPUTS: inputs}
 
 
 def _task_files(plan: EvaluationPlan) -> dict[str, str]:
@@ -126,7 +97,7 @@ class TrainConfig(TypedDict):
 
 
 def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
-    """Return what identifies a policy beside its weights: its configuration as LeRobot encodes it, the run's seed.
+    """Return what identifies a policy apart from its weights: its configuration as LeRobot encodes it, the run's seed.
 
     Of a detector, which is no part of its checkpoint, also the hash.
 
@@ -186,7 +157,7 @@ def new_card(
     checkpoint: Mapping[str, Any] | None,
     trained_on: Mapping[str, Any] | None,
     task_files: Mapping[str, str],
-    flags: Sequence[str],
+    settings: Mapping[str, Any],
     runs: Sequence[Mapping[str, Any]],
     shard: str | None = None,
 ) -> dict[str, Any]:
@@ -199,7 +170,7 @@ def new_card(
         "checkpoint": checkpoint,
         "trained_on": trained_on,
         "task_files": dict(task_files),
-        "flags": list(flags),
+        "settings": dict(settings),
         "shard": shard,
         "runs": joined_runs(runs),
         "episodes": [],
@@ -210,32 +181,33 @@ def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool =
     """Return a card for both of two runs of one evaluation: extent, episodes, runs and tasks' hashes of both.
 
     Args:
-        again: whether an equal run is one more start, or the same start told twice.
+        again: whether an equal run is one more start, or the same start read twice.
     """
     a, b = card["protocol"], other["protocol"]
     extent = {"tasks": sorted({*a["tasks"], *b["tasks"]}), "episodes": max(a["episodes"], b["episodes"])}
+    found = {**other, **card}  # a card of an earlier version has flags and no settings
+    found.pop("flags", None)
     return {
-        **card,
+        **found,
+        "format": FORMAT,
         "protocol": {**b, **a, **extent},
         "policy": card["policy"] or other["policy"],
         "checkpoint": card["checkpoint"] or other["checkpoint"],
         "trained_on": card["trained_on"] or other["trained_on"],
         "task_files": {**card["task_files"], **other["task_files"]},
-        "flags": _widened_flags(card, extent),
+        "settings": _widened(found.get("settings") or {}, a if "settings" in card else b, extent),
         "shard": card["shard"] if card["shard"] == other["shard"] else None,
         "runs": joined_runs([*card["runs"], *other["runs"]], again),
         "episodes": _joined_episodes(card["episodes"], other["episodes"]),
     }
 
 
-def _widened_flags(card: Mapping[str, Any], extent: Mapping[str, Any]) -> list[str]:
-    """Return a card's flags, changed to a wider extent where it is wider."""
-    flags = list(card["flags"])
-    if extent["episodes"] != card["protocol"]["episodes"]:
-        flags = [*without_flags(flags, "eval.n_episodes"), f"--eval.n_episodes={extent['episodes']}"]
-    if extent["tasks"] != sorted(card["protocol"]["tasks"]):
-        flags = [*without_flags(flags, "env.task", "env.tasks"), f"--env.tasks={','.join(extent['tasks'])}"]
-    return flags
+def _widened(settings: Mapping[str, Any], protocol: Mapping[str, Any], extent: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a card's settings, changed to a wider extent."""
+    found = {**settings, "episodes": extent["episodes"]}
+    if extent["tasks"] != sorted(protocol["tasks"]):
+        found["env"] = {**settings.get("env", {}), "tasks": ",".join(extent["tasks"])}
+    return found
 
 
 def joined_runs(runs: Iterable[Mapping[str, Any]], again: bool = True) -> list[dict[str, Any]]:
@@ -265,15 +237,13 @@ def _joined_episodes(mine: Iterable[Mapping[str, Any]], others: Iterable[Mapping
 
 
 def write_card(folder: Path, card: Mapping[str, Any]) -> None:
-    """Write ``card.json`` and ``card.md``, each whole or not at all."""
-    write_file(folder / CARD_FILE, _json(card), durable=True)
-    write_file(folder / CARD_MARKDOWN, markdown(card), durable=True)
+    """Write the file of an evaluation, whole or not at all."""
+    write_file(folder / EVALUATION_FILE, _json(card), durable=True)
 
 
 def remove_card(folder: Path) -> None:
-    """Remove the card of a folder, if there is one."""
-    for name in (CARD_FILE, CARD_MARKDOWN):
-        (folder / name).unlink(missing_ok=True)
+    """Remove the file of an evaluation, if there is one."""
+    (folder / EVALUATION_FILE).unlink(missing_ok=True)
 
 
 def _json(card: Mapping[str, Any]) -> str:
@@ -284,78 +254,6 @@ def _json(card: Mapping[str, Any]) -> str:
         text.replace('"episodes": []\n}', f'"episodes": [\n{episodes}\n ]\n}}' if episodes else '"episodes": []\n}')
         + "\n"
     )
-
-
-def markdown(card: Mapping[str, Any]) -> str:
-    """Return the card as Markdown."""
-    lines = ["# Result card", "", *_protocol_lines(card), "", *_policy_lines(card)]
-    for number, run in enumerate(card["runs"], start=1):
-        lines += ["", *_run_lines(number, run)]
-    lines += ["", f"`memobench rerun {CARD_FILE}` repeats the evaluation and compares every episode.", ""]
-    return "\n".join(lines)
-
-
-def _row(name: str, value: object) -> str:
-    """Return a row of a table; what it holds may be a stranger's."""
-    return f"| {markdown_text(name)} | {markdown_text(str(value))} |"
-
-
-def _protocol_lines(card: Mapping[str, Any]) -> list[str]:
-    protocol = card["protocol"]
-    tasks = protocol.get("tasks", [])
-    settings = {name: protocol[name] for name in SETTINGS if name in protocol}
-    others = {key: value for key, value in protocol.items() if key not in (*SETTINGS, *EXTENT)}
-    return [
-        *("| protocol | |", "|---|---|"),
-        _row("tasks", f"{len(tasks)}: {', '.join(tasks)}"),
-        _row("episodes of each", protocol.get("episodes")),
-        *(_row(name.replace("_", " "), value) for name, value in {**settings, **others}.items()),
-        *_differences(card),
-        *_sealed_lines(card.get("sealed")),
-        _row("episodes in the log", len(card["episodes"])),
-    ]
-
-
-def _differences(card: Mapping[str, Any]) -> list[str]:
-    """Return rows on what makes figures others than the paper's protocol and scenes would give."""
-    found = {
-        "differs from the paper's": DIFFERENCES if card["protocol"].get("protocol") == UPSTREAM else (),
-        "stand-ins for missing scans": stand_ins_of(card["episodes"]),
-    }
-    return [_row(name, "; ".join(told)) for name, told in found.items() if told]
-
-
-def _sealed_lines(sealed: Mapping[str, Any] | None) -> list[str]:
-    if sealed is None:
-        return []
-    before = "; ".join(f"{start['started'][:10]} {start['suite']} {start['referent']}" for start in sealed["earlier"])
-    number = f"run {sealed['run']} with release {sealed['release']}; before it: {before or 'none'}"
-    told = {f"{name} of that run": sealed[name] for name in ("started", "policy", "scenes") if name in sealed}
-    return [_row("sealed test", number), *(_row(name, value) for name, value in told.items())]
-
-
-def _policy_lines(card: Mapping[str, Any]) -> list[str]:
-    policy = card["policy"]
-    lines = [
-        "| policy | |",
-        "|---|---|",
-        _row("type", policy.get("type", "not known")),
-        _row("seed", policy.get("seed")),
-    ]
-    if card["checkpoint"]:
-        lines += [_row("checkpoint", card["checkpoint"]["path"]), _row("its sha256", policy.get("sha256", "not known"))]
-    if "detector_sha256" in policy:
-        lines += [_row("sha256 of its detector", policy["detector_sha256"])]
-    return lines + [_row(f"trained on: {key}", value) for key, value in (card["trained_on"] or {}).items()]
-
-
-def _run_lines(number: int, run: Mapping[str, Any]) -> list[str]:
-    times = run.get("times", 1)
-    command = " ".join(" ".join(run["command"]).split())
-    lines = [f"## Run {number}" + (f" (started {times} times)" if times > 1 else ""), ""]
-    lines += [f"    {command}", "", "| | |", "|---|---|"]  # indented: no text ends such a block
-    facts = {"commit": run["git_commit"], "batch size": run["batch_size"], **run["machine"], **run.get("gl", {})}
-    return lines + [_row(*fact) for fact in {**run["versions"], **facts}.items()]
 
 
 # --- whether an episode was drawn as it is drawn here ---

@@ -16,17 +16,13 @@ from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_memobench.envs.acting import acting
-from lerobot_memobench.envs.command_line import quiet, read_rename_map
+from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.configuration_memobench import Opener
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.jobs.threads import limit_torch
 from lerobot_memobench.policies.memory_reads import ReadLog
 from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
-from lerobot_memobench.run.recording import Recorder
 from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
-
-RECORDINGS = "recordings"
-"""Folder of rollouts that are recorded as datasets, in that of the evaluation."""
 
 Advance = Callable[[int, int, str], None]
 """Called after each batch with the episodes that have ended, those that are to be run, and the task's name."""
@@ -52,10 +48,11 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     begin()
     environment = replace(plan.environment, resume=has_log(plan.log))
     asked = range(plan.seed, plan.seed + plan.grid.runs)
-    by = acting(policy, plan.policy_path, asked, environment.obs_type, environment.oracle_memory)
-    environments = Environments(environment.opener(policy, by, plan.log), plan.eval_settings.use_async_envs)
+    by = acting(policy, plan.policy_path, asked, environment.settings)
+    environments = Environments(environment.opener(policy, by, plan.log), plan.settings.use_async_envs is not False)
     seeds = BatchSeeds(actor.policy, plan.seed)
-    reads = ReadLog(plan.log, environment.seed_base, environment.referent) if plan.options.memory_reads else None
+    scenes = environment.settings
+    reads = ReadLog(plan.log, scenes.seed_base, scenes.referent) if plan.options.memory_reads else None
     amp = torch.autocast(device_type=device.type) if policy.use_amp else nullcontext()
     done, total = 0, sum(len(plan.grid.runs_of(number)) for _, number in cells)
     with amp, closing(environments):
@@ -64,8 +61,8 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
             batch = range(plan.seed + runs.start, plan.seed + runs.stop)
             env = environments.of(task, len(batch))
             seeds.begin(task.name, batch.start)
-            with _noting(reads, actor.policy, task, batch) as ended, _recording(plan, task, env) as recorder:
-                roll(env, actor, batch, ended, recorder)
+            with _noting(reads, actor.policy, task, batch) as ended:
+                roll(env, actor, batch, ended)
             done += len(batch)
             advance(done, total, task.name)
 
@@ -100,7 +97,7 @@ def load_actor(plan: EvaluationPlan) -> Actor:
     """Return the plan's policy and its processors, as LeRobot makes them."""
     policy, environment = copy(plan.policy), plan.environment
     policy.pretrained_path = None if plan.policy_path is None else Path(plan.policy_path)
-    renamed = read_rename_map(plan.arguments.get("rename_map"))
+    renamed = dict(plan.settings.rename_map)
     with quiet() if plan.policy_path is None else nullcontext():  # LeRobot warns that it has no weights
         loaded = make_policy(cfg=policy, env_cfg=environment, rename_map=renamed).eval()
     before, after = make_pre_post_processors(
@@ -117,20 +114,6 @@ def load_actor(plan: EvaluationPlan) -> Actor:
 
 def _noting(reads: ReadLog | None, policy: Any, task: PlannedTask, seeds: Sequence[int]) -> AbstractContextManager[Any]:
     return nullcontext() if reads is None else reads.noting(task.name, policy, seeds)
-
-
-def _recording(plan: EvaluationPlan, task: PlannedTask, env: Any) -> AbstractContextManager[Recorder | None]:
-    """Return the recorder of a batch, None where none was asked for; leaving it completes its datasets."""
-    settings = plan.eval_settings
-    if not settings.recording:
-        return nullcontext()
-    name = f"{task.suite}_{task.number}"
-    repository = None if settings.recording_repo_id is None else f"{settings.recording_repo_id}_{name}"
-    folder: Path = plan.output / RECORDINGS / name
-    fps = env.unwrapped.metadata["render_fps"]
-    return closing(
-        Recorder(folder, plan.environment.features, env.num_envs, fps, repository, settings.recording_private)
-    )
 
 
 def lerobot_summary(records: Iterable[Mapping[str, Any]], tasks: Iterable[PlannedTask]) -> dict[str, Any]:

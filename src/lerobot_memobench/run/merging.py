@@ -17,15 +17,14 @@ from lerobot_memobench.envs.episode_log import (
     has_log,
     key_of,
     read_log,
-    read_protocol_file,
     write_episodes,
-    write_protocol,
 )
+from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreement
-from lerobot_memobench.evaluation.records import CARD_FILE, read_card, read_protocol
+from lerobot_memobench.evaluation.records import read_protocol
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.io import draft_of, is_there
+from lerobot_memobench.io import draft_of
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import (
     drawn_otherwise,
@@ -84,26 +83,26 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     joined = join(records)
     card = _joined_card(sources)
     wanted = [] if card is None else _wanted(card)
+    told = [*map(protocol_of, sources)]
 
     out.mkdir(parents=True, exist_ok=True)
-    if all(read_protocol_file(source) for source in sources):
-        write_protocol(out, _joined_settings([*map(read_protocol_file, sources), *protocols.values()]))
     for source in folders:
         if source != out:
             _share(source / VIDEOS, out / VIDEOS, "*.mp4")
             _share(source / MEMORY_READS, out / MEMORY_READS, "*.json.gz")
     write_episodes(out, joined)
-    if card is None:
-        remove_card(out)
-    else:
+    remove_card(out)
+    if card is not None:
         asked = set(wanted)
         write_card(out, with_episodes(card, [each for each in joined if (each["task"], each["episode"]) in asked]))
+    elif all(told):
+        write_protocol(out, _joined_settings([*told, *protocols.values()]))
     present = {(record["task"], record["episode"]) for record in joined}
     return [cell for cell in wanted if cell not in present]
 
 
 def _joined_settings(protocols: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the settings that the protocols tell, those of the first before all others."""
+    """Return the settings of all protocols; the first one that names a setting counts."""
     joined: dict[str, Any] = {}
     for protocol in protocols:
         joined = {**protocol, **joined}
@@ -183,9 +182,9 @@ def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, An
 
 def _joined_card(folders: Sequence[Path]) -> dict[str, Any] | None:
     """Return one card for all, None where one of them has none: it would say more than is known."""
-    if not all(is_there(folder / CARD_FILE) for folder in folders):
+    if not all(POLICY in read_evaluation(folder) for folder in folders):
         return None
-    cards = {folder: read_card(folder / CARD_FILE, whole=True) for folder in folders}
+    cards = {folder: read_evaluation(folder, whole=True) for folder in folders}
     joined = functools.reduce(lambda card, mine: extended(card, mine, again=False), cards.values())
     for folder, card in cards.items():
         for name, value in card["task_files"].items():

@@ -1,7 +1,7 @@
-"""The plan of an evaluation: what its command line asks for, complete and typed. It is made once and never changed.
+"""The plan of an evaluation: its settings complete and typed. It is made once and never changed.
 
-Everything that a look at arguments, folders and configurations can tell is told here, before anything is run: a mistake
-costs a sentence and not a run. What a user sets stays; what is left open gets the benchmark's default.
+Making the plan checks arguments, folders and configurations, so that a mistake ends the command before anything runs.
+Settings that a user names stay; the others get the benchmark's defaults.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from lerobot_memobench.envs.command_line import overrides, quiet, read_rename_map
-from lerobot_memobench.envs.observations import OBJECTS, PIXELS, check_obs_type, obs_type_of, prompt_in
+from lerobot_memobench.envs.command_line import overrides, quiet
+from lerobot_memobench.envs.evaluation_file import read_evaluation
+from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
+from lerobot_memobench.envs.settings import OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.evaluation.records import CARD_FILE, read_card
 from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
-from lerobot_memobench.policies.compatibility import REFUSAL, check_features
+from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.protocol import (
     EVALUATION_EPISODES,
     EVALUATION_SEED,
@@ -40,40 +41,38 @@ from lerobot_memobench.run.arguments import (
     joined,
     read_arguments,
     split_arguments,
-    whole_number,
     without_flags,
 )
 
 if TYPE_CHECKING:
-    from lerobot.configs.default import EvalConfig
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.envs.configs import EnvConfig
 
     from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from lerobot_memobench.run.settings import EvaluationSettings
 
 ENVIRONMENT = "memobench"
-EXPERT = "memobench_expert"
-SCRIPTED = {EXPERT: "env.expert_action", "memobench_blind": "env.blind_action"}
-"""Policies whose actions the environment offers, and by which setting it does."""
-OUTPUT, LOG = "output_dir", "env.log_dir"
-PATHS = ("policy.path", "env.task_dir")
-"""Settings that name what is read."""
+SCRIPTED = {"memobench_expert": "expert_action", "memobench_blind": "blind_action"}
+"""Policies whose actions the environment offers -> the setting by which it does."""
+OUTPUT = "output_dir"
 LARGEST_BATCH = 64
+OBJECT_BATCH = 10
+"""Environments at once, in one process, of a policy that observes objects and runs on a CPU: a control step of one
+episode took 3.8 ms against 6.1 ms one at a time."""
 VIDEO_EPISODES = 10
 """Episodes of each task that are recorded as videos, as many as LeRobot renders of an environment without videos of its
-own; none where only objects are observed, so that nothing is drawn unasked."""
+own; none where only objects are observed, so that nothing is drawn without need."""
 EVALUATED = (PAPER, VALIDATION, SEALED)
 """Splits that ``split=`` names."""
 
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """What is evaluated and how.
+    """An evaluation that is ready to run.
 
     Attributes:
-        arguments: LeRobot's, complete but for the folders that are written.
+        settings: complete, as the card holds them.
         policy: its configuration. environment: its configuration.
-        eval_settings: LeRobot's section ``eval``.
         grid: the episodes it consists of.
         output: folder of LeRobot's own files.
         log: folder of the episode log, the report and the card.
@@ -83,10 +82,9 @@ class EvaluationPlan:
         command: the command line as it was given, for the card.
     """
 
-    arguments: LerobotArguments
+    settings: EvaluationSettings
     policy: PreTrainedConfig
     environment: MemobenchEnvConfig
-    eval_settings: EvalConfig
     grid: Grid
     output: Path
     log: Path
@@ -98,17 +96,17 @@ class EvaluationPlan:
     @property
     def policy_path(self) -> str | None:
         """The model checkpoint or repository that is evaluated, None for a policy that is not loaded."""
-        return self.arguments.get("policy.path")
+        return self.settings.policy_path
 
     @property
     def split(self) -> str | None:
-        """What the seeds of its scenes are for, None for none of `protocol.SPLITS` in particular."""
+        """The split of `protocol.SPLITS` that holds the seeds of its scenes; None where no split holds them all."""
         seeds = self.seeds
         return next((name for name, split in SPLITS.items() if seeds[0] in split and seeds[-1] in split), None)
 
     @property
     def seeds(self) -> range:
-        """Seeds of the scenes; where each is run with each variant, those of all tasks, whose numbers of it differ."""
+        """Seeds of the scenes. With evidence, those of all tasks: tasks differ in their number of variants."""
         base, first, last = self.environment.seed_base, self.grid.first, self.grid.first + self.grid.runs - 1
         if self.environment.evidence:
             variants = self.variants.values()
@@ -117,7 +115,7 @@ class EvaluationPlan:
 
     @property
     def variants(self) -> dict[str, int]:
-        """Task -> with how many variants each of its scenes is run where evidence is asked."""
+        """Task -> number of variants with which each of its scenes is run, with evidence."""
         from lerobot_memobench.tasks.catalogue import load_task
 
         return {task.name: len(load_task(task.folder).random_variants) for task in self.grid.tasks}
@@ -129,85 +127,60 @@ class EvaluationPlan:
         kept = [word for word in joined(self.command) if not word.startswith(("resume=", f"{OUTPUT}="))]
         return shlex.join([*without_flags(kept, OUTPUT), "resume=true", f"{OUTPUT}={folder}"])
 
-    @property
-    def portable_flags(self) -> list[str]:
-        """LeRobot's flags without the folders that are written, those that are read absolute: for cards and parts."""
-        arguments = self.arguments
-        for key in PATHS:
-            path = Path(arguments.get(key) or "").expanduser()
-            if arguments.has(key) and path.exists():
-                arguments = arguments.changed(key, path.absolute())
-        return list(arguments.flags)
-
 
 # --- making it ---
 
 
 def plan_line(line: Sequence[str]) -> EvaluationPlan:
     """Return the plan of the benchmark's evaluation that ``lerobot eval <line>`` asks for."""
+    from lerobot_memobench.run.settings import read_settings
+
     options, given = take_run_options(split_arguments(line))
-    return make_plan(read_arguments("eval", given), options, ("lerobot", "eval", *line))
+    return make_plan(read_settings(given), options, ("lerobot", "eval", *line))
 
 
-def is_benchmark(arguments: LerobotArguments, options: RunOptions) -> bool:
-    """Return whether an evaluation is the benchmark's; another one gets no defaults, and is checked here.
-
-    Raises:
-        MemobenchError: no environment is named, or what only the benchmark has is asked of another one.
-    """
-    if not arguments.has("env.type") and not arguments.has(CONFIG_FILE):
-        raise MemobenchError("name an environment: env=memobench")
-    if arguments.get("env.type") == ENVIRONMENT:
-        return True
-    if options.any:
-        raise MemobenchError(
-            "split=, memory_reads=, resume=, shard= and shards= belong to the benchmark: name it with env=memobench"
-        )
-    path = arguments.get("policy.path")
-    if path is not None:
-        check_checkpoint(path)
-    return False
-
-
-def make_plan(arguments: LerobotArguments, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:
-    """Complete the arguments of the benchmark's evaluation and find out what they ask for.
+def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:
+    """Complete the settings of the benchmark's evaluation and check what they ask for.
 
     Raises:
         MemobenchError: it cannot be run as asked.
     """
-    if options.resume and not arguments.has(OUTPUT):
+    from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from lerobot_memobench.run.settings import policy_of, with_policy
+
+    if options.resume and asked.output_dir is None:
         raise MemobenchError("resume=true needs the folder of the evaluation to go on with: output_dir=<folder>")
-    arguments = with_policy(arguments)
+    asked = with_policy(asked)
     if options.split is not None:
         check_choice("split", options.split, EVALUATED)
-        arguments = arguments.default("seed", SPLITS[options.split].start)
-    policy = evaluated_policy(arguments)
-    output = _output(arguments, options)
-    log = Path(arguments.get(LOG) or output)
-    arguments = arguments.changed(OUTPUT, output).changed(LOG, log)
-    if obs_type_of(policy) not in (None, PIXELS):
-        arguments = arguments.default("env.obs_type", obs_type_of(policy))
-    arguments = with_protocol(arguments, options, log, policy)
-    arguments = arguments.default("env.prompt_in", prompt_in(policy))
-    environment = cast("MemobenchEnvConfig", env_config(arguments))
-    check_observations(policy, environment)
-    check_as_checkpoint(arguments, policy, environment)
-    if options.memory_reads:
-        check_memory_reads(policy)
-    grid = make_grid(arguments, environment)
+    asked = with_device(asked, options)
+    policy = policy_of(asked)
+    output = _output(asked, options, policy)
+    log = Path(asked.env.get("log_dir") or output)
+    asked = with_protocol(asked, options, policy)
+    asked = with_batch_size(asked, options, log, policy)
+    environment = MemobenchEnvConfig(**{**asked.env, "log_dir": None, "resume": False})
+    for name, value in vars(environment.settings_for(policy)).items():
+        setattr(environment, name, value)
+    asked = asked.with_env(**environment.gym_kwargs)
+    grid = make_grid(asked, environment)
     plan = EvaluationPlan(
-        arguments=arguments.without(OUTPUT, LOG),
+        settings=asked,
         policy=policy,
         environment=environment,
-        eval_settings=eval_settings(arguments),
         grid=grid,
         output=output,
         log=log,
         seed=environment.seed_base + grid.first,
-        batch=whole_number(arguments.get("eval.batch_size")) or 1,
+        batch=asked.batch_size or 1,
         options=options,
         command=tuple(command),
     )
+    if plan.policy_path is not None:
+        check_checkpoint(plan.policy_path)
+    check_inputs(asked, policy, environment)
+    if options.memory_reads:
+        check_memory_reads(policy)
     check_split(plan)
     check_scenes(plan)
     if options.slurm is None:  # there, each part checks its own machine
@@ -219,7 +192,7 @@ def check_split(plan: EvaluationPlan) -> None:
     """Refuse seeds outside the split that was named, and the sealed ones where it was not.
 
     Raises:
-        MemobenchError: they are, with what to say instead.
+        MemobenchError: they are.
     """
     asked, seeds, sealed = plan.options.split, plan.seeds, SPLITS[SEALED]
     if asked is not None and plan.split != asked:
@@ -262,105 +235,132 @@ def _check_simulator(environment: MemobenchEnvConfig) -> None:
     KINDS[environment.world].check()
 
 
-def _output(arguments: LerobotArguments, options: RunOptions) -> Path:
+def _output(asked: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> Path:
     """Return the folder that was asked for, that of the part in it, or one that no evaluation has used."""
-    given = arguments.get(OUTPUT)
-    if given is not None:
-        return Path(given) / options.shard.folder if options.shard is not None else Path(given)
-    chosen = arguments.chosen.get("policy")
-    name = arguments.get("policy.type") or (chosen.get_choice_name(chosen) if chosen else "policy")  # type: ignore[attr-defined]
+    if asked.output_dir is not None:
+        return Path(asked.output_dir) / options.shard.folder if options.shard is not None else Path(asked.output_dir)
     now = dt.datetime.now()
-    base = Path("outputs/eval") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{ENVIRONMENT}_{name}"
+    base = Path("outputs/eval") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{ENVIRONMENT}_{policy.type}"
     others = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
     return next(folder for folder in itertools.chain([base], others) if not folder.exists())
 
 
-def make_grid(arguments: LerobotArguments, environment: MemobenchEnvConfig) -> Grid:
+def make_grid(asked: EvaluationSettings, environment: MemobenchEnvConfig) -> Grid:
     """Return the episodes that an evaluation consists of.
 
     Raises:
         MemobenchError: unknown tasks, or no episodes.
     """
     tasks = tuple(PlannedTask(*chosen) for chosen in environment.selected())
-    runs, seed = whole_number(arguments.get("eval.n_episodes")), whole_number(arguments.get("seed"))
+    runs, seed = asked.episodes, asked.seed
     if runs is None or seed is None or runs < 1:
-        raise MemobenchError(
-            f"found episodes={arguments.get('eval.n_episodes')} and seed={arguments.get('seed')}; expected whole "
-            "numbers, and at least one episode"
-        )
-    batch = min(whole_number(arguments.get("eval.batch_size")) or 1, runs)
-    return Grid(tasks, runs, batch, seed - environment.seed_base)
+        raise MemobenchError(f"found episodes={runs} and seed={seed}; expected whole numbers, and at least one episode")
+    return Grid(tasks, runs, min(asked.batch_size or 1, runs), seed - environment.seed_base)
 
 
 # --- the benchmark's defaults ---
 
 
-def with_policy(arguments: LerobotArguments) -> LerobotArguments:
-    """Return arguments with the scripted expert where no policy is named; a scripted policy is offered its action."""
-    if not any(arguments.has(f"policy.{word}") for word in ("type", "path")):
-        arguments = arguments.choosing("policy", EXPERT)
-    chosen: Any = arguments.chosen.get("policy")
-    offered = None if chosen is None else SCRIPTED.get(chosen.get_choice_name(chosen))
-    return arguments if offered is None else arguments.default(offered, True)
+def with_device(asked: EvaluationSettings, options: RunOptions) -> EvaluationSettings:
+    """Return settings whose policy runs on the CPU where this machine has nothing else.
 
-
-def with_protocol(
-    arguments: LerobotArguments, options: RunOptions, log: Path, policy: PreTrainedConfig
-) -> LerobotArguments:
-    """Return arguments with the protocol's seed and episodes, a batch, a device, the replan interval, videos."""
+    Where parts run elsewhere, that machine decides: this one may be a login node without a GPU, or with the only one.
+    """
     import torch
 
-    evidence = is_true("env.evidence", arguments.get("env.evidence"))
-    episodes = EVIDENCE_EPISODES if evidence else EVALUATION_EPISODES
-    arguments = arguments.default("seed", EVALUATION_SEED).default("eval.n_episodes", episodes)
-    if whole_number(arguments.get("seed")) is not None:
-        arguments = arguments.default("env.seed_base", arguments.get("seed"))  # episodes are counted from the first
-    # A policy may serve few environments at once, such as one for each of its servers.
-    arguments = with_batch_size(arguments, options, log, getattr(policy, "max_environments", None) or LARGEST_BATCH)
-    # Where parts run elsewhere, that machine decides: this one may be a login node without a GPU, or with the only one.
-    if not options.shards and not torch.cuda.is_available() and not torch.backends.mps.is_available():
-        arguments = arguments.default("policy.device", "cpu")
-    if (n_action_steps := getattr(policy, "n_action_steps", None)) is not None:
-        arguments = arguments.default("env.replan_steps", n_action_steps)
-    return arguments.default("env.videos", 0 if arguments.get("env.obs_type") == OBJECTS else VIDEO_EPISODES)
+    if options.shards or "device" in asked.policy or torch.cuda.is_available() or torch.backends.mps.is_available():
+        return asked
+    return replace(asked, policy={**asked.policy, "device": "cpu"})
 
 
-def with_batch_size(arguments: LerobotArguments, options: RunOptions, log: Path, most: int) -> LerobotArguments:
-    """Return arguments with the largest batch that LeRobot would choose and that divides the episodes.
+def with_protocol(asked: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> EvaluationSettings:
+    """Return settings with the protocol's seed and episodes, the policy's inputs, and videos."""
+    if asked.seed is None:
+        seed = EVALUATION_SEED if options.split is None else SPLITS[options.split].start
+        asked = replace(asked, seed=seed)
+    if asked.episodes is None:
+        asked = replace(asked, episodes=EVIDENCE_EPISODES if asked.env.get("evidence") else EVALUATION_EPISODES)
+    asked = asked.env_default("seed_base", asked.seed)  # episodes are counted from the first
+    if obs_type_of(policy) not in (None, PIXELS):
+        asked = asked.env_default("obs_type", obs_type_of(policy))
+    if policy.type in SCRIPTED:
+        asked = asked.env_default(SCRIPTED[policy.type], True)
+    return asked.env_default("videos", 0 if asked.env.get("obs_type") == OBJECTS else VIDEO_EPISODES)
 
-    LeRobot runs whole batches and throws the surplus of the last one away, after simulating it. Going on keeps the
-    number of the earlier run: what a policy samples may depend on it. Parts run one at a time: by cores, each machine
-    would cut the evaluation differently.
+
+def with_batch_size(
+    asked: EvaluationSettings, options: RunOptions, log: Path, policy: PreTrainedConfig
+) -> EvaluationSettings:
+    """Return settings with the number of environments that run at once.
+
+    A policy that observes objects and runs on a CPU gets `OBJECT_BATCH` in one process; otherwise as many processes as
+    suit the cores and divide the episodes. Going on keeps the number of the earlier run, because a policy's samples may
+    depend on it. Parts run one at a time: by cores, each machine would cut the evaluation differently.
     """
-    given = whole_number(arguments.get("eval.batch_size")) or 0
+    given, episodes = asked.batch_size or 0, asked.episodes or 1
     if given < 0:
         raise MemobenchError(
             f"found batch_size={given}; expected how many episodes run at once, at least 1, or 0 for as many as suit "
             "the machine"
         )
     if given:
-        return arguments
-    earlier = earlier_batch_size(log) if options.resume else None
-    if earlier is not None:
-        return arguments.changed("eval.batch_size", earlier)
-    if options.in_parts and not arguments.has("eval.batch_size"):
-        return arguments.default("eval.batch_size", 1)
-    episodes = whole_number(arguments.get("eval.n_episodes")) or 1
-    limit = max(1, min(int(cores() * 0.7), episodes, most))
-    return arguments.changed("eval.batch_size", max(size for size in range(1, limit + 1) if episodes % size == 0))
+        return asked
+    if options.resume and (earlier := earlier_batch_size(log)) is not None:
+        return replace(asked, batch_size=earlier)
+    if options.in_parts and asked.batch_size is None:
+        return replace(asked, batch_size=1)
+    # A policy may serve few environments at once, such as one for each of its servers.
+    most = min(episodes, getattr(policy, "max_environments", None) or LARGEST_BATCH)
+    learned = policy.type not in SCRIPTED and policy.device == "cpu"
+    if learned and asked.env.get("obs_type") == OBJECTS and not asked.use_async_envs:
+        return replace(asked, batch_size=min(OBJECT_BATCH, most), use_async_envs=False)
+    limit = max(1, min(int(cores() * 0.7), most))
+    return replace(asked, batch_size=max(size for size in range(1, limit + 1) if episodes % size == 0))
 
 
 def earlier_batch_size(log: Path) -> int | None:
-    """Return the batch size of the evaluation in a folder, None where there is none or nobody knows."""
-    path = log / CARD_FILE
-    if not path.is_file():
-        return None
-    starts = read_card(path).get("runs") or [{}]
+    """Return the batch size of the evaluation in a folder, None where there is none or it is not known."""
+    starts = read_evaluation(log).get("runs") or [{}]
     size = starts[-1].get("batch_size")
     return None if size is None else int(size)
 
 
-# --- the configurations of the policy and the environment, as LeRobot will build them ---
+def check_inputs(asked: EvaluationSettings, policy: PreTrainedConfig, environment: MemobenchEnvConfig) -> None:
+    """Refuse a policy that is to act on other inputs, or under other settings, than it was trained for.
+
+    Raises:
+        MemobenchError: it is refused.
+    """
+    check_obs_type(policy, environment.obs_type)
+    if asked.policy_path is None:
+        return
+    with quiet():
+        check_as_trained(asked.policy_path, policy)
+    from lerobot.envs.utils import env_to_policy_features
+
+    check_features(asked.policy_path, policy, env_to_policy_features(environment), asked.rename_map)
+
+
+def read_other(given: Arguments) -> LerobotArguments:
+    """Return LeRobot's arguments for an evaluation of another environment than the benchmark, checked.
+
+    Raises:
+        MemobenchError: no environment is named, something is asked for that only the benchmark has, or the checkpoint
+            is not whole.
+    """
+    for key, _ in given.pairs:
+        if key in RUN_OPTIONS:
+            raise MemobenchError(f"{key}= belongs to the benchmark: name it with env=memobench")
+    arguments = read_arguments("eval", given)
+    if not given.wants_help and not arguments.has("env.type") and not arguments.has(CONFIG_FILE):
+        raise MemobenchError("name an environment: env=memobench")
+    path = arguments.get("policy.path")
+    if path is not None and not given.wants_help:
+        check_checkpoint(path)
+    return arguments
+
+
+# --- configurations of LeRobot's arguments, for training ---
 
 
 def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
@@ -376,20 +376,6 @@ def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
     return _loaded(path, arguments) if _is_known(arguments, "policy") else None
 
 
-def evaluated_policy(arguments: LerobotArguments) -> PreTrainedConfig:
-    """Return the configuration of the policy that is evaluated; that of a repository is downloaded.
-
-    Raises:
-        MemobenchError: the type is not known. Others as of `policy_config`.
-    """
-    config, path = policy_config(arguments), arguments.get("policy.path")
-    if config is None and path is not None:
-        config = _loaded(path, arguments)
-    if config is None:
-        raise MemobenchError(f"policy.type={arguments.get('policy.type')} is not known; import what registers it")
-    return config
-
-
 def _loaded(path: str, arguments: LerobotArguments) -> PreTrainedConfig:
     from lerobot.configs.policies import PreTrainedConfig
 
@@ -400,24 +386,6 @@ def _loaded(path: str, arguments: LerobotArguments) -> PreTrainedConfig:
 def env_config(arguments: LerobotArguments) -> EnvConfig | None:
     """Return the environment's configuration; None where none is chosen, or a configuration file has a say."""
     return cast("EnvConfig | None", _parsed(arguments, "env"))
-
-
-def eval_settings(arguments: LerobotArguments) -> EvalConfig:
-    """Return LeRobot's section ``eval``.
-
-    Raises:
-        MemobenchError: tasks were to run in threads.
-    """
-    import draccus
-    from lerobot.configs.default import EvalConfig
-
-    threads = arguments.get("env.max_parallel_tasks")
-    if threads not in (None, "1"):
-        raise MemobenchError(
-            f"env.max_parallel_tasks is {threads}; the tasks run one after another here. Leave it out, and ask for "
-            "processes by shards= and workers="
-        )
-    return draccus.parse(EvalConfig, args=overrides("eval", arguments.for_parser))
 
 
 def _is_known(arguments: LerobotArguments, key: str) -> bool:
@@ -439,43 +407,23 @@ def _parsed(arguments: LerobotArguments, key: str) -> Any:
 
 
 def check_observations(policy: PreTrainedConfig | None, environment: EnvConfig | None) -> None:
-    """Refuse an environment that lacks the policy's inputs, or renders them only at some of the steps it remembers.
+    """Refuse an environment that lacks the policy's inputs.
 
     Raises:
-        MemobenchError: pictures or objects would be missing, or one step's picture remembered as another's.
+        MemobenchError: pictures or objects would be missing.
     """
     if environment is not None and environment.type == ENVIRONMENT:
-        check_obs_type(policy, environment.obs_type)
-    remembers_pictures = getattr(policy, "needs_every_frame", False) and obs_type_of(policy) != OBJECTS
-    if remembers_pictures and getattr(environment, "render_every", 1) > 1:
-        raise MemobenchError(f"env.render_every is {getattr(environment, 'render_every', 1)}; {REFUSAL}")
-
-
-def check_as_checkpoint(arguments: LerobotArguments, policy: PreTrainedConfig | None, environment: EnvConfig) -> None:
-    """Refuse a model checkpoint that is to act under other settings than it was trained for, or on other inputs.
-
-    Raises:
-        MemobenchError: it is refused.
-    """
-    path = arguments.get("policy.path")
-    if path is None or policy is None:
-        return
-    with quiet():
-        check_as_trained(path, policy)
-    from lerobot.envs.utils import env_to_policy_features
-
-    renamed = read_rename_map(arguments.get("rename_map"))
-    check_features(path, policy, env_to_policy_features(environment), renamed)
+        check_obs_type(policy, cast("MemobenchEnvConfig", environment).obs_type)
 
 
 def check_memory_reads(policy: Any) -> None:
-    """Refuse to note what a policy reads that does not tell it.
+    """Refuse ``memory_reads`` for a policy that does not report its reads.
 
     Args:
         policy: it, or its configuration.
 
     Raises:
-        MemobenchError: it is none of ours, or has no memory that tells it.
+        MemobenchError: the policy has no memory that reports its reads.
     """
     config = getattr(policy, "config", policy)
     if not hasattr(config, "check_memory_reads"):
@@ -495,7 +443,7 @@ class RunOptions:
 
     Attributes:
         split: whose seeds are run, one of `EVALUATED`; None: those that `seed=` says.
-        memory_reads: how much each chunk reads of what the policy remembers is written beside the log.
+        memory_reads: write how much each chunk reads of each remembered frame next to the log.
         resume: go on with the evaluation in the output folder.
         shard: run this part alone.
         shards: run so many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
@@ -510,11 +458,6 @@ class RunOptions:
     shards: int = 0
     workers: int = 0
     slurm: tuple[str, ...] | None = None
-
-    @property
-    def any(self) -> bool:
-        """Whether something is asked for that only the benchmark's evaluation can do."""
-        return self.resume or self.in_parts or self.memory_reads or self.split is not None
 
     @property
     def in_parts(self) -> bool:

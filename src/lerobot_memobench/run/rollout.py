@@ -23,7 +23,6 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES
 from numpy.typing import NDArray
 
 from lerobot_memobench.protocol import CLOCK
-from lerobot_memobench.run.recording import Recorder
 
 PIXELS, PHASE, STEP = "pixels", "phase", "step"
 """Keys of the environment's observations; ``phase`` is 0 in the demonstration prompt and 1 in the execution."""
@@ -63,49 +62,37 @@ class Actor:
         return found
 
 
-def roll(
-    env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = None, recorder: Recorder | None = None
-) -> None:
+def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = None) -> None:
     """Run one episode in each row; the environments write the log.
 
     Args:
         env: vector environment of `MemobenchEnvConfig`.
         seeds: one per row.
-        recorder: takes every frame; then each one is drawn.
     """
     actor.policy.reset()
     # Without the option a frozen row would rest until the rollout after this one.
     observation, _ = env.reset(seed=list(seeds), options={NEW_ROLLOUT_OPTION: True})
     limit = env.call("_max_episode_steps")[0]
     check_env_attributes_and_types(env)
-    inputs = Inputs(env, actor, spares=recorder is None)
+    inputs = Inputs(env, actor)
     done = np.zeros(env.num_envs, bool)
     for step in range(1, limit + 1):
-        before, action = observation, actor.act(inputs.of(observation))
+        action = actor.act(inputs.of(observation))
         inputs.announce()
-        observation, reward, terminated, truncated, info = env.step(action)
+        observation, _, terminated, truncated, _ = env.step(action)
         done = done | terminated | truncated | (step == limit)
         if ended is not None:
             ended(done)
-        if recorder is not None:
-            holds = np.broadcast_to(np.asarray(info.get("final_info", info).get("is_success", False), bool), done.shape)
-            broken = np.broadcast_to(info.get("_fault", False), done.shape)  # gymnasium marks the rows that set it
-            recorder.add(before, action, reward, holds, done, env.call("task_description"), broken)
         if done.all():
             break
 
 
 class Inputs:
-    """The inputs of a policy during a rollout, as new as the policy needs them.
+    """The inputs of a policy during a rollout, as new as the policy needs them."""
 
-    Args:
-        spares: leave out what the policy does not need.
-    """
-
-    def __init__(self, env: Any, actor: Actor, spares: bool = True) -> None:
+    def __init__(self, env: Any, actor: Actor) -> None:
         self._env, self._actor = env, actor
-        self._needed: Callable[[], bool] = needs_observation(actor.policy) if spares else lambda: True
-        self._ready = has_planned_action(actor.policy) if spares else lambda: False
+        self._needed, self._ready = needs_observation(actor.policy), has_planned_action(actor.policy)
         self._drawn, self._planned = True, False  # after the environment's reset
         self._pictures: dict[str, torch.Tensor] = {}
         self._last: dict[str, Any] = {}

@@ -9,16 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_log, read_protocol_file
+from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_log
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import CARD_FILE, Run, read_card, read_protocol
+from lerobot_memobench.evaluation.records import Run, read_protocol
 from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
-from lerobot_memobench.io import count_of, is_there, remove_drafts, write_file
+from lerobot_memobench.io import count_of, remove_drafts, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import (
-    CARD_MARKDOWN,
     card_of,
     drawn_otherwise,
     extended,
@@ -29,7 +29,7 @@ from lerobot_memobench.run.card import (
 from lerobot_memobench.run.evaluate import Advance, evaluate, lerobot_summary
 from lerobot_memobench.run.machine import drawn_with
 from lerobot_memobench.run.plan import Cell, EvaluationPlan
-from lerobot_memobench.run.sealed import RUN_FILE, counted
+from lerobot_memobench.run.sealed import counted
 
 VIDEOS, LEROBOT_INFO = "videos", "eval_info.json"
 """Folder of the videos, in that of the log; rates in the form of LeRobot's evaluation."""
@@ -63,7 +63,7 @@ def run_evaluation(
 
     Args:
         tell: told what matters and stops nothing, and how to go on when a run breaks off.
-        begin: told what is about to be run: the first episode takes a while.
+        begin: called with a line on the evaluation before it starts.
         advance: see `evaluate.Advance`.
 
     Raises:
@@ -120,13 +120,10 @@ def _run(
 
 def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
     """Write the report of the log, and what was found onto the card."""
-    protocol = {**card["protocol"], **read_protocol_file(plan.log)}
-    protocol.pop(POLICY, None)  # a card says more of it; the file has what `auto` came to in LeRobot's process
     # A log of plain lerobot-eval holds whole batches: episodes beyond those asked for are no part of the report.
-    limit = plan.grid.first + max(plan.grid.runs, protocol["episodes"])
+    limit = plan.grid.first + max(plan.grid.runs, card["protocol"]["episodes"])
     records = [record for record in read_log(plan.log) if record["episode"] < limit]
-    card = with_checkpoint({**card, "protocol": protocol}, plan.policy_path)
-    write_card(plan.log, with_episodes(card, records))
+    write_card(plan.log, with_episodes(with_checkpoint(card, plan.policy_path), records))
     write_file(plan.output / LEROBOT_INFO, json.dumps(lerobot_summary(records, plan.grid.tasks), indent=2) + "\n")
     return EvaluationReport(write_report(plan.log, limit))
 
@@ -143,7 +140,6 @@ def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, An
         MemobenchError: it is another evaluation: of another protocol, policy, or of other task files.
     """
     check_folder(folder)
-    path = folder / CARD_FILE
     if not has_log(folder):
         return card
     found = differences(read_protocol(folder), {**card["protocol"], POLICY: card[POLICY]}, policy=True)
@@ -157,10 +153,10 @@ def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, An
             f"the episodes in {folder} drew their variants otherwise ({problem}): an earlier version ran them, which "
             "did not draw in balance; go on with that version, or choose another output_dir="
         )
-    if not is_there(path):
-        tell(f"note: {folder} has no {CARD_FILE}: whether its episodes are this policy's cannot be checked")
+    if POLICY not in read_evaluation(folder):
+        tell(f"note: {folder} has no result card: whether its episodes are this policy's cannot be checked")
         return card
-    earlier = read_card(path, whole=True)
+    earlier = read_evaluation(folder, whole=True)
     edited = [name for name, value in card["task_files"].items() if earlier["task_files"].get(name, value) != value]
     if edited:
         raise MemobenchError(f"the files of {edited[0]} are not those that the episodes in {folder} were run with")
@@ -216,19 +212,19 @@ def logged(folder: Path, referent: str) -> set[tuple[str, int]]:
 def held(plan: EvaluationPlan) -> Iterator[None]:
     """Hold the folders of an evaluation and of its log, see `made`.
 
-    Drafts of a killed run are removed, and of a run that ends before its first episode the files that it made.
+    Drafts of a killed run are removed, and of a run that ends before its first episode the file that it made.
     """
     with ExitStack() as stack:
         for folder in {folder.absolute(): folder for folder in (plan.output, plan.log)}.values():
             stack.enter_context(made(folder))
         for folder in (plan.log, plan.log / VIDEOS, plan.log / MEMORY_READS):
             remove_drafts(folder)
-        files = [*(plan.log / name for name in (CARD_FILE, CARD_MARKDOWN)), plan.output / RUN_FILE]
-        mine = [file for file in files if not file.exists()]
+        file = plan.log / EVALUATION_FILE
+        there = file.exists()
         try:
             yield
         finally:
-            for file in [] if has_log(plan.log) else mine:
+            if not there and not has_log(plan.log):
                 file.unlink(missing_ok=True)
 
 

@@ -18,9 +18,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NotRequired
 
-from lerobot_memobench.envs.acting import SEALED_LEDGER, SEALED_RUN, tree_hash
-from lerobot_memobench.evaluation.records import SealedStart
-from lerobot_memobench.io import Malformed, checked, count_of, file_hash, parsed, telling_of_the_disk, write_file
+from lerobot_memobench.envs.acting import SEALED_LEDGER, tree_hash
+from lerobot_memobench.envs.evaluation_file import SealedStart
+from lerobot_memobench.io import Malformed, checked, count_of, file_hash, parsed, telling_of_the_disk
 from lerobot_memobench.jobs.processes import taking_turns
 from lerobot_memobench.policies.checkpoint import (
     ADAPTER_FILE,
@@ -36,8 +36,6 @@ from lerobot_memobench.run.machine import PACKAGES, versions
 from lerobot_memobench.run.plan import EvaluationPlan
 from lerobot_memobench.tasks.task import MEMOBENCH
 
-RUN_FILE = SEALED_RUN
-"""Marks the folder of a counted evaluation; what counts is in the ledger."""
 LOADED = (
     *(CONFIG_FILE, WEIGHTS_FILE, "adapter_config.json", ADAPTER_FILE),
     *(PREPROCESSOR_FILE, POSTPROCESSOR_FILE),
@@ -81,8 +79,6 @@ def counted(plan: EvaluationPlan, card: dict[str, Any], tell: Callable[[str], No
         ledger.parent.mkdir(parents=True, exist_ok=True)
         with taking_turns(ledger.with_suffix(".lock")):
             found = _start(plan, card, str(folder))
-    folder.mkdir(parents=True, exist_ok=True)
-    write_file(folder / RUN_FILE, json.dumps(found, indent=1) + "\n")
     tell(in_words(found))
     episodes = card.pop("episodes")  # they stay the last of a card
     return {**card, "sealed": found, "episodes": episodes}

@@ -139,7 +139,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> lis
     jobs = [
         ShardJob(
             program=tuple(program),
-            flags=(*plan.portable_flags, *_part_options(plan)),
+            flags=(*plan.settings.words, *_part_options(plan)),
             shard=shard,
             out=out,
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
@@ -178,7 +178,7 @@ def slurm_of(plan: EvaluationPlan) -> Slurm | None:
 
     A large policy requests a GPU, and memory for its weights twice.
     """
-    options, device = plan.options, plan.arguments.get("policy.device")
+    options, device = plan.options, plan.settings.policy.get("device")
     if options.slurm is None:
         return None
     parameters = parameters_of(plan.policy_path) or 0 if plan.policy_path is not None else 0

@@ -37,7 +37,8 @@ from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as INPUT
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.envs.command_line import overrides, quiet
-from lerobot_memobench.envs.observations import BOTH, OBJECTS, OBS_TYPES, PIXELS, chooses_inputs, reads_prompt
+from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import check_fetched, count_of
 from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on

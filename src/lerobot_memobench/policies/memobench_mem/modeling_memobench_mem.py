@@ -28,8 +28,8 @@ from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_resumed, check_weights
-from lerobot_memobench.policies.compatibility import PICTURE_AGE, cure, require_fresh
+from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_weights
+from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
 from lerobot_memobench.policies.memobench_mem.average import WeightAverage
 from lerobot_memobench.policies.memobench_mem.caching import open_frames
@@ -92,7 +92,6 @@ logger = logging.getLogger(__name__)
 
 FSDP_PREFIX = "_fsdp_wrapped_module."
 """What torch's FSDP puts into the names of what it wraps."""
-OBS_PICTURE_AGE = f"observation.{PICTURE_AGE}"
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "modulator", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
@@ -443,12 +442,9 @@ class MemobenchMemPolicy(PI05Policy):
 
     @torch.no_grad()
     def _write(self, batch: dict[str, Tensor], rows: list[int]) -> None:
-        """Write the present frames of some rows to their memories; refuse a frame of an earlier step."""
+        """Write the present frames of some rows to their memories."""
         memory = self.model.memory
         assert memory is not None
-        if OBS_PICTURE_AGE in batch and self.perception.pictures:
-            for row in rows:
-                require_fresh(round(float(batch[OBS_PICTURE_AGE][row])))
         frames = self.perception.remember(batch, rows).to(self._device)
         with self._acting():
             for row, frame in zip(rows, frames.split(1), strict=True):  # one by one: no row depends on others
@@ -625,8 +621,6 @@ class MemobenchMemPolicy(PI05Policy):
             require_agreement(saved, of, config, training=dataset_meta is not None)
             if dataset_meta is None:
                 check_as_trained(saved, config, of)
-            else:
-                check_resumed(saved, config)
         trained = as_trained(source, config, revision)
         assert isinstance(trained, MemobenchMemConfig)
         check_weights(source, trained, revision)

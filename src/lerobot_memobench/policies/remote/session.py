@@ -17,7 +17,6 @@ from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import short
-from lerobot_memobench.policies.compatibility import PICTURE_AGE, require_fresh
 from lerobot_memobench.policies.remote.configuration_remote import (
     IMAGE,
     RLDS,
@@ -110,7 +109,6 @@ class Session:
 
     def watch(self, row: Row) -> None:
         """Note a frame that is not asked about; the server gets it with the next question."""
-        require_fresh(row.scalar(PICTURE_AGE))
         sent = self._keys.values()
         names = (IMAGE, STATE) if self._dialect.buffers else [name for name in HISTORY if name in sent]
         self._frames.append({name: self._value(row, name) for name in names})
