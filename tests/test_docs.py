@@ -28,7 +28,7 @@ from lerobot_memobench.evaluation.metrics import Rate
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.run.arguments import joined, read_arguments, resolve_recipe, split_arguments
 from lerobot_memobench.run.plan import take_run_options
-from lerobot_memobench.run.training import take_training_options
+from lerobot_memobench.training.command import take_training_options
 from tests.support.logs import rollout
 from tests.support.scripts import load_script
 

@@ -18,8 +18,6 @@ import pytest
 
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.describe import short_manifest
-from lerobot_memobench.datasets.feature_cache.layout import FORMAT, CacheMeta, read_meta
-from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.datasets.generation import is_finished
 from lerobot_memobench.datasets.hdf5.reading import read_extras
 from lerobot_memobench.datasets.lerobot_format.layout import episode_count, read_manifest
@@ -117,48 +115,13 @@ def infos(folder: Path) -> None:
     pq.write_table(pa.table({"episode_index": [0, 1]}), folder / "meta" / "episodes" / "file-000.parquet")
 
 
-CACHE = "feature_cache/tiny-stride1"
-
-
-def caches(folder: Path) -> None:
-    """A feature cache of two episodes of three frames."""
-    meta = CacheMeta(FORMAT, "print", "tower", "words", "camera", 1, 2, 4, 6, ["coarse"], True, True)
-    write(folder / CACHE / "meta.json", vars(meta))
-    write(folder / CACHE / "texts.json", ["a", "b"])
-    write(folder / CACHE / "memory.json", ["", "a"])
-    for name, array in {
-        "episodes": np.array([0, 3, 6]),
-        "phase": np.ones(6, np.uint8),
-        "subgoal-coarse": np.array([0, 1, -1, 0, 0, 1], np.int32),
-        "texts": np.ones((2, 3), np.float32),
-        "memory": np.array([0, 1, 0, 0, 1, 1], np.int32),
-    }.items():
-        np.save(folder / CACHE / f"{name}.npy", array)
-    (folder / CACHE / "tokens.bin").write_bytes(bytes(2 * 6 * 2 * 4))
-
-
-def use_cache(folder: Path) -> None:
-    if read_meta(folder, "tiny-stride1") is None:
-        return
-    cache = FeatureCache.open(folder, "tiny-stride1", frames_key="tower", camera="camera", stride=1)
-    for index in range(cache.num_frames):
-        episode, frame = cache.locate(index)
-        assert cache.tokens(episode, [frame]).shape == (1, cache.meta.tokens_per_frame, cache.meta.dim)
-        assert cache.memory_texts([index])
-    for level in cache.meta.levels:
-        assert cache.text_embeddings[cache.text_rows(level).clip(min=0)].shape[0] == cache.num_frames
-
-
 KINDS: dict[str, tuple[Prepare, Use, str]] = {
     "manifest": (manifests, use_manifest, "manifest.json"),
     "manifest of a conversion": (manifests, use_conversion, "manifest.json"),
     "staged episode": (staged, use_staged, "episode.json"),
     "request": (requests, use_request, ".staging/request.json"),
     "info": (infos, episode_count, "meta/info.json"),
-    "cache's description": (caches, use_cache, f"{CACHE}/meta.json"),
-    "cache's texts": (caches, use_cache, f"{CACHE}/texts.json {CACHE}/memory.json"),
 }
-ARRAYS = " ".join(f"{CACHE}/{name}.npy" for name in ("episodes", "phase", "subgoal-coarse", "texts", "memory"))
 
 
 def check(
@@ -168,9 +131,6 @@ def check(
     monkeypatch: pytest.MonkeyPatch,
     mutate: Callable[[bytes, random.Random], bytes] = mutations.mutated_json,
 ) -> tuple[int, int]:
-    monkeypatch.setattr(
-        "lerobot_memobench.datasets.feature_cache.reading.dataset_fingerprint", lambda root, camera: "print"
-    )
     prepare, use, files = KINDS[kind]
     source, whole = tmp_path / "source", tmp_path / "whole"
     whole.mkdir()
@@ -200,16 +160,6 @@ def test_damaged_files_beside_a_dataset(tmp_path: Path, kind: str, monkeypatch: 
 def test_many_damaged_files_beside_a_dataset(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     results, refused = check(tmp_path, kind, 10_000, monkeypatch)
     print(f"{kind}: {results} results, {refused} refused")
-
-
-def test_damaged_arrays_of_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(KINDS, "arrays", (caches, use_cache, ARRAYS))
-    assert min(check(tmp_path, "arrays", 100, monkeypatch, mutations.mutated_bytes)) > 1
-
-
-def test_what_a_cache_says_of_itself_is_told_in_one_sentence() -> None:
-    meta = CacheMeta(FORMAT, "print", "tower", "words", 5000 * "a", 1, 2, 4, 6, ["coarse"], True, True)
-    assert len(meta.mismatch({"camera": "observation.images.image"}) or "") < mutations.LONGEST_SENTENCE
 
 
 # --- attributes ---

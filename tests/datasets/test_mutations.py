@@ -20,8 +20,6 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_memobench.datasets.feature_cache.building import build_feature_cache
-from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.datasets.hdf5.reading import PublishedFile
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.layout import image_key, read_manifest
@@ -29,19 +27,17 @@ from lerobot_memobench.datasets.staging import FORMATS, stage_demonstration
 from lerobot_memobench.datasets.validate import validate
 from lerobot_memobench.errors import MemobenchError
 from tests.datasets.test_damaged_commands import demonstration
-from tests.datasets.test_feature_cache import _Frames, _Texts
 
 CAMERA = image_key("image")
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of two episodes, its HDF5 file and a feature cache."""
+    """A dataset of two episodes and its HDF5 file."""
     folder = tmp_path_factory.mktemp("mutations")
     demos = [demonstration(10_000 + k) for k in range(2)]
     staged = [stage_demonstration(demo, folder / str(k), FORMATS) for k, demo in enumerate(demos)]
     root = assemble(staged, folder / "whole", formats=FORMATS)
-    build_feature_cache(root, "test", _Frames(), _Texts(), camera=CAMERA)
     return root
 
 
@@ -78,15 +74,6 @@ def by_describe(root: Path) -> Any:
     return read_manifest(root)["episodes"]
 
 
-def by_training(root: Path) -> Any:
-    """Everything that training reads of a feature cache."""
-    cache = FeatureCache.open(root, "test", frames_key="tower", camera=CAMERA, stride=1, texts_key="texts")
-    frames = range(cache.num_frames)
-    tables = [cache.text_rows(level) for level in cache.meta.levels]
-    numbers = [cache.all_tokens().view(-1).tolist(), cache.text_embeddings.tolist(), cache.phase, cache.episodes]
-    return [cache.texts, cache.memory_texts(frames), str(cache.meta), tables, numbers]
-
-
 KINDS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "videos": ("videos/**/*.mp4", by_lerobot),
     "data": ("data/**/*.parquet", by_lerobot),
@@ -97,7 +84,6 @@ KINDS: dict[str, tuple[str, Callable[[Path], Any]]] = {
     "manifest": ("manifest.json", by_describe),
     "states": ("states/**/*.parquet", by_replay),
     "HDF5": ("hdf5/*.hdf5", by_convert),
-    "feature cache": ("feature_cache/test/*.*", by_training),
 }
 
 

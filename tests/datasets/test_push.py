@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.datasets.feature_cache.building import keep_from_the_hub
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.push import push
 from lerobot_memobench.errors import MemobenchError
@@ -175,20 +174,6 @@ from lerobot.datasets import LeRobotDataset
 RepoCard.validate = lambda *_, **__: None  # it asks huggingface.co, whatever the endpoint is
 LeRobotDataset({repo!r}, root={folder!r}).push_to_hub()
 """
-
-
-def test_lerobots_own_push_leaves_feature_caches_here(hub, machine, folder, tmp_path):
-    keep_from_the_hub(folder)
-    (folder / "feature_cache" / "tiny").mkdir(parents=True)
-    (folder / "feature_cache" / "tiny" / "tokens.bin").write_bytes(b"0" * 100)
-    pushed = machine(LEROBOTS_PUSH.format(folder=str(folder), repo=REPO), tmp_path / "home")
-    assert pushed.returncode == 0, pushed.stderr
-    assert "meta/info.json" in hub.repos[REPO]
-    assert [name for name in hub.repos[REPO] if name.startswith("feature_cache")] == []
-    (folder / ".gitignore").write_text("mine\n")
-    keep_from_the_hub(folder)
-    keep_from_the_hub(folder)
-    assert (folder / ".gitignore").read_text() == "mine\n/feature_cache/\n"
 
 
 def test_the_card_on_the_hub_loads_from_there(hub, machine, folder, tmp_path):

@@ -15,15 +15,14 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import SEVERAL, WordTextEncoder, shuffled_subgoals, text_rows
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import with_memory
 from lerobot_memobench.tasks.task import LEVELS
+from lerobot_memobench.training.features import FOLDER, cache_dataset
 from tests.support.small_policy import batch_of, made_for_training, small_config
 
 EPISODE_1 = 40  # first frame of the second episode, whose subgoals are:
@@ -224,7 +223,6 @@ def test_without_memory_fusion_it_is_plain_pi05(dataset_root: Path, tmp_path: Pa
     policy.train()
     loss, logged = policy.forward(batch)
     loss.backward()
-    policy.update()
     assert logged["loss"] == logged["action_loss"]
     for part in (policy, before, after):
         part.save_pretrained(tmp_path)

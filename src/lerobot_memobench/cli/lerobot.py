@@ -41,7 +41,7 @@ def run(line: Sequence[str]) -> int:
     if given.wants_help and name in SHORT_FORMS:
         print(Path(__file__).with_name(f"lerobot_{name}.txt").read_text(), flush=True)
     if name == "train":
-        from lerobot_memobench.run.training import train
+        from lerobot_memobench.training.command import train
 
         return train(given, line[1:], tell)
     check_task_names(given)

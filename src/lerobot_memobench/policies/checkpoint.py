@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -30,6 +29,8 @@ GO_ON_WITHOUT = ("pi0", "pi05", "pi0_fast")
 ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
+REMOVED_FIELDS = {"align_weight", "feature_cache_dir", "min_lr_ratio", "shuffle_seed"}
+"""Fields of memobench_mem in checkpoints of earlier versions (`update_checkpoint`)."""
 
 
 class Feature(TypedDict, total=False):
@@ -135,7 +136,14 @@ def checkpoint_type(path: str) -> str | None:
     folder = Path(path).expanduser()
     if not folder.is_dir():
         return None
-    name = read_json(folder / CONFIG_FILE).get("type")
+    config = read_json(folder / CONFIG_FILE)
+    name = config.get("type")
+    removed = sorted(REMOVED_FIELDS & config.keys())
+    if name == "memobench_mem" and removed:
+        raise MemobenchError(
+            f"{folder / CONFIG_FILE} has {', '.join(removed)}, which an earlier version wrote; update the checkpoint: "
+            f"python -m lerobot_memobench.policies.update_checkpoint {folder}"
+        )
     if not isinstance(name, str):
         raise MemobenchError(
             f"{folder / CONFIG_FILE} names no policy type; expected a checkpoint of today's LeRobot, which cannot read "
@@ -288,21 +296,6 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
             f"--policy.{name}={asked} cannot be followed: '{source}' was trained with {held}, and {why}; "
             f"leave {name} out, or train with it"
         )
-
-
-def check_resumed(source: str | Path, policy: PreTrainedConfig) -> None:
-    """Refuse that LeRobot's own ``--resume`` goes on with a training under settings that it was not begun with.
-
-    Args:
-        source: the checkpoint that is loaded; nothing is checked where the command line resumes none, or another.
-        policy: configuration under which it would go on; errors as of `check_as_begun`.
-    """
-    from lerobot.configs import parser
-
-    file, resume = parser.parse_arg("config_path"), parser.parse_arg("resume")
-    resumes = "--resume" in sys.argv if resume is None else resume.lower() == "true"
-    if resumes and file is not None and Path(source).resolve() in (Path(file).resolve(), Path(file).resolve().parent):
-        check_as_begun(source, policy, as_trained(source, policy))
 
 
 def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTrainedConfig) -> None:
