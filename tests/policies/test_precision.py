@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 
-from lerobot_memobench.policies.memobench_mem.average import WeightAverage
 from tests.support.small_policy import batch_of, made_for_training
 
 
@@ -40,20 +39,6 @@ def test_what_learns_is_float32_and_what_is_frozen_is_not(half: Any, dataset_roo
     vlm = expert.model.paligemma_with_expert.paligemma.model.language_model.layers[0].self_attn.q_proj.weight
     assert vlm.dtype == torch.bfloat16
     assert {parameter.dtype for parameter in expert.get_optim_params()} == {torch.float32}
-
-
-def test_an_average_is_cast_once_between_updates() -> None:
-    parameter = torch.nn.Parameter(torch.tensor([1.0], dtype=torch.bfloat16))
-    average = WeightAverage({"w": parameter}, decay=0.5)
-    with average.applied():
-        first = parameter.data
-    with average.applied():
-        assert parameter.data.data_ptr() == first.data_ptr()
-    parameter.data.fill_(3.0)
-    average.update()
-    with average.applied():
-        assert parameter.item() > 1.0
-    assert parameter.item() == 3.0
 
 
 def test_small_updates_accumulate(half: Any) -> None:

@@ -115,7 +115,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_encoded(root: Path, m
     with pytest.raises(MemobenchError, match="feature cache"):
         encoder.made(root)
     assert encoder.calls == []
-    assert not (root / "feature_cache").exists()
+    assert not features_folder(root, "test", encoder.features(), CAMERA, 1).exists()
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")

@@ -2,7 +2,7 @@
 
 ``key=value`` becomes ``--key=value`` after a check against the command's settings; whatever starts with
 ``--`` is passed on untouched. ``lerobot eval env=memobench`` and ``lerobot train policy=…`` also get the
-defaults that make them work as they stand (``run.plan``, ``run.training``).
+benchmark's defaults (``run.plan``, ``training.command``).
 """
 
 from __future__ import annotations

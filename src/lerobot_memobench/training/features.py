@@ -179,7 +179,7 @@ def make_features(
     with telling_of_the_disk(folder), ThreadPoolExecutor(workers or min(cores(), MOST_THREADS)) as pool:
         folder.mkdir(parents=True, exist_ok=True)
         _keep_from_the_hub(root)
-        for number in missing[rank::world]:
+        for number in [number for number in missing if number % world == rank]:
             frames = [slot * stride for slot in range(counts[number])]
             parts = [frames[first : first + batch_size] for first in range(0, len(frames), batch_size)]
             images = pool.map(functools.partial(read, number), parts)

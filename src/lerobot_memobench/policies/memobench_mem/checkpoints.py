@@ -243,7 +243,7 @@ _ORACLE = "memobench_oracle_memory"
 def require_agreement(source: str | Path, revision: str | None, config: MemobenchMemConfig, *, training: bool) -> None:
     """Check that the saved steps of a checkpoint do, or will do, what ``config`` says.
 
-    LeRobot loads them. Ours follow the policy (`sampler.TrainingRun`), and LeRobot hands some of its own their new
+    LeRobot loads them. Ours follow the training (`follow_training`), and LeRobot gives some of its own their new
     settings; the rest would keep the checkpoint's.
 
     A checkpoint without a preprocessor passes: LeRobot says what it lacks.
