@@ -15,13 +15,14 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
+from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import check_clock, objects_column
 from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS, obs_type_of, reads_prompt
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
-from lerobot_memobench.protocol import CLOCK
+from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import SHORT_FORMS, read_arguments, split_arguments
 from lerobot_memobench.run.plan import policy_config
 from lerobot_memobench.run.rollout import has_planned_action, needs_observation
@@ -44,6 +45,8 @@ class Subject:
     Attributes:
         dataset: as it is trained on: with the policy's own delta timestamps.
         streams: `STREAMS` episodes.
+        cameras: of the dataset.
+        numbers: (N,) index in ``dataset`` of each frame, by its global index in the dataset that was named.
     """
 
     name: str
@@ -52,6 +55,8 @@ class Subject:
     postprocessor: Any
     dataset: Any
     streams: list[Stream]
+    cameras: list[str]
+    numbers: NDArray[np.int64]
 
     @property
     def reads_prompt(self) -> bool:
@@ -97,8 +102,8 @@ class Subject:
         """
         from lerobot.utils.collate import lerobot_collate_fn
 
-        batch = lerobot_collate_fn([self.dataset[stream.index + call] for call in calls])
-        for key in self.dataset.meta.camera_keys:
+        batch = lerobot_collate_fn([self.dataset[int(self.numbers[stream.index + call])] for call in calls])
+        for key in self.cameras:
             if key in batch and batch[key].dtype == torch.uint8:
                 batch[key] = batch[key].to(torch.float32) / 255
         self.policy.reset()
@@ -178,13 +183,15 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     path = config.pretrained_path
     if path is not None:
         check_weights(path, config)
-    whole = TrainPipelineConfig(DatasetConfig(repository, root=root), policy=config)
+    whole, numbers = TrainPipelineConfig(DatasetConfig(repository, root=root), policy=config), np.arange(raw.num_frames)
     torch.manual_seed(0)
     if config.type == MEMORY_POLICY:
         training = open_training(whole, open_datasets(whole))
         policy, (before, after), dataset = training.policy, training.processors, training.samples()
     else:
         choice = choice_for(config, raw.meta.features, None, obs_type)
+        if not choice.prompts:
+            numbers = np.cumsum(read_frame_table(Path(raw.root)).phase == EXECUTION) - 1
         if needs_view(raw.meta.features, choice):
             write_view(Path(raw.root), folder / "view", choice)
             whole.dataset.root = str(folder / "view")
@@ -201,7 +208,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     streams = [stream for stream, _ in zip(found, range(STREAMS), strict=False)]
     if len(streams) < STREAMS:
         raise MemobenchError(f"{raw.root} has {len(streams)} episodes; name a dataset of at least {STREAMS}, or none")
-    return Subject(config.type, policy, before, after, dataset, streams)
+    return Subject(config.type, policy, before, after, dataset, streams, raw.meta.camera_keys, numbers)
 
 
 def _begin_somewhere(policy: Any) -> None:
