@@ -27,6 +27,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.training.average import WeightAverage
 
 WARM_UP, BATCH = 3, 16
 Part = Callable[[str, str, int], dict[str, Any]]
@@ -151,7 +152,8 @@ def updating(ddp: bool, **fields: Any) -> Part:
             learner = DistributedDataParallel(policy, find_unused_parameters=True)
         batch = {key: value.to(device) for key, value in training_batch(settings, BATCH).items()}
         try:
-            taken = [timed(update, learner, policy, optimizer, batch) for _ in range(steps + WARM_UP)]
+            average = WeightAverage(policy.trained_parameters(), policy.config.ema_decay)
+            taken = [timed(update, learner, policy, optimizer, average, batch) for _ in range(steps + WARM_UP)]
         finally:
             if ddp:
                 torch.distributed.destroy_process_group()
@@ -160,14 +162,16 @@ def updating(ddp: bool, **fields: Any) -> Part:
     return part
 
 
-def update(learner: Any, policy: MemobenchMemPolicy, optimizer: Any, batch: Mapping[str, Tensor]) -> None:
+def update(
+    learner: Any, policy: MemobenchMemPolicy, optimizer: Any, average: WeightAverage, batch: Mapping[str, Tensor]
+) -> None:
     """Update once, as training does."""
     loss, _ = learner(batch)
     loss.backward()
     torch.nn.utils.clip_grad_norm_(policy.parameters(), policy.config.optimizer_grad_clip_norm)
     optimizer.step()
     optimizer.zero_grad()
-    policy.update()
+    average.update()
 
 
 COMPILED = {"compile_model": True, "compile_mode": "reduce-overhead"}

@@ -29,29 +29,26 @@ import numpy as np
 import torch
 from turns import medians, peak, reset_peak, resident
 
-from lerobot_memobench.datasets.feature_cache.building import build_feature_cache
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER
-from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
-from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder
+from lerobot_memobench.datasets.frames import read_frame_table
+from lerobot_memobench.datasets.lookup import FrameLookup
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SIZES
 from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
+from lerobot_memobench.training.features import Features, features_folder, make_features
 
 CAMERA = "observation.images.image"
 TASK = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 CACHE = "benchmark"
 
 
-class RandomTokens:
-    """Stands for the image tower: tokens of the right shape, whatever the images."""
+TOKENS_PER_FRAME = 16
 
-    key, tokens_per_frame = "random", 16
 
-    def __init__(self, dim: int) -> None:
-        self.dim = dim
-
-    def __call__(self, images: torch.Tensor) -> torch.Tensor:
-        return torch.randn(len(images), self.tokens_per_frame, self.dim).to(torch.bfloat16)
+def random_tokens(dim: int) -> Features:
+    """Return features of the image tower's shape, whatever the images."""
+    return Features(
+        "random", TOKENS_PER_FRAME, dim, lambda images: torch.randn(len(images), TOKENS_PER_FRAME, dim).bfloat16()
+    )
 
 
 def main() -> None:
@@ -69,8 +66,8 @@ def main() -> None:
         try:
             print(json.dumps(measure(root, asked.size, asked.frames, asked.samples, asked.repeats)))
         finally:
-            shutil.rmtree(root / FOLDER / CACHE, ignore_errors=True)
-            (root / FOLDER / f"{CACHE}.lock").unlink(missing_ok=True)
+            features = random_tokens(SIZES[asked.size].vlm.width)
+            shutil.rmtree(features_folder(root, CACHE, features, CAMERA, 1), ignore_errors=True)
 
 
 def record(root: Path) -> Path:
@@ -90,8 +87,8 @@ def measure(root: Path, size: str, numbers: list[int], samples: int, repeats: in
     from lerobot.datasets.video_utils import decode_video_frames
 
     dim = SIZES[size].vlm.width
-    folder = build_feature_cache(root, CACHE, RandomTokens(dim), WordTextEncoder(8), camera=CAMERA)
-    cache = FeatureCache.open(root, CACHE, frames_key=RandomTokens.key, camera=CAMERA, stride=1)
+    features = make_features(root, CACHE, random_tokens(dim), camera=CAMERA)
+    cache = FrameLookup(root, read_frame_table(root), remember=features.tokens)
     meta = LeRobotDatasetMetadata(root.name, root=root)
     rng = np.random.default_rng(0)
     length = int(np.diff(cache.episodes).max())
@@ -104,7 +101,7 @@ def measure(root: Path, size: str, numbers: list[int], samples: int, repeats: in
         "image": f"{height}x{width}",
         "longest_episode": length,
         "samples": len(indices),
-        "token_file_mib": round((folder / "tokens.bin").stat().st_size / 2**20, 1),
+        "token_files_mib": round(sum(file.stat().st_size for file in features.folder.iterdir()) / 2**20, 1),
     }
 
     def decode(frames: int) -> None:
@@ -116,7 +113,7 @@ def measure(root: Path, size: str, numbers: list[int], samples: int, repeats: in
             decode_video_frames(root / meta.get_video_file_path(episode, CAMERA), times, tolerance_s=1e-4)
 
     for frames in numbers:
-        step = GatherMemoryProcessorStep(frames=frames, cache=cache)
+        step = GatherMemoryProcessorStep(frames=frames, lookup=cache)
         sides = {"cache": lambda step=step: step.gather(cache, indices), "lerobot": lambda n=frames: decode(n)}
         rise = {}
         for name, side in sides.items():

@@ -39,9 +39,9 @@ from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import Memo
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep, gathering
-from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory
 from lerobot_memobench.protocol import CONTROL_HZ, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE
+from lerobot_memobench.training.speed import keep_freed_memory
 
 EPISODES, MOMENTS = 12, 6
 MINUTE, MINUTES = 60 * CONTROL_HZ, (1, 5, 20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +20,8 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.training.average import WeightAverage
+from lerobot_memobench.training.speed import quick_products
 
 # A size between tiny and pi05 that a CPU can train, with the full size's proportions: 256 patches per image, a VLM
 # that is wider than its expert, a chunk of 50, memory of 512 tokens.
@@ -56,14 +59,17 @@ def updates(policy: MemobenchMemPolicy, batch: Mapping[str, torch.Tensor]) -> Ca
     policy.train()
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     there = {key: value.to(policy.config.device) for key, value in batch.items()}
+    average = WeightAverage(policy.trained_parameters(), policy.config.ema_decay)
+    on_cpu = policy.config.device == "cpu" and not policy.config.uses_visual_encoder
 
     def update() -> None:
-        loss, _ = policy.forward(there)
-        loss.backward()
+        with quick_products() if on_cpu else nullcontext():
+            loss, _ = policy.forward(there)
+            loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimizer.step()
         optimizer.zero_grad()
-        policy.update()
+        average.update()
         if policy.config.device != "cpu":
             torch.cuda.synchronize()
 

@@ -179,16 +179,16 @@ def control_and_planned_step(folder: Path) -> list[Functions]:
 
 def training_step(folder: Path) -> list[Functions]:
     """Trace ``lerobot train`` from the end of its second update to that of its third, and end it there."""
-    from lerobot.scripts import lerobot_train
+    from lerobot_memobench.training.loop import Run
 
     memobench("generate", "--tasks", TASK, "--episodes", 1, "--no-images", "--out", folder / "dataset")
-    update, watch, count = lerobot_train.update_policy, Watch(), 0
+    update, watch, count = Run.update, Watch(), 0
 
-    def updated(*parts: Any, **settings: Any) -> Any:
+    def updated(run: Run, batch: dict[str, Any]) -> dict[str, Any]:
         nonlocal count
         if count == 3:  # the third has been made
             raise SystemExit(0)
-        result = update(*parts, **settings)
+        result = update(run, batch)
         count += 1
         if count == 2:
             watch.start()
@@ -196,7 +196,7 @@ def training_step(folder: Path) -> list[Functions]:
             watch.stop()
         return result
 
-    lerobot_train.update_policy = updated
+    Run.update = updated  # type: ignore[method-assign]
     with contextlib.suppress(SystemExit):
         policy = ("policy=memobench_mem", "size=small", "perception=objects", "align=semantic", "device=cpu")
         run = (f"dataset={folder}/dataset", "steps=9", "batch_size=12", "num_workers=0", f"output_dir={folder}/train")

@@ -34,7 +34,7 @@ from lerobot_memobench.run.arguments import (
 )
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.settings import read_settings
-from lerobot_memobench.run.training import take_training_options
+from lerobot_memobench.training.command import take_training_options
 from tests.support.logs import rollout
 from tests.support.scripts import load_script
 

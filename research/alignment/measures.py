@@ -19,14 +19,15 @@ from lerobot.policies import make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, RecordedFrames
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
+from lerobot_memobench.datasets.lookup import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import SemanticAlignment, masked_mean
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, item
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import follow_training
 from lerobot_memobench.protocol import PROMPT
 from lerobot_memobench.tasks.catalogue import suite_of
+from lerobot_memobench.training.data import RecordedSamples
 
 # --- episodes: their tasks, and which are held out ---
 
@@ -267,14 +268,14 @@ class Measures:
         frames: of the dataset. meta: its metadata, as LeRobot has it. tasks: names of its tasks.
     """
 
-    def __init__(self, frames: RecordedFrames, meta: Any, tasks: tuple[str, ...], questions: Questions) -> None:
+    def __init__(self, frames: FrameLookup, meta: Any, tasks: tuple[str, ...], questions: Questions) -> None:
         self.frames, self.meta, self.tasks, self.questions = frames, meta, tasks, questions
 
     def of_checkpoint(self, folder: Path) -> dict[str, Any]:
         """Measure the policy of a checkpoint, by its averaged weights."""
         policy = MemobenchMemPolicy.from_pretrained(folder)
         before, _ = make_pre_post_processors(policy.config, pretrained_path=str(folder))
-        TrainingRun(policy.config, self.frames, self.meta).follow(before.steps)  # what it looks up
+        follow_training(before.steps, policy.config, self.meta, self.frames)
         found: dict[str, Any] = self.of_memory(policy, before) if policy.config.memory != "none" else {}
         return found | {"action_loss": self.action_loss(policy, before)}
 
@@ -345,8 +346,9 @@ class Measures:
         self, policy: MemobenchMemPolicy, before: Any, asked: Asked
     ) -> Iterator[tuple[int, dict[str, Tensor]]]:
         """Numbered batches of these frames, as LeRobot's loader and the preprocessor make them."""
-        deltas = {"action": policy.config.action_delta_indices}
+        tasks = self.meta.tasks.index.tolist()
+        recorded = RecordedSamples(self.frames, tasks, policy.config.action_delta_indices)
         for first in range(0, len(asked.indices), EVALUATION_BATCH):
             part = asked.indices[first : first + EVALUATION_BATCH].tolist()
-            samples = default_collate([item(self.frames, self.meta, deltas, number) for number in part])
+            samples = default_collate([recorded[number] for number in part])
             yield first // EVALUATION_BATCH, before(samples)

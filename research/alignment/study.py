@@ -16,18 +16,17 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 import torch
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_memobench.datasets.feature_cache.layout import dataset_fingerprint
-from lerobot_memobench.datasets.feature_cache.reading import RecordedFrames
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Number, read_json, write_file
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.sampler import training_run
 from lerobot_memobench.protocol import CAMERAS, EVALUATION_SEED
+from lerobot_memobench.training.data import open_datasets, open_training
+from lerobot_memobench.training.features import dataset_fingerprint
 from research.alignment.measures import Measures, Split, guesses, make_questions, split_episodes
 from research.alignment.report import draw, measures_table, summarise
 from research.learning.experiments import MEMORY, MEMORYLESS, Experiment
@@ -149,17 +148,14 @@ class Study:
         self.out, self.settings = out, settings
         self.split = split_episodes(root, settings.held_out)
         self.stages = Stages(experiment_of(self.split, settings), out, root, workers)
-        meta = LeRobotDatasetMetadata(DEFAULT_REPO_ID, root=root)
         config = MemobenchMemConfig(size="small", perception="objects", device="cpu", push_to_hub=False)
         torch.manual_seed(0)
-        self.untrained = make_policy(config, ds_meta=meta)
-        self.before, _ = make_pre_post_processors(config, dataset_stats=meta.stats)
-        run = training_run(config)
-        assert run is not None  # the policy has begun it
-        assert isinstance(run.cache, RecordedFrames)
-        self.frames = run.cache
+        whole = TrainPipelineConfig(DatasetConfig(DEFAULT_REPO_ID, root=str(root)), policy=config)
+        training = open_training(whole, open_datasets(whole))
+        self.untrained, self.frames = training.policy, training.lookup
+        self.before, _ = training.processors
         self.questions = make_questions(self.frames, settings.level, self.split, settings.frames_per_episode)
-        self.measures = Measures(self.frames, meta, self.split.tasks, self.questions)
+        self.measures = Measures(self.frames, training.dataset.meta, self.split.tasks, self.questions)
         claim_folder(out, root, settings)  # now that it can be studied
 
     def baselines(self) -> dict[str, Any]:

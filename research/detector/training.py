@@ -34,9 +34,9 @@ from lerobot_memobench.perception.detector import (
 from lerobot_memobench.perception.geometry import projected
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
-from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory, quicker_in_bfloat16
-from lerobot_memobench.policies.memobench_mem.training import draw_curve, mean_of
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.training.speed import keep_freed_memory, quicker_in_bfloat16
+from research.detector.curve import draw_curve, mean_of
 from research.detector.data import Pictures
 from research.detector.labels import MASK, Rows, images_of
 

@@ -138,7 +138,7 @@ def train_once(words: Sequence[str], log: Path, policy: Path, *, beside: int = 1
     Raises:
         MemobenchError: as `run_once`; or a checkpoint is there, and nothing says by which command.
     """
-    from lerobot_memobench.run.training import TRAIN_CONFIG, last_checkpoint
+    from lerobot_memobench.training.resume import TRAIN_CONFIG, last_checkpoint
 
     try:
         begun = last_checkpoint(policy) / TRAIN_CONFIG
@@ -159,7 +159,7 @@ def check_training(words: Sequence[str]) -> None:
         MemobenchError: an unknown setting or value, named with the nearest known one.
     """
     from lerobot_memobench.run.arguments import read_arguments
-    from lerobot_memobench.run.training import take_training_options
+    from lerobot_memobench.training.command import take_training_options
 
     told = [word for word in words[2:] if not word.startswith("dataset=")]
     *_, rest = take_training_options(split_arguments(told))

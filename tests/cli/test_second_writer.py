@@ -10,8 +10,6 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.datasets.feature_cache import building
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.evaluation.html.write import UNFINISHED
 from lerobot_memobench.jobs.processes import locked, taking_turns
@@ -22,28 +20,6 @@ from tests.support import logs, synthetic_dataset
 STOVE = "turn_on_the_stove_and_turn_it_off"
 EVALUATION = ["policy=memobench_random", f"tasks={STOVE}", "episodes=2", "policy.device=cpu", "output_dir=out"]
 PARTS = ["eval", "env=memobench", *EVALUATION, "shards=2", "batch_size=1"]
-
-
-class Waited(Exception):
-    """The second builder of a cache would wait."""
-
-
-def come_back(folder: Path) -> None:
-    raise Waited
-
-
-class Encoder:
-    """Stands for encoders that are never called."""
-
-    key, tokens_per_frame, dim = "none", 1, 1
-
-
-def cache() -> int:
-    try:
-        building.build_feature_cache("data", "a", Encoder(), Encoder(), wait=come_back)  # type: ignore[arg-type]
-    except Waited:
-        return 2
-    return 0
 
 
 #: Command -> its exit status, where its lock is.
@@ -59,8 +35,7 @@ COMMANDS: dict[str, tuple[Callable[[], int], int, str]] = {
     "sealed test": (lambda: memobench(["test-sealed", *EVALUATION]), 2, "out"),
     "merge": (lambda: memobench(["merge", "out", "logged"]), 2, "out"),
     "report": (lambda: memobench(["report", "logged"]), 0, "logged"),
-    "demo": (lambda: memobench(["demo", "--out", "demo"]), 2, "demo"),
-    "html": (lambda: memobench(["html", "logged", "--out", "html"]), 2, "html"),
+    "html": (lambda: memobench(["report", "logged", "--html", "html"]), 2, "html"),
     "generation": (
         lambda: memobench(["generate", "--tasks", STOVE, "--episodes", "1", "--out", "ds"]),
         2,
@@ -72,7 +47,6 @@ COMMANDS: dict[str, tuple[Callable[[], int], int, str]] = {
         2,
         ".run.lock",
     ),
-    "feature cache": (cache, 2, f"data/{FOLDER}/a.lock"),
 }
 
 
@@ -94,7 +68,6 @@ def test_a_second_writer_changes_nothing(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in (
         "out/notes.json",
-        "demo/contact_sheet.png",
         "out/.1-a.part.evaluation.json",
         "run/model",
         "files/a.hdf5",
@@ -104,14 +77,13 @@ def test_a_second_writer_changes_nothing(
     parts: dict[str, Any] = {"protocol": {"tasks": [STOVE], "episodes": 2}, "policy": {}, "checkpoint": None}
     started = [run_facts(["lerobot", "eval"], 1)]
     write_card(Path("out"), new_card(**parts, trained_on=None, task_files={}, settings={}, runs=started))
-    for name in ("ds/.staging/episodes/.tmp-000000", "html/videos/run", f"data/{FOLDER}"):
+    for name in ("ds/.staging/episodes/.tmp-000000", "html/videos/run"):
         Path(name).mkdir(parents=True)
     Path("html/index.html").write_text(UNFINISHED)
     Path("html/videos/run/a.mp4").write_text("of the first run")
     Path("ds/.staging/request.json").write_text("{}")
     for path in dataset.iterdir():
         Path("data", path.name).symlink_to(path)
-    Path("data/.gitignore").write_text(f"/{FOLDER}/\n")
     Path(".run.lock").touch()
     EpisodeLog("logged").append(logs.record(STOVE))
     run, status, place = COMMANDS[command]
@@ -121,4 +93,4 @@ def test_a_second_writer_changes_nothing(
         before = files(tmp_path)
         assert run() == status
         assert files(tmp_path) == before
-    assert command == "feature cache" or "another run is writing" in capsys.readouterr().err
+    assert "another run is writing" in capsys.readouterr().err

@@ -166,9 +166,10 @@ def test_a_flaw_is_named(name: str, window: Subject) -> None:
 
 
 def test_another_history_in_training_is_named(window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = window.dataset.reader.get_item.__self__  # `samples.keep_in_memory`
-    later = {key: [d - key.startswith("observation.") for d in deltas] for key, deltas in rows.deltas.items()}
-    monkeypatch.setattr(rows, "deltas", later)
+    reader = window.dataset.reader
+    deltas = reader.delta_indices.items()
+    later = {key: [d - key.startswith("observation.") for d in found] for key, found in deltas}
+    monkeypatch.setattr(reader, "delta_indices", later)
     assert failed(window) == {"same history in training"}
 
 

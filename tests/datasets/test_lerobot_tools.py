@@ -9,14 +9,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_edit_dataset as tool
-from lerobot.scripts.lerobot_train import train
+from safetensors.torch import load_file
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
 from lerobot_memobench.datasets.describe import describe
@@ -29,6 +28,7 @@ from lerobot_memobench.datasets.validate import validate as validation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from tests.support.short_demonstrations import drawn_steps, with_pictures
+from tests.support.small_policy import train_with
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
@@ -158,7 +158,7 @@ def test_with_images_it_caches_and_trains(filmed, demos, tmp_path):
     check(folder, [demos[1], *demos[:2]], tmp_path / "out")
     policy = MemobenchMemConfig(device="cpu", push_to_hub=False, align="semantic", chunk_size=8, n_action_steps=8)
     chosen = episodes_where(folder, memory_type="object")
-    train(
+    train_with(
         TrainPipelineConfig(
             dataset=DatasetConfig(repo_id=REPO, root=str(folder), episodes=chosen),
             policy=policy,
@@ -170,9 +170,10 @@ def test_with_images_it_caches_and_trains(filmed, demos, tmp_path):
         )
     )
     assert (tmp_path / "run" / "checkpoints" / "000001" / "pretrained_model" / "model.safetensors").is_file()
-    (cached,) = [path.parent for path in (folder / "feature_cache").rglob("episodes.npy")]
-    lengths = np.diff(np.load(cached / "episodes.npy"))
-    assert lengths.tolist() == [len(demo) for demo in (demos[1], *demos[:2])]
+    lengths = []
+    for path in sorted((folder / "feature_cache").rglob("*.safetensors")):
+        lengths.append(len(load_file(path)["tokens"]))
+    assert lengths == [len(demo) for demo in (demos[1], *demos[:2])]
 
 
 def test_states_that_are_gone_are_still_compared(ours, demos, tmp_path):

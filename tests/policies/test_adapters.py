@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_memobench.training.average import begin_average
 from tests.support.small_policy import batch_of, made_for_training
 
 
@@ -44,4 +45,4 @@ def test_adapters_are_made_beside_memory_and_heads(dataset_root: Path, tmp_path:
     learning = {name for name, p in wrapped.named_parameters() if p.requires_grad and p.grad is not None}
     for part in ("lora_A", "model.memory.", "modulator", "memory_to_expert", "alignment"):
         assert any(part in name for name in learning), part
-    assert policy.average is None
+    assert begin_average(policy) is None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,15 +14,15 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER
-from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
+from lerobot_memobench.datasets.frames import read_frame_table
+from lerobot_memobench.datasets.lookup import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import SEVERAL, WordTextEncoder, shuffled_subgoals, text_rows
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import with_memory
 from lerobot_memobench.tasks.task import LEVELS
+from lerobot_memobench.training.features import FOLDER
 from tests.support.small_policy import batch_of, made_for_training, small_config
 
 EPISODE_1 = 40  # first frame of the second episode, whose subgoals are:
@@ -198,14 +197,11 @@ def test_a_dataset_without_the_columns_is_refused(dataset_root: Path, tmp_path: 
     shutil.copytree(dataset_root, root, ignore=shutil.ignore_patterns(FOLDER))
     for path in (root / "data").rglob("*.parquet"):
         pq.write_table(pq.read_table(path).drop_columns(["coarse_subgoal", "memory"]), path)
-    folder = cache_dataset(root, small_config())
-    meta = json.loads((folder / "meta.json").read_text())
-    keys = {key: meta[key] for key in ("frames_key", "camera", "stride")}
-    cache = FeatureCache.open(root, folder.name, **keys)
-    with pytest.raises(MemobenchError, match=r"coarse_subgoal.*levels it has: intermediate, fine"):
-        cache.text_rows("coarse")
+    lookup = FrameLookup(root, read_frame_table(root))
+    with pytest.raises(MemobenchError, match=r"coarse_subgoal.*intermediate, fine"):
+        lookup.text_rows("coarse")
     with pytest.raises(MemobenchError, match="no column 'memory'"):
-        cache.memory_texts([3])
+        lookup.memory_texts([3])
 
 
 # -- pi0.5 without a memory ----------------------------------------------------------------------------------------
@@ -224,7 +220,6 @@ def test_without_memory_fusion_it_is_plain_pi05(dataset_root: Path, tmp_path: Pa
     policy.train()
     loss, logged = policy.forward(batch)
     loss.backward()
-    policy.update()
     assert logged["loss"] == logged["action_loss"]
     for part in (policy, before, after):
         part.save_pretrained(tmp_path)

@@ -14,16 +14,15 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.envs.observations import obs_type_of
 from lerobot_memobench.envs.settings import PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import DETECTED, VIEWS
 from lerobot_memobench.sim.object_layout import SIZE
+from lerobot_memobench.training.features import FOLDER, cache_dataset
 from tests.support.object_dataset import make_object_dataset
 from tests.support.picture_rollouts import (
     made_detector,

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.scripts.lerobot_train import train
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from tests.support.small_policy import train_with
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 HORIZON = 12
@@ -35,7 +35,7 @@ HORIZON = 12
 def test_a_trained_checkpoint_evaluates(
     fields: dict[str, Any], settings: list[str], dataset_root: Path, tmp_path: Path
 ) -> None:
-    train(
+    train_with(
         TrainPipelineConfig(
             dataset=DatasetConfig(repo_id="memobench/synthetic", root=str(dataset_root)),
             policy=MemobenchMemConfig(

@@ -129,7 +129,6 @@ def _step(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> None:
     loss.backward()
     torch.nn.utils.clip_grad_norm_(policy.get_optim_params(), 1.0)
     optimizer.step()
-    policy.update()
     assert torch.isfinite(loss)
 
 

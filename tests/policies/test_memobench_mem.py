@@ -18,8 +18,6 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.processor import TokenizerProcessorStep
 from safetensors.torch import load_file, save_file
 
-from lerobot_memobench.datasets.feature_cache.layout import find_cache
-from lerobot_memobench.datasets.feature_cache.reading import FeatureCache
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem, processor_memobench_mem
 from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder, make_alignment, make_text_encoder
@@ -51,7 +49,6 @@ def trained(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory):  # ty
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
-        policy.update()
     folder = tmp_path_factory.mktemp("checkpoint") / "pretrained_model"
     policy.save_pretrained(folder)
     before.save_pretrained(folder)
@@ -98,7 +95,6 @@ def test_half_precision_and_both_fusions_train_and_act(dataset_root: Path, memor
     with torch.autocast("cpu", dtype=torch.bfloat16):
         loss, logged = policy.forward(before(batch_of(dataset, [3, 50, 80])))
     loss.backward()
-    policy.update()
     assert np.isfinite(logged["loss"])
     actions = _rollout(policy, before, [[_observation(dataset, 0, t)] for t in range(2)])
     assert torch.isfinite(actions).all()
@@ -338,63 +334,6 @@ def test_what_a_checkpoint_holds_is_not_drawn_first(trained: Any, monkeypatch: p
     assert not torch.equal(drawn[-1], before)
 
 
-def test_evaluation_loads_the_average_and_training_both(trained: Any) -> None:
-    policy, before, _, dataset, folder, _ = trained
-    average = policy.average
-    assert average is not None
-    assert average.updates == 4
-    evaluated = MemobenchMemPolicy.from_pretrained(folder)
-    for name, parameter in evaluated.named_parameters():
-        expected = average.average.get(name, dict(policy.named_parameters())[name])
-        assert torch.equal(parameter, expected), name
-    assert evaluated.average is None
-    resumed = MemobenchMemPolicy.from_pretrained(folder, dataset_meta=dataset.meta)
-    assert resumed.average is not None
-    assert resumed.average.updates == 4
-    for name, parameter in resumed.named_parameters():
-        assert torch.equal(parameter, dict(policy.named_parameters())[name]), name
-    for name, tensor in resumed.average.average.items():
-        assert torch.equal(tensor, average.average[name]), name
-    # Evaluation during training uses the average too, and gives the trained weights back.
-    frames = [[_observation(dataset, 0, t)] for t in range(2)]
-    with torch.inference_mode():
-        assert torch.equal(_rollout(policy, before, frames), _rollout(evaluated, before, frames))
-    assert torch.equal(next(iter(policy.get_optim_params())), next(iter(resumed.get_optim_params())))
-    policy.train()
-    policy.forward(before(batch_of(dataset, [3, 50])))[0].backward()
-    policy.zero_grad()
-
-
-def test_average_follows_its_formula() -> None:
-    from lerobot_memobench.policies.memobench_mem.average import WeightAverage
-
-    parameter = torch.nn.Parameter(torch.tensor([1.0]))
-    average = WeightAverage({"w": parameter}, decay=0.15)
-    expected = 1.0
-    for n, value in enumerate((2.0, 3.0, 5.0)):
-        parameter.data.fill_(value)
-        average.update()
-        decay = min(0.15, (1 + n) / (10 + n))
-        expected = decay * expected + (1 - decay) * value
-        assert average.average["w"].item() == pytest.approx(expected)
-    half = torch.nn.Parameter(torch.tensor([1.0], dtype=torch.bfloat16))
-    kept = WeightAverage({"w": half}, decay=0.999)
-    kept.update()
-    assert kept.average["w"].dtype == torch.float32
-    with kept.applied():
-        assert half.dtype == torch.bfloat16
-
-
-def test_no_average_when_it_is_off(dataset_root: Path, tmp_path: Path) -> None:
-    policy, before, _, dataset = made_for_training(dataset_root, ema_decay=0.0)
-    policy.train()
-    policy.forward(before(batch_of(dataset, [3])))
-    policy.update()
-    assert policy.average is None
-    policy.save_pretrained(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
-
-
 def test_resuming_rebuilds_the_pipeline_and_finds_the_cache(trained: Any) -> None:
     _, before, _, dataset, folder, _ = trained
     policy = MemobenchMemPolicy.from_pretrained(folder, dataset_meta=dataset.meta)
@@ -497,7 +436,7 @@ def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:
     for name, tensor in plain.named_parameters():
         assert torch.equal(own[name], tensor), name
     # The tower alone, as `memobench cache --weights` reads it, is the same tower.
-    from lerobot_memobench.policies.memobench_mem.caching import load_image_tower
+    from lerobot_memobench.training.features import load_image_tower
 
     assert load_image_tower(small_config(), tmp_path).key == policy.perception.key
     assert load_image_tower(small_config()).key == trained[0].perception.key != policy.perception.key
@@ -594,12 +533,3 @@ def test_label_text_encoder_knows_which_texts_are_equal_and_no_words() -> None:
     assert labels[0] @ labels[2] > 0.999
     assert abs(labels[0] @ labels[1]) < 0.2 < hashed[0] @ hashed[1]
     assert make_text_encoder("labels", 512).key != make_text_encoder("words", 512).key
-
-
-def test_cache_of_one_dataset_is_not_used_for_another(trained: Any) -> None:
-    contents = {"frames_key": trained[0].perception.key, "camera": "observation.images.image", "stride": 1}
-    root = Path(trained[3].root)
-    cache = FeatureCache.open(root, find_cache(root, "tiny-stride1", **contents).name, **contents)
-    step = GatherMemoryProcessorStep(frames=4, cache=cache)
-    with pytest.raises(MemobenchError, match="outside the feature cache"):
-        step.gather(cache, [10_000])

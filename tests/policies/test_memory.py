@@ -200,10 +200,14 @@ def test_rows_of_a_rollout_and_the_cache_agree() -> None:
     stored = torch.randn(-(-length // stride), 1, 6)
 
     class Cache:
-        """One episode, as `FeatureCache` has it."""
+        """One episode, as `FrameLookup` has it."""
 
-        meta = type("Meta", (), {"stride": stride})
+        encoded: dict[str, Any] = {}
+        columns = encoded
         episodes, phase, texts = np.array([0, length]), np.ones(length), ()
+
+        def __init__(self) -> None:
+            self.stride = stride
 
         def locate(self, index: int) -> tuple[int, int]:
             return 0, index

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -185,10 +184,11 @@ def test_what_is_older_is_forgotten() -> None:
 
 def test_what_follows_is_loaded_up_to_the_end_of_the_episode() -> None:
     class Cache:
-        """Two episodes, as `FeatureCache` has them."""
+        """Two episodes, as `FrameLookup` has them."""
 
-        meta = type("Meta", (), {"stride": 4})
-        episodes, phase, texts = np.array([0, 41, 60]), np.ones(60), ()
+        encoded: dict[str, Any] = {}
+        columns = encoded
+        episodes, phase, texts, stride = np.array([0, 41, 60]), np.ones(60), (), 4
 
         def locate(self, index: int) -> tuple[int, int]:
             return (0, index) if index < 41 else (1, index - 41)
@@ -249,7 +249,6 @@ def test_actions_begin_without_hindsight_and_learn_with_it(trained: tuple[Any, d
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        policy.update()
     assert foreseen[-1] < 0.9 * foreseen[0]
     learned = policy.model.memory_parameters().items()
     still = [name for name, weights in learned if weights.grad is None or not weights.grad.any()]
@@ -299,20 +298,3 @@ def test_the_full_size_has_the_sizes_of_the_source() -> None:
     assert model.memory.field.convolve[2].weight.shape == (1024, 1024, 3, 3, 3)
     assert model.memory.out.out_features == 2048
     assert model.foresight.queries.shape == (8, 1024)
-
-
-def test_thumbnails_have_a_cache_of_their_own(dataset_root: Path, tmp_path: Path) -> None:
-    made_for_training(dataset_root, size="tiny", feature_cache_dir=str(tmp_path))
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
-    policy, preprocessor, _, dataset = made_for_training(
-        dataset_root, size="tiny", memory="motion", memory_frames=32, feature_cache_dir=str(tmp_path)
-    )
-    assert policy.config.memory_stride == 4
-    batch = preprocessor(batch_of(dataset, [9]))
-    assert batch["memory.frames"].shape[1:] == (1, THUMBNAIL**2)
-    _, logged = policy.train().forward(batch)
-    assert logged["memory_foresight_loss"] >= 0
-    folders = [path.name for path in tmp_path.iterdir() if path.is_dir()]
-    assert len(folders) == 2
-    assert ["-thumbnails-stride4-" in name for name in sorted(folders, key=len)] == [False, True]
-    assert {path: path.stat().st_mtime_ns for path in before} == before

@@ -10,12 +10,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.datasets import EpisodeAwareSampler
-from lerobot.datasets.compute_stats import compute_relative_action_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.dataset_reader import DatasetReader
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from scipy.spatial.transform import Rotation
 
@@ -42,18 +37,18 @@ from lerobot_memobench.policies.memobench_mem.objects import (
     rotation,
     slot_features,
 )
-from lerobot_memobench.policies.memobench_mem.sampler import (
-    grouped_order,
-    task_weights,
-    weighted_order,
-)
-from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
 from lerobot_memobench.sim.object_slots import classes
+from lerobot_memobench.training.data import Training, open_datasets, open_training
+from lerobot_memobench.training.loop import make_sampler
+from lerobot_memobench.training.sampler import (
+    FrameSampler,
+    task_weights,
+)
 from tests.support import object_dataset
 from tests.support.object_dataset import LENGTHS, PROMPTS, make_object_dataset, slots_at, state_at
-from tests.support.small_policy import batch_of, made_for_training, small_config
+from tests.support.small_policy import batch_of, made_for_training, small_config, train_config
 
 OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 1}
 STARTS = np.cumsum([0, *LENGTHS])
@@ -80,41 +75,6 @@ def observed(dataset: Any, index: int, **more: Any) -> dict[str, Any]:
 # -- settings ------------------------------------------------------------------------------------------------------
 
 
-def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> None:
-    config = MemobenchMemConfig(device="cpu", size="small", perception="objects")
-    assert (config.chunk_size, config.n_action_steps, config.num_inference_steps) == (16, 6, 1)
-    assert (config.objective, config.memory_stride) == ("regression", 8)
-    assert (config.optimizer_lr, config.optimizer_weight_decay, config.ema_decay) == (1e-3, 1e-4, 0.995)
-    assert (config.tokens_per_frame, config.frames_per_episode, config.memory_frames) == (2, 6, 32)
-    assert config.normalization_mapping["ACTION"] is NormalizationMode.MEAN_STD
-    own = {"chunk_size": 8, "ema_decay": 0.0, "min_lr_ratio": 1.0, "tokens_per_frame": 4}
-    other = MemobenchMemConfig(device="cpu", size="small", perception="objects", **own)
-    assert {name: getattr(other, name) for name in own} == own
-    assert other.n_action_steps == 6
-    other.save_pretrained(tmp_path)
-    assert dataclasses.asdict(PreTrainedConfig.from_pretrained(tmp_path)) == dataclasses.asdict(other)
-    before = MemobenchMemConfig(device="cpu", size="tiny")
-    assert (before.objective, before.num_inference_steps, before.memory_stride) == ("flow_matching", 10, 1)
-    assert (before.chunk_size, before.ema_decay, before.min_lr_ratio, before.frames_per_episode) == (50, 0.999, 1.0, 1)
-    assert before.normalization_mapping["STATE"] is NormalizationMode.QUANTILES
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"perception": "object"}, "objects"),
-        ({"perception": "objects", "tokens_per_frame": 0}, "tokens_per_frame"),
-        ({"frames_per_episode": 0}, "frames_per_episode"),
-        ({"min_lr_ratio": 2.0}, "min_lr_ratio"),
-        ({"task_weights": {"prompted": -1.0}}, "must not hold negative weights"),
-        ({"size": "small", "perception": "objects", "detection_noise": -1.0}, "detection_noise=-1.0"),
-    ],
-)
-def test_bad_values_are_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(MemobenchError, match=message):
-        MemobenchMemConfig(device="cpu", **fields)
-
-
 def test_the_rate_falls_as_a_cosine() -> None:
     config = MemobenchMemConfig(device="cpu", size="small", perception="objects")
     optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
@@ -133,27 +93,6 @@ def test_the_rate_falls_as_a_cosine() -> None:
 # -- samples -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("episodes", [None, [0, 2]])
-def test_samples_from_memory_are_lerobots(root: Path, episodes: list[int] | None) -> None:
-    from lerobot.datasets.factory import resolve_delta_timestamps
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    config, whole = small_config(**OBJECTS), LeRobotDataset("memobench/objects", root=root)
-    deltas = resolve_delta_timestamps(config, whole.meta)
-    dataset = LeRobotDataset("memobench/objects", root=root, delta_timestamps=deltas, episodes=episodes)
-    policy = make_policy(config, ds_meta=dataset.meta)
-    assert policy.run.meta is dataset.meta
-    of_lerobot = DatasetReader.get_item.__wrapped__
-    for row in (0, 12, 38, len(dataset) - 1):
-        expected, found = of_lerobot(dataset.reader, row), dataset[row]
-        assert expected.keys() - found.keys() <= {
-            *("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"),
-            *CLOCK,
-        }
-        for key, value in found.items():
-            assert value == expected[key] if key == "task" else torch.equal(value, expected[key]), key
-
-
 @pytest.mark.parametrize("earlier", [False, True])
 def test_no_video_is_decoded(earlier: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And objects are read beside pictures, under today's name and that of earlier datasets."""
@@ -170,49 +109,11 @@ def test_no_video_is_decoded(earlier: bool, tmp_path: Path, monkeypatch: pytest.
     assert torch.equal(batch[OBS_ENV_STATE], torch.tensor([column[10].as_py(), column[30].as_py()]))
     loss, _ = policy.forward(batch)
     assert loss.isfinite()
-    with pytest.raises(AssertionError, match="a video was opened"):  # any other policy's samples are LeRobot's
-        DatasetReader.get_item.__wrapped__(dataset.reader, 10)
 
 
 def test_a_dataset_without_objects_is_refused(dataset_root: Path) -> None:
     with pytest.raises(MemobenchError, match=r"observation\.environment_state.*memobench generate"):
         made_for_training(dataset_root, **OBJECTS)
-
-
-@pytest.mark.parametrize("moments", [1, 3, 6])
-def test_every_place_once_in_groups_of_an_episode(moments: int) -> None:
-    ends = np.cumsum([7, 30, 1, 12])
-    order = grouped_order(ends, moments, torch.Generator().manual_seed(1))
-    assert sorted(order.tolist()) == list(range(50))
-    episodes = np.searchsorted(ends, order.numpy(), "right").tolist()
-    runs = [episodes[0:1]]
-    for episode in episodes[1:]:
-        if episode == runs[-1][-1] and len(runs[-1]) < moments:
-            runs[-1].append(episode)
-        else:
-            runs.append([episode])
-    assert len(runs) <= 2 + -(-7 // moments) + -(-30 // moments) + -(-12 // moments)
-    assert not torch.equal(order, grouped_order(ends, moments, torch.Generator().manual_seed(2)))
-
-
-@pytest.mark.parametrize("weights", [(1, 1, 1), (1, 3, 2)])
-def test_tasks_are_drawn_by_their_weights_however_long_their_episodes_are(weights: tuple[int, ...]) -> None:
-    ends, tasks = np.cumsum([600, 30, 1, 1200, 20]), np.array([2, 0, 1, 2, 0])
-
-    def draw() -> np.ndarray:
-        chance = torch.Generator().manual_seed(1)
-        return weighted_order(ends, tasks, np.array(weights, float), 6, chance).numpy()
-
-    order = draw()
-    assert len(order) == ends[-1]
-    episodes = np.searchsorted(ends, order, "right")
-    groups = episodes[: len(order) // 6 * 6].reshape(-1, 6)
-    assert (groups == groups[:, :1]).all(), "six frames of an episode follow one another"
-    shares = np.bincount(episodes, minlength=5) / len(order)
-    first, second, third = np.array(weights) / sum(weights)
-    assert shares == pytest.approx([third / 2, first / 2, second, third / 2, first / 2], abs=0.06)
-    assert len(set(order[episodes == 0].tolist())) > 150, "frames of an episode are drawn at random"
-    assert (order == draw()).all()
 
 
 @pytest.mark.parametrize(
@@ -235,8 +136,8 @@ def test_a_task_of_several_instructions_is_one_task(
     phase = np.ones(sum(LENGTHS), int)
     phase[[int(start) for start in STARTS[:-1]]] = 0
     tasks, found = task_weights(meta, np.cumsum([0, *LENGTHS]), phase, weights)
-    assert tasks.tolist() == np.repeat([0, 1, 0] if records else [1, 2, 0], LENGTHS).tolist()
-    assert found[tasks[[0, LENGTHS[0]]]].tolist() == [expected["butter"], expected["drawer"]]
+    assert tasks.tolist() == ([0, 1, 0] if records else [1, 2, 0])
+    assert found[tasks[[0, 1]]].tolist() == [expected["butter"], expected["drawer"]]
     with pytest.raises(MemobenchError, match="names 'open the drawr'"):
         task_weights(meta, np.cumsum([0, *LENGTHS]), phase, {"open the drawr": 2.0})
     with pytest.raises(MemobenchError, match="leaves no task"):
@@ -251,24 +152,22 @@ def test_a_weight_is_of_the_task_then_of_its_memory_type(tmp_path: Path) -> None
     name, kind = next(iter(kinds.items()))
     phase = np.ones(sum(LENGTHS), int)
     tasks, found = task_weights(meta, np.cumsum([0, *LENGTHS]), phase, {kind: 2.0, name: 5.0})
-    for record, task in zip(records, tasks[[int(start) for start in STARTS[:-1]]], strict=True):
+    for record, task in zip(records, tasks, strict=True):
         assert record is not None
         assert found[task] == (5.0 if record.task_name == name else 2.0 if record.memory_type == kind else 1.0)
 
 
-def sampled(policy: MemobenchMemPolicy, dataset: Any, **options: Any) -> EpisodeAwareSampler:
-    return EpisodeAwareSampler(
-        dataset.meta.episodes["dataset_from_index"],
-        dataset.meta.episodes["dataset_to_index"],
-        drop_n_last_frames=policy.config.drop_n_last_frames,
-        shuffle=True,
-        **options,
-    )
+def sampled(root: Path, config: Any, episodes: list[int] | None = None) -> tuple[FrameSampler, Training]:
+    whole = train_config(root, config)
+    whole.dataset.episodes = episodes
+    training = open_training(whole, open_datasets(whole))
+    return make_sampler(whole, training), training
 
 
 def test_batches_hold_frames_of_few_episodes_and_no_prompt(root: Path) -> None:
-    policy, before, _, dataset = made_for_training(root, **OBJECTS)
-    loader = torch.utils.data.DataLoader(dataset, batch_size=12, sampler=sampled(policy, dataset))
+    sampler, training = sampled(root, small_config(**OBJECTS))
+    before = training.processors[0]
+    loader = torch.utils.data.DataLoader(training.samples(), batch_size=12, sampler=sampler)
     drawn = torch.cat([part["index"] for part in loader]).tolist()
     execution = {
         int(STARTS[episode]) + frame
@@ -283,27 +182,17 @@ def test_batches_hold_frames_of_few_episodes_and_no_prompt(root: Path) -> None:
 
 
 def test_of_some_episodes_no_other_frame_is_drawn(root: Path) -> None:
-    """`dataset.episodes` holds some out; rows of what is opened are not frames of the dataset then."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    policy, before, _, _ = made_for_training(root, **OBJECTS)
-    dataset = LeRobotDataset("memobench/objects", root=root, episodes=[1, 2])
-    options = {
-        "episode_indices_to_use": dataset.episodes,
-        "absolute_to_relative_idx": dataset.absolute_to_relative_idx,
-    }
-    sampler = sampled(policy, dataset, **options)
-    drawn = [int(dataset[row]["index"]) for _ in range(20) for row in sampler]
+    sampler, training = sampled(root, small_config(**OBJECTS), [1, 2])
+    drawn = [frame for _ in range(20) for frame in sampler]
     assert set(drawn) == {int(STARTS[k]) + frame for k in (1, 2) for frame in range(PROMPTS[k], LENGTHS[k])}
     assert np.mean([frame < STARTS[2] for frame in drawn]) == pytest.approx(1 / 2, abs=0.06)
-    assert before(batch_of(dataset, list(range(4))))[FRAMES].any()
+    assert training.processors[0](batch_of(training.samples(), [int(STARTS[1]) + 9]))[FRAMES].any()
 
 
 def test_the_sampler_draws_prompted_tasks_more_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(object_dataset, "PROMPTS", (0, 8, 0))
     root = make_object_dataset(tmp_path / "data")
-    policy, _, _, dataset = made_for_training(root, **OBJECTS, task_weights={"prompted": 3.0})
-    sampler = sampled(policy, dataset)
+    sampler, _ = sampled(root, small_config(**OBJECTS, task_weights={"prompted": 3.0}))
     drawn = np.array([frame for _ in range(20) for frame in sampler])
     assert np.mean((drawn >= STARTS[1]) & (drawn < STARTS[2])) == pytest.approx(3 / 4, abs=0.06)
 
@@ -314,37 +203,19 @@ def _normalised_by(processor: Any) -> dict[str, Any]:
     return held
 
 
-def test_statistics_are_those_of_execution_frames(root: Path, tmp_path: Path) -> None:
-    """Of a new policy's processors and of a checkpoint's, while the dataset object keeps its own."""
-    policy, before, after, dataset = made_for_training(root, **OBJECTS)
+def test_statistics_are_those_of_execution_frames(root: Path) -> None:
+    _, before, after, dataset = made_for_training(root, **OBJECTS)
     hf = dataset.hf_dataset.with_format("numpy")
     actions = np.asarray(hf["action"])[np.asarray(hf["observation.phase"]).reshape(-1) != 0]
-    for part in (policy, before, after):
-        part.save_pretrained(tmp_path)
-    replaced = {"stats": dataset.meta.stats}
-    resumed = make_pre_post_processors(
-        policy.config,
-        pretrained_path=str(tmp_path),
-        preprocessor_overrides={"normalizer_processor": replaced},
-        postprocessor_overrides={"unnormalizer_processor": replaced},
-    )
-    for processor in (before, after, *resumed):
+    for processor in (before, after):
         held = _normalised_by(processor)
         assert np.allclose(held["mean"], actions.mean(axis=0), atol=1e-5)
         assert np.allclose(held["std"], actions.std(axis=0) + 0.01, atol=1e-4)
-    file = LeRobotDatasetMetadata("memobench/objects", root=root).stats
-    assert all(np.array_equal(dataset.meta.stats["action"][name], one) for name, one in file["action"].items())
 
 
-def test_relative_actions_have_relative_statistics(root: Path) -> None:
+def test_relative_actions_need_relative_statistics(root: Path) -> None:
     with pytest.raises(MemobenchError, match="relative_action=true"):
         made_for_training(root, **OBJECTS, use_relative_actions=True)
-    dataset = LeRobotDataset("memobench/objects", root=root)
-    relative = compute_relative_action_stats(dataset.hf_dataset, dataset.meta.features, 6, [])
-    dataset.meta.stats["action"] = relative
-    policy = make_policy(small_config(**OBJECTS, use_relative_actions=True), ds_meta=dataset.meta)
-    before, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
-    assert np.allclose(_normalised_by(before)["mean"], relative["mean"], atol=1e-5)
 
 
 # -- training ------------------------------------------------------------------------------------------------------
@@ -478,7 +349,6 @@ def saved(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, An
         policy.forward(before(batch_of(dataset, [10 + step, 30, 55, 80])))[0].backward()
         optimizer.step()
         optimizer.zero_grad()
-        policy.update()
     folder = tmp_path_factory.mktemp("checkpoint") / "pretrained_model"
     for part in (policy, before, after):
         part.save_pretrained(folder)
@@ -500,23 +370,6 @@ def test_rows_are_independent(saved: tuple[Any, Any, Any, Path]) -> None:
     other = [observed(dataset, int(STARTS[2]) + index) for index in range(12)]
     together, alone = act([list(rows) for rows in zip(one, other, strict=True)]), act([[row] for row in one])
     assert all(torch.allclose(both[0], single[0], atol=1e-5) for both, single in zip(together, alone, strict=True))
-
-
-def test_training_goes_on_from_a_checkpoint_with_other_settings(saved: tuple[Any, Any, Any, Path], root: Path) -> None:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from lerobot.policies import make_policy
-
-    policy, _, dataset, folder = saved
-    config = PreTrainedConfig.from_pretrained(folder, cli_overrides=["--align=framewise", "--memory_frames=5"])
-    config.pretrained_path = folder
-    again = make_policy(config, ds_meta=LeRobotDataset("memobench/objects", root=root).meta)
-    pre, _ = make_pre_post_processors(config, pretrained_path=str(folder))
-    batch = pre(batch_of(dataset, [10, 60]))
-    assert batch[PLACES].shape[1] == 5
-    assert batch["memory.text"].shape[:2] == (2, 5)
-    again.train().forward(batch)[0].backward()
-    trained = policy.average.average["model.memory.pool.slot.mlp.0.weight"]
-    assert torch.equal(again.average.average["model.memory.pool.slot.mlp.0.weight"], trained)
 
 
 def test_another_perceptions_weights_are_refused(saved: tuple[Any, Any, Any, Path]) -> None:
@@ -696,3 +549,38 @@ def test_a_memory_does_not_tell_the_phase_unless_it_is_told_to() -> None:
     for told in (False, True):
         pool = ObjectEncoder(classes(), 2, 32, phase=told).pool()
         assert torch.equal(pool(rows[0]), pool(rows[1])) != told
+
+
+def test_small_brings_its_recipe_and_leaves_it_to_the_user(tmp_path: Path) -> None:
+    config = MemobenchMemConfig(device="cpu", size="small", perception="objects")
+    assert (config.chunk_size, config.n_action_steps, config.num_inference_steps) == (16, 6, 1)
+    assert (config.objective, config.memory_stride) == ("regression", 8)
+    assert (config.optimizer_lr, config.optimizer_weight_decay, config.ema_decay) == (1e-3, 1e-4, 0.995)
+    assert (config.tokens_per_frame, config.frames_per_episode, config.memory_frames) == (2, 6, 32)
+    assert config.normalization_mapping["ACTION"] is NormalizationMode.MEAN_STD
+    own = {"chunk_size": 8, "ema_decay": 0.0, "tokens_per_frame": 4}
+    other = MemobenchMemConfig(device="cpu", size="small", perception="objects", **own)
+    assert {name: getattr(other, name) for name in own} == own
+    assert other.n_action_steps == 6
+    other.save_pretrained(tmp_path)
+    assert dataclasses.asdict(PreTrainedConfig.from_pretrained(tmp_path)) == dataclasses.asdict(other)
+    before = MemobenchMemConfig(device="cpu", size="tiny")
+    assert (before.objective, before.num_inference_steps, before.memory_stride) == ("flow_matching", 10, 1)
+    assert (before.chunk_size, before.ema_decay, before.frames_per_episode) == (50, 0.999, 1)
+    assert before.normalization_mapping["STATE"] is NormalizationMode.QUANTILES
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"perception": "object"}, "objects"),
+        ({"perception": "objects", "tokens_per_frame": 0}, "tokens_per_frame"),
+        ({"frames_per_episode": 0}, "frames_per_episode"),
+        ({"warmup_fraction": 2.0}, "warmup_fraction"),
+        ({"task_weights": {"prompted": -1.0}}, "must not hold negative weights"),
+        ({"size": "small", "perception": "objects", "detection_noise": -1.0}, "detection_noise=-1.0"),
+    ],
+)
+def test_bad_values_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(MemobenchError, match=message):
+        MemobenchMemConfig(device="cpu", **fields)

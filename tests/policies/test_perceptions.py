@@ -19,14 +19,13 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.training.features import FOLDER
 from tests.support.memory import remembered, trained_on
 from tests.support.object_dataset import make_object_dataset
 from tests.support.picture_rollouts import STARTS, made_detector, pictures_of
-from tests.support.small_policy import batch_of, losses_in_training, made_for_training, small_config
+from tests.support.small_policy import batch_of, losses_in_training, made_for_training
 from tests.support.synthetic_dataset import CAMERAS
 
 WORDS = ("observation.language.tokens", "observation.language.attention_mask")
@@ -128,19 +127,6 @@ def test_a_rollout_perceives_and_remembers_what_training_reads(case: Case) -> No
     assert apart(*prefixes) <= 2 * case.of.rounding
 
 
-def test_no_video_is_opened_where_features_are_kept(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert case.shared
-
-    def refuse(*_: Any, **__: Any) -> None:
-        raise AssertionError("a video was opened")
-
-    monkeypatch.setattr("lerobot_memobench.datasets.feature_cache.building.frame_reader", refuse)
-    if case.fields["size"] != "tiny":  # beside the image tower, the policy learns from present images
-        monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
-    policy, before, _, dataset = case.made()
-    assert policy.forward(before(batch_of(dataset, [10, 30])))[0].isfinite()
-
-
 @pytest.mark.parametrize("case", ["visual encoder", "detection noise"], indirect=True)
 @pytest.mark.slow
 def test_it_learns(case: Case) -> None:
@@ -190,7 +176,6 @@ def test_pictures_in_a_batch_are_refused(case: Case) -> None:
 def test_a_checkpoint_acts_as_its_policy(case: Case, tmp_path: Path) -> None:
     policy, before, after, dataset = case.shared
     policy.train().forward(before(batch_of(dataset, [10, 30])))
-    policy.update()
     for part in (policy, before, after):
         part.save_pretrained(tmp_path)
     again = MemobenchMemPolicy.from_pretrained(tmp_path)
@@ -205,12 +190,3 @@ def test_a_checkpoint_acts_as_its_policy(case: Case, tmp_path: Path) -> None:
         actions.append([actor.select_action(step(one)) for one in observations])
     assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*actions, strict=True))
     assert actions[0][-1].any()
-
-
-@pytest.mark.parametrize("case", ["detections"], indirect=True)
-@pytest.mark.slow
-def test_features_are_kept_elsewhere_on_demand(case: Case, tmp_path: Path) -> None:
-    place = tmp_path / "caches"
-    cache_dataset(case.root, small_config(**case.fields | {"feature_cache_dir": str(place), "memory_stride": 4}))
-    assert any(place.glob("*/tokens.bin"))
-    assert not any("stride4" in path.name for path in (case.root / FOLDER).glob("*"))

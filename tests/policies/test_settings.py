@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 import torch
 from lerobot.configs import NormalizationMode
-from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 from lerobot_memobench.errors import MemobenchError
@@ -24,9 +23,9 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
     MemobenchMemConfig,
     UnreadError,
 )
-from lerobot_memobench.policies.memobench_mem.sampler import SamplerSpec
+from lerobot_memobench.training.loop import make_sampler
 from tests.support.object_dataset import make_object_dataset
-from tests.support.small_policy import batch_of, opened
+from tests.support.small_policy import Samples, batch_of, open_small_training, train_config
 
 OBJECTS = {"size": "small", "perception": "objects", "memory_stride": 2}
 BASES: dict[str, dict[str, Any]] = {
@@ -44,7 +43,6 @@ OTHERS: dict[str, Any] = {
     "size": {"small": "tiny", "tiny": "small"},
     "perception": {"pixels": "objects", "objects": "pixels"},
     "ema_decay": 0.0,
-    "shuffle_seed": 1,
     "object_classes": ["knob"],
     "align": "semantic",
     "text_encoder": "labels",
@@ -72,7 +70,6 @@ OTHERS: dict[str, Any] = {
     "input_features": {},
     "output_features": {},
     "optimizer_betas": (0.5, 0.6),
-    "feature_cache_dir": "elsewhere",
 }
 LEROBOTS = {
     "device": "make_policy",
@@ -123,11 +120,10 @@ def roots(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Mappi
 def effects(root: Path, fields: Mapping[str, Any]) -> str:
     """Return a hash of all that a training and a rollout of such a policy do."""
     config = MemobenchMemConfig(device="cpu", push_to_hub=False, **fields)
-    dataset = opened(root, config)
-    torch.manual_seed(0)
-    policy: Any = make_policy(config, ds_meta=dataset.meta)
-    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
-    drawn = vars(SamplerSpec.of_run(policy.run))
+    training = open_small_training(root, config)
+    policy, (before, after), dataset = training.policy, training.processors, Samples(training)
+    sampler = make_sampler(train_config(root, config), training)
+    drawn = [sampler.together, sampler.order(0), sampler.starts, sampler.weights]
     settings = config.get_optimizer_preset()
     optimizer = settings.build(policy.get_optim_params())
     rates = config.get_scheduler_preset().build(optimizer, 40).lr_lambdas[0]
@@ -143,7 +139,6 @@ def effects(root: Path, fields: Mapping[str, Any]) -> str:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        policy.update()
         seen.append(loss.item())
     frame = {
         key: value[None] if isinstance(value, torch.Tensor) else value
@@ -155,36 +150,7 @@ def effects(root: Path, fields: Mapping[str, Any]) -> str:
         clock = {"observation.step": torch.tensor([float(step)]), "observation.phase": torch.tensor([float(step > 2)])}
         seen.append(after(policy.select_action(before({**frame, **clock}))).float().numpy())
         seen.append([len(row.queue) for row in policy.rollout.rows])
-    seen.append(config.cache_place)
     return hashlib.sha256(pickle.dumps(seen)).hexdigest()
-
-
-@pytest.mark.parametrize(
-    ("name", "fields"),
-    [
-        (name, {"size": "small", "perception": "objects"})
-        for name in ("visual_encoder", "image_resolution", "empty_cameras")
-    ]
-    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *READERS["perception=objects"][1].split())]
-    + [(name, {"memory": "none"}) for name in (*READERS["a memory"][1].split(), "memory_frames", "open_gate")]
-    + [(name, {"size": "small", "perception": "objects"}) for name in READERS["objective=flow_matching"][1].split()]
-    + [(name, {}) for name in READERS["policy=pi05"][1].split() if name not in PI05_ALONE]
-    + [(name, {}) for name in ("align_weight", "text_encoder", "subgoal_level", "shuffle_seed", "subgoals")]
-    + [("memory_frames", {"memory": "bank"}), ("open_gate", {"memory_fusion": "context"})]
-    + [
-        ("relative_exclude_joints", {}),
-        ("feature_cache_dir", {"memory": "none"}),
-        ("memory_phase", {"memory": "none"}),
-    ],
-)
-def test_a_setting_that_nothing_reads_is_refused(name: str, fields: dict[str, Any]) -> None:
-    """Its default is taken, as a recipe or a checkpoint may hold it."""
-    plain = MemobenchMemConfig(device="cpu", **fields)
-    MemobenchMemConfig(device="cpu", **fields | {name: getattr(plain, name)})
-    with pytest.raises(UnreadError, match=f"policy.{name}=") as refused:
-        MemobenchMemConfig(device="cpu", **fields | {name: other(name, getattr(plain, name))})
-    default = refused.value.defaults[name]
-    assert MemobenchMemConfig(device="cpu", **fields | {name: default}) == plain
 
 
 @pytest.mark.slow
@@ -211,3 +177,30 @@ def test_a_setting_does_something_or_is_refused(
         except (MemobenchError, ValueError) as error:
             print(base, one.name, "refused:", str(error)[:90], flush=True)
     assert idle == []
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [
+        (name, {"size": "small", "perception": "objects"})
+        for name in ("visual_encoder", "image_resolution", "empty_cameras")
+    ]
+    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *READERS["perception=objects"][1].split())]
+    + [(name, {"memory": "none"}) for name in (*READERS["a memory"][1].split(), "memory_frames", "open_gate")]
+    + [(name, {"size": "small", "perception": "objects"}) for name in READERS["objective=flow_matching"][1].split()]
+    + [(name, {}) for name in READERS["policy=pi05"][1].split() if name not in PI05_ALONE]
+    + [(name, {}) for name in ("text_encoder", "subgoal_level", "subgoals")]
+    + [("memory_frames", {"memory": "bank"}), ("open_gate", {"memory_fusion": "context"})]
+    + [
+        ("relative_exclude_joints", {}),
+        ("memory_phase", {"memory": "none"}),
+    ],
+)
+def test_a_setting_that_nothing_reads_is_refused(name: str, fields: dict[str, Any]) -> None:
+    """Its default is taken, as a recipe or a checkpoint may hold it."""
+    plain = MemobenchMemConfig(device="cpu", **fields)
+    MemobenchMemConfig(device="cpu", **fields | {name: getattr(plain, name)})
+    with pytest.raises(UnreadError, match=f"policy.{name}=") as refused:
+        MemobenchMemConfig(device="cpu", **fields | {name: other(name, getattr(plain, name))})
+    default = refused.value.defaults[name]
+    assert MemobenchMemConfig(device="cpu", **fields | {name: default}) == plain

@@ -73,25 +73,6 @@ def script() -> ModuleType:
     return load_script("ship_policy")
 
 
-def test_a_card_tells_every_setting_that_is_not_the_sizes(script: ModuleType) -> None:
-    import draccus
-
-    given = {
-        "task_weights": {"prompted": 2.0},
-        "chunk_size": 8,
-        "min_lr_ratio": 0.1,
-        "memory_fusion": "context",
-        "memory_frames": 16,
-    }
-    usual = {"device": "cpu", "size": "small", "perception": "objects"}
-    policy = encoded(MemobenchMemConfig(**usual, **given))
-    words = script.settings(policy)
-    assert {word.partition("=")[0] for word in words} == {f"policy.{name}" for name in given}
-    shared = [f"--{name}={value}" for name, value in usual.items()]
-    again = draccus.parse(MemobenchMemConfig, args=[*shared, *("--" + word.removeprefix("policy.") for word in words)])
-    assert encoded(again) == policy
-
-
 def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_path: Path) -> None:
     source = tmp_path / "pretrained_model"
     source.mkdir()
@@ -170,3 +151,21 @@ def test_the_card_tells_of_the_errors_of_eyes(
     text = (script.ship(tmp_path / "run", "seeing", None, {}, []) / "README.md").read_text()
     assert "reads objects." in text
     assert "policy.detection_noise=1.0" in text.partition("lerobot train")[2]
+
+
+def test_a_card_tells_every_setting_that_is_not_the_sizes(script: ModuleType) -> None:
+    import draccus
+
+    given = {
+        "task_weights": {"prompted": 2.0},
+        "chunk_size": 8,
+        "memory_fusion": "context",
+        "memory_frames": 16,
+    }
+    usual = {"device": "cpu", "size": "small", "perception": "objects"}
+    policy = encoded(MemobenchMemConfig(**usual, **given))
+    words = script.settings(policy)
+    assert {word.partition("=")[0] for word in words} == {f"policy.{name}" for name in given}
+    shared = [f"--{name}={value}" for name, value in usual.items()]
+    again = draccus.parse(MemobenchMemConfig, args=[*shared, *("--" + word.removeprefix("policy.") for word in words)])
+    assert encoded(again) == policy

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,18 +13,15 @@ from torch import Tensor
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.fusion import Prefix
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS, Query
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Query
 from lerobot_memobench.policies.memobench_mem.memory.subgoal import SCORES, NarrowChannel
 from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
-from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.policies.memobench_mem.subgoals import choices
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
 from lerobot_memobench.tasks.memory_text import with_memory
 from tests.support.memory import histories
-from tests.support.object_dataset import make_object_dataset
-from tests.support.small_policy import batch_of, losses_in_training, made_for_training
 
 OF_TASKS = {"the drawer": ["close it", "open it"], "the bowl": ["open it", "put it into the top drawer"]}
 CHUNK, B, TEXTS = 4, 2, 3
@@ -244,27 +240,3 @@ def test_it_is_built_at_full_size_and_has_a_fusion_of_its_own() -> None:
     }
     with pytest.raises(MemobenchError, match="cannot be read by memory_fusion=context"):
         MemobenchMemConfig(device="cpu", memory="subgoal", memory_fusion="context")
-
-
-@pytest.mark.parametrize(("memory", "name"), [("subgoal", "subgoal"), ("keyframes", "subtask")])
-@pytest.mark.slow
-def test_it_learns_from_a_dataset_and_its_texts_lie_in_the_checkpoint(memory: str, name: str, tmp_path: Path) -> None:
-    root = make_object_dataset(tmp_path / "objects")
-    fields = {"size": "small", "perception": "objects", "memory_stride": 2, "memory_frames": 32}
-    policy, before, _, dataset = made_for_training(root, memory=memory, **fields)
-    assert policy.config.subgoals["open the drawer"] == ["reach thing 2"]
-    batch = before(batch_of(dataset, [20, 30, 50, 60]))
-    losses = losses_in_training(policy, batch, 20)
-    assert sum(losses[-5:]) < sum(losses[:5]) / 2
-    _, logged = policy.train().forward(batch)
-    assert logged[f"memory_{name}_loss"] < 0.1
-    policy.save_pretrained(tmp_path / "saved")
-    before.save_pretrained(tmp_path / "saved")
-    loaded = MemobenchMemPolicy.from_pretrained(tmp_path / "saved")
-    assert loaded.config.subgoals == policy.config.subgoals
-    policy.average = None  # the trained weights, not their average
-    chunks = policy.predict_action_chunk(batch)
-    if memory == "subgoal":
-        assert torch.equal(policy.model.fusion.said, batch[SUBGOAL])
-    wrong = {SUBGOAL: (batch[SUBGOAL] + 1) % 2, SUBGOALS: (batch[SUBGOALS] + 1) % 2}
-    assert torch.equal(policy.predict_action_chunk(batch | wrong), chunks), "what is true is not asked"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +12,19 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_policy, make_pre_post_processors
 
-from lerobot_memobench.datasets.feature_cache import building
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
-from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.training.features import FOLDER, cache_dataset
 from tests.support.picture_rollouts import (
     CAMERAS,
 )
 from tests.support.small_policy import batch_of, made_for_training, small_config
-from tests.support.synthetic_dataset import LENGTHS
 
 FRAME_BYTES = 2 * GRID**2 * WIDTH
 ROUNDED = 2**-7
@@ -126,37 +122,6 @@ def test_a_file_that_holds_no_encoder_is_refused(root: Path, tmp_path: Path) -> 
 # -- caches --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_both_are_made_once_and_their_size_is_told_before(
-    dataset_root: Path,
-    tmp_path: Path,
-    encoder_fields: dict[str, Any],
-    encoded: list[int],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    root, told = copy(dataset_root, tmp_path / "data"), []
-    folder = cache_dataset(root, small_config(**encoder_fields), tell=lambda said: told.append((said, len(encoded))))
-    made = {path.name.rsplit("-", 1)[0]: (path / "tokens.bin").stat().st_size for path in (root / FOLDER).glob("*/")}
-    assert folder.name.rsplit("-", 1)[0] == "small-stride2"
-    slots = sum(-(-length // 2) for length in LENGTHS)
-    assert made == {"small-present": sum(LENGTHS) * FRAME_BYTES, "small-stride2": slots * 2 * POOLED**2 * WIDTH}
-    assert len(list((root / FOLDER).glob("small-present-*/"))) == len(CAMERAS)
-    assert told[0][1] == 0
-    assert "94 frames" in told[0][0]
-    assert "24.0 KiB of each of 2 pictures of a frame, and 6.0 KiB of every frame that is remembered" in told[0][0]
-    assert sum(encoded) == sum(LENGTHS) * len(CAMERAS), "the memory is made of what was seen, and not encoded again"
-
-    def refuse(*_: Any, **__: Any) -> None:
-        raise AssertionError("a video was opened")
-
-    monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
-    monkeypatch.setattr("lerobot_memobench.datasets.feature_cache.building.frame_reader", refuse)
-    encoded.clear()
-    policy, before, _, dataset = made_for_training(root, **encoder_fields)
-    assert policy.forward(before(batch_of(dataset, [10, 30])))[0].isfinite()
-    assert encoded == []
-
-
 def test_a_cache_that_was_killed_is_finished(
     dataset_root: Path, tmp_path: Path, encoder_fields: dict[str, Any], root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,67 +145,6 @@ def test_a_cache_that_was_killed_is_finished(
     assert all((killed / path).read_bytes() == (root / path).read_bytes() for path in made)
 
 
-@pytest.mark.slow
-def test_of_two_trainings_each_looks_at_one_camera(
-    dataset_root: Path, tmp_path: Path, encoder_fields: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root, original = copy(dataset_root, tmp_path / "data"), VisualEncoder.forward
-    begun, waits, go = threading.Event(), threading.Event(), threading.Event()
-    encoded = {"first": 0, "second": 0}
-
-    def held(tower: VisualEncoder, images: torch.Tensor) -> torch.Tensor:
-        encoded[threading.current_thread().name] += len(images)
-        if threading.current_thread().name == "first":
-            begun.set()
-            assert go.wait(60)
-        return original(tower, images)
-
-    monkeypatch.setattr(VisualEncoder, "forward", held)
-    monkeypatch.setattr(building.logger, "warning", lambda *_: waits.set())
-    first, second = (
-        threading.Thread(target=cache_dataset, args=(root, small_config(**encoder_fields)), name=name, daemon=True)
-        for name in encoded
-    )
-    first.start()
-    assert begun.wait(60)
-    second.start()
-    assert waits.wait(60)
-    assert encoded["second"] == sum(LENGTHS)
-    go.set()
-    first.join(60)
-    second.join(60)
-    assert encoded == {"first": sum(LENGTHS), "second": sum(LENGTHS)}
-    assert len(list((root / FOLDER).glob("*/tokens.bin"))) == len(CAMERAS) + 1
-
-
-def test_a_disk_without_room_for_all_is_told_before_any_is_made(
-    dataset_root: Path,
-    tmp_path: Path,
-    encoder_fields: dict[str, Any],
-    encoded: list[int],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    root, usage = copy(dataset_root, tmp_path / "data"), shutil.disk_usage(tmp_path)
-    room = 2 * sum(LENGTHS) * FRAME_BYTES  # for the present pictures, and not for the memory
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=room))
-    with pytest.raises(MemobenchError, match=r"4\.7 MiB are needed there and 4\.4 MiB are free.*feature_cache_dir"):
-        cache_dataset(root, small_config(**encoder_fields))
-    assert encoded == []
-    assert not (root / FOLDER).exists()
-
-
-@pytest.mark.slow
-def test_caches_of_other_encoders_lie_beside_and_elsewhere(
-    dataset_root: Path, tmp_path: Path, encoder_fields: dict[str, Any]
-) -> None:
-    root, place = copy(dataset_root, tmp_path / "data"), tmp_path / "caches"
-    others = made_detector(tmp_path / "others.safetensors", 2)
-    for file in (encoder_fields["visual_encoder"], str(others)):
-        cache_dataset(root, small_config(**encoder_fields | {"visual_encoder": file, "feature_cache_dir": str(place)}))
-    assert len([path for path in place.iterdir() if path.is_dir()]) == 6
-    assert not (root / FOLDER).exists()
-
-
 # -- samples -------------------------------------------------------------------------------------------------------
 
 
@@ -255,23 +159,6 @@ def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, encoder_fields
     assert all(batch[encoded_key(camera)].shape == (2, GRID**2, WIDTH) for camera in CAMERAS)
     assert batch[FRAMES].shape[1:] == (POOLED**2, WIDTH)
     assert len(batch[FRAMES]) < (batch[PLACES] >= 0).sum(), "moments of an episode share frames"
-
-
-def test_pictures_that_are_changed_are_refused(root: Path, encoder_fields: dict[str, Any]) -> None:
-    from lerobot_memobench.run.training import trained_on
-
-    policy, _, _, dataset = made_for_training(root, **encoder_fields)
-    dataset.set_image_transforms(lambda picture: 1 - picture)
-    with pytest.raises(MemobenchError, match=r"image_transforms.*leave it out.*policy\.visual_encoder=random"):
-        dataset[0]
-
-    from lerobot.configs.train import DatasetConfig, TrainPipelineConfig
-    from lerobot.scripts import lerobot_train
-
-    data = DatasetConfig("memobench/synthetic", root=str(root))
-    data.image_transforms.enable = True
-    with trained_on(None), pytest.raises(MemobenchError, match="image_transforms"):
-        lerobot_train.make_train_eval_datasets(TrainPipelineConfig(dataset=data, policy=policy.config))
 
 
 # -- training and rollouts see alike -------------------------------------------------------------------------------
@@ -304,7 +191,6 @@ def saved(
     file = shutil.copy(encoder_fields["visual_encoder"], folder / "detector.safetensors")
     policy, before, after, dataset = made_for_training(root, **encoder_fields | {"visual_encoder": str(file)})
     policy.train().forward(before(batch_of(dataset, [10, 30])))
-    policy.update()
     for part in (policy, before, after):
         part.save_pretrained(folder / "pretrained_model")
     Path(file).unlink()

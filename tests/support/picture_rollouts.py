@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from lerobot.utils.constants import OBS_STATE
 
-from lerobot_memobench.datasets.feature_cache.frames import frame_reader
+from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
 from lerobot_memobench.perception.weights import save_detector

@@ -1,4 +1,4 @@
-"""A small memory policy with its processors and dataset, as lerobot-train makes them; shared by tests."""
+"""A small memory policy with its processors and samples, as `lerobot train` makes them; shared by tests."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.factory import resolve_delta_timestamps
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import FLOW_MATCHING, MemobenchMemConfig
+from lerobot_memobench.training.data import Training, open_datasets, open_training
+from lerobot_memobench.training.loop import train
 
 CHUNK = 6
 
@@ -29,20 +29,50 @@ def small_config(**fields: Any) -> MemobenchMemConfig:
     return MemobenchMemConfig(device="cpu", push_to_hub=False, **usual | fields)
 
 
-def opened(root: Path, config: MemobenchMemConfig) -> LeRobotDataset:
-    """Return a dataset as lerobot-train opens it for a policy."""
-    meta = LeRobotDatasetMetadata("memobench/synthetic", root=root)
-    return LeRobotDataset("memobench/synthetic", root=root, delta_timestamps=resolve_delta_timestamps(config, meta))
+def train_config(root: Path, config: MemobenchMemConfig, **settings: Any) -> TrainPipelineConfig:
+    """Return LeRobot's configuration of a training on a dataset."""
+    return TrainPipelineConfig(DatasetConfig("memobench/synthetic", root=str(root)), policy=config, **settings)
+
+
+def train_with(config: TrainPipelineConfig) -> None:
+    """Train as `lerobot train` does, by a configuration of LeRobot's."""
+    policy: Any = config.policy
+    config.optimizer, config.scheduler = policy.get_optimizer_preset(), policy.get_scheduler_preset()
+    train(config)
+
+
+def open_small_training(root: Path, config: MemobenchMemConfig) -> Training:
+    """Return the training of a policy on a dataset; weights are drawn from seed 0."""
+    whole = train_config(root, config)
+    datasets = open_datasets(whole)
+    torch.manual_seed(0)
+    return open_training(whole, datasets)
 
 
 def made_for_training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
-    """Policy, preprocessor, postprocessor and dataset, as lerobot-train makes them."""
-    config = small_config(**fields)
-    dataset = opened(root, config)
-    torch.manual_seed(0)
-    policy = make_policy(config, ds_meta=dataset.meta)
-    before, after = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
-    return policy, before, after, dataset
+    """Policy, preprocessor, postprocessor and samples, as `lerobot train` makes them."""
+    training = open_small_training(root, small_config(**fields))
+    return training.policy, *training.processors, Samples(training)
+
+
+class Samples:
+    """The samples of a training by their global indices, with pictures as floats; else LeRobot's dataset."""
+
+    def __init__(self, training: Training) -> None:
+        self._dataset, self._samples = training.dataset, training.samples()
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        found = self._samples[index]
+        pictures = [name for name, value in found.items() if getattr(value, "dtype", None) == torch.uint8]
+        return found | {name: found[name].float() / 255 for name in pictures}
+
+    def __len__(self) -> int:
+        return len(self._dataset)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._dataset, name)
 
 
 def losses_in_training(policy: Any, batch: dict[str, Any], updates: int = 40) -> list[float]:
@@ -58,5 +88,5 @@ def losses_in_training(policy: Any, batch: dict[str, Any], updates: int = 40) ->
     return losses
 
 
-def batch_of(dataset: LeRobotDataset, indices: list[int]) -> dict[str, Any]:
-    return torch.utils.data.default_collate([dataset[index] for index in indices])
+def batch_of(samples: Any, indices: list[int]) -> dict[str, Any]:
+    return torch.utils.data.default_collate([samples[index] for index in indices])

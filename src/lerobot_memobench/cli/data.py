@@ -1,4 +1,4 @@
-"""``memobench generate``, ``convert``, ``cache``, ``validate``, ``describe`` and ``push``: datasets."""
+"""``memobench generate``, ``convert``, ``cache``, ``view``, ``validate``, ``describe`` and ``push``: datasets."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import typer
 from rich.table import Table
 
 from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, WhichWorld, World, console, counting, say
+from lerobot_memobench.envs.settings import OBS_TYPES
+from lerobot_memobench.errors import check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.slurm import read_options
@@ -184,30 +186,22 @@ def cache(
     weights: Annotated[str | None, typer.Option(help="Folder or repository with the image tower (size pi05).")] = None,
     device: Annotated[str | None, typer.Option(help="cuda or cpu; the best there is by default.")] = None,
     batch_size: Annotated[int, typer.Option(min=1, help="Frames per pass of the image tower.")] = 64,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for feature caches (policy.feature_cache_dir); feature_cache in the dataset's by default."
-        ),
-    ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Threads that decode videos; as many as there are cores by default.")
     ] = None,
 ) -> None:
     """Encode a dataset once for policies with a memory. Its frames and its subgoals."""
     from lerobot_memobench.envs.command_line import quiet
-    from lerobot_memobench.policies.memobench_mem.caching import cache_dataset
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+    from lerobot_memobench.training.features import cache_dataset
 
     with quiet():
-        place = None if out is None else str(out)
         given: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
         config = MemobenchMemConfig(
             size=size,
             perception=perception,
             detector=detector,
             visual_encoder=visual_encoder,
-            feature_cache_dir=place,
             device=device,
             **given,
         )
@@ -223,6 +217,24 @@ def cache(
             tell=partial(screen.print, soft_wrap=True),
         )
     say(f"feature cache: {folder}")
+
+
+def view(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a LeRobotDataset.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; its videos are links to the dataset's.")],
+    obs_type: Annotated[
+        str | None, typer.Option(help=f"Inputs: {', '.join(OBS_TYPES)}; pictures if there are some by default.")
+    ] = None,
+    prompts: Annotated[bool, typer.Option(help="Keep the frames of demonstration prompts.")] = False,
+) -> None:
+    """Write a dataset for lerobot-train. Without the frames of prompts, and with the columns of chosen inputs."""
+    from lerobot_memobench.datasets.lerobot_format.layout import read_info
+    from lerobot_memobench.training.view import choice_for, write_view
+
+    if obs_type is not None:
+        check_choice("obs_type", obs_type, OBS_TYPES)
+    write_view(dataset, out, choice_for(None, read_info(dataset)["features"], prompts, obs_type))
+    say(f"view: {out}")
 
 
 def validate(

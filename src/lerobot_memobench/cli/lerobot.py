@@ -2,7 +2,7 @@
 
 ``key=value`` becomes ``--key=value`` after a check against the command's settings; whatever starts with
 ``--`` is passed on untouched. ``lerobot eval env=memobench`` and ``lerobot train policy=…`` also get the
-defaults that make them work as they stand (``run.plan``, ``run.training``).
+benchmark's defaults (``run.plan``, ``training.command``).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def run(line: Sequence[str]) -> int:
     if given.wants_help and name in SHORT_FORMS:
         print(Path(__file__).with_name(f"lerobot_{name}.txt").read_text(), flush=True)
     if name == "train":
-        from lerobot_memobench.run.training import train
+        from lerobot_memobench.training.command import train
 
         return train(given, line[1:], tell)
     check_task_names(given)

@@ -57,7 +57,7 @@ app = typer.Typer(
 
 COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
     "Look around": (tasks, objects, doctor),
-    "Demonstrations": (generate, data.convert, cache, data.validate, data.describe, data.push),
+    "Demonstrations": (generate, data.convert, cache, data.view, data.validate, data.describe, data.push),
     "Train": (recipe, conformance),
     "Results": (test_sealed, report, compare, merge, rerun),
 }

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
+from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import check_clock, objects_column
 from lerobot_memobench.envs.command_line import quiet
@@ -22,11 +23,11 @@ from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
-from lerobot_memobench.protocol import CLOCK
+from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import SHORT_FORMS, read_arguments, split_arguments
 from lerobot_memobench.run.plan import policy_config
 from lerobot_memobench.run.rollout import has_planned_action, needs_observation
-from lerobot_memobench.run.training import take_training_options, trained_on
+from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 
 REPLAN = 3
 """Actions per chunk where none are asked for: several chunks begin within a short stream."""
@@ -45,6 +46,8 @@ class Subject:
     Attributes:
         dataset: as it is trained on: with the policy's own delta timestamps.
         streams: `STREAMS` episodes.
+        cameras: of the dataset.
+        numbers: (N,) index in ``dataset`` of each frame, by its global index in the dataset that was named.
     """
 
     name: str
@@ -53,6 +56,8 @@ class Subject:
     postprocessor: Any
     dataset: Any
     streams: list[Stream]
+    cameras: list[str]
+    numbers: NDArray[np.int64]
 
     @property
     def reads_prompt(self) -> bool:
@@ -98,8 +103,8 @@ class Subject:
         """
         from lerobot.utils.collate import lerobot_collate_fn
 
-        batch = lerobot_collate_fn([self.dataset[stream.index + call] for call in calls])
-        for key in self.dataset.meta.camera_keys:
+        batch = lerobot_collate_fn([self.dataset[int(self.numbers[stream.index + call])] for call in calls])
+        for key in self.cameras:
             if key in batch and batch[key].dtype == torch.uint8:
                 batch[key] = batch[key].to(torch.float32) / 255
         self.policy.reset()
@@ -159,42 +164,52 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
     path = arguments.get("policy.path")
     config.pretrained_path = None if path is None else Path(path)
     with quiet():
-        return _built(config, str(arguments.get("dataset.repo_id")), arguments.get("dataset.root"), obs_type)
+        return _built(config, str(arguments.get("dataset.repo_id")), arguments.get("dataset.root"), obs_type, folder)
 
 
-def _built(config: Any, repository: str, root: str | None, obs_type: str | None) -> Subject:
-    from lerobot import policies  # its functions are looked up where they are called: hooks stand around them
+def _built(config: Any, repository: str, root: str | None, obs_type: str | None, folder: Path) -> Subject:
     from lerobot.configs.default import DatasetConfig
     from lerobot.configs.train import TrainPipelineConfig
-    from lerobot.datasets import LeRobotDataset, factory
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.datasets.factory import make_dataset
+    from lerobot.policies import make_policy, make_pre_post_processors
 
-    whole = TrainPipelineConfig(DatasetConfig(repository, root=root), policy=config)
-    with trained_on(None, obs_type):
-        dataset, _ = factory.make_train_eval_datasets(whole)
-    features = dataset.meta.features
-    check_clock(features, dataset.root)
-    if not set(CLOCK) <= set(features):
-        raise MemobenchError(f"{dataset.root} has no {CLOCK[0]}; name a dataset of `memobench generate`, or none")
+    from lerobot_memobench.training.data import open_datasets, open_training
+    from lerobot_memobench.training.view import choice_for, needs_view, write_view
+
+    raw = LeRobotDataset(repository, root=root)
+    check_clock(raw.meta.features, raw.root)
+    if not set(CLOCK) <= set(raw.meta.features):
+        raise MemobenchError(f"{raw.root} has no {CLOCK[0]}; name a dataset of `memobench generate`, or none")
     path = config.pretrained_path
     if path is not None:
         check_weights(path, config)
+    whole, numbers = TrainPipelineConfig(DatasetConfig(repository, root=root), policy=config), np.arange(raw.num_frames)
     torch.manual_seed(0)
-    policy = policies.make_policy(config, ds_meta=dataset.meta)
+    if config.type == MEMORY_POLICY:
+        training = open_training(whole, open_datasets(whole))
+        policy, (before, after), dataset = training.policy, training.processors, training.samples()
+    else:
+        choice = choice_for(config, raw.meta.features, None, obs_type)
+        if not choice.prompts:
+            numbers = np.cumsum(read_frame_table(Path(raw.root)).phase == EXECUTION) - 1
+        if needs_view(raw.meta.features, choice):
+            write_view(Path(raw.root), folder / "view", choice)
+            whole.dataset.root = str(folder / "view")
+        dataset = make_dataset(whole)
+        policy = make_policy(config, ds_meta=dataset.meta)
+        loaded = {} if path is None else {"preprocessor_overrides": {"device_processor": {"device": config.device}}}
+        before, after = make_pre_post_processors(config, path, dataset_stats=dataset.meta.stats, **loaded)
     if path is None:
         _begin_somewhere(policy)
-    loaded = {} if path is None else {"preprocessor_overrides": {"device_processor": {"device": config.device}}}
-    before, after = policies.make_pre_post_processors(config, path, dataset_stats=dataset.meta.stats, **loaded)
     policy.eval()
     shown = obs_type_of(config) or PIXELS
-    raw = LeRobotDataset(repository, root=dataset.root)
     objects = objects_column(raw.meta.features) if shown in (OBJECTS, BOTH) else None
     found = read_streams(raw, shown in (PIXELS, BOTH), objects, reads_prompt(config), EXECUTION_FRAMES)
     streams = [stream for stream, _ in zip(found, range(STREAMS), strict=False)]
     if len(streams) < STREAMS:
-        raise MemobenchError(
-            f"{dataset.root} has {len(streams)} episodes; name a dataset of at least {STREAMS}, or none"
-        )
-    return Subject(config.type, policy, before, after, dataset, streams)
+        raise MemobenchError(f"{raw.root} has {len(streams)} episodes; name a dataset of at least {STREAMS}, or none")
+    return Subject(config.type, policy, before, after, dataset, streams, raw.meta.camera_keys, numbers)
 
 
 def _begin_somewhere(policy: Any) -> None:

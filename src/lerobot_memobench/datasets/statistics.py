@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.feature_cache.frames import frame_reader, read_frame_table
-from lerobot_memobench.datasets.feature_cache.reading import read_recorded
+from lerobot_memobench.datasets.frames import frame_reader, read_frame_table
 from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats
 from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, STATS_FILE, read_info
+from lerobot_memobench.datasets.lookup import read_recorded
 from lerobot_memobench.datasets.video import ImageHistograms, Stats
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, short, telling_of_the_disk, write_file

@@ -12,9 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.feature_cache.frames import FrameReader, frame_reader
-from lerobot_memobench.datasets.feature_cache.layout import FOLDER as CACHES
-from lerobot_memobench.datasets.feature_cache.layout import check_cache
+from lerobot_memobench.datasets.frames import FrameReader, frame_reader
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
     INFO_FILE,
@@ -200,9 +198,6 @@ def _file_checks(folder: Path) -> Iterator[_FileCheck]:
         yield _FileCheck(folder, STATS_FILE.as_posix(), partial(check_statistics, folder, chosen))
     if (folder / MANIFEST_FILE).exists():
         yield _FileCheck(folder, MANIFEST_FILE, partial(check_manifest, folder))
-    for cache in sorted((folder / CACHES).glob("*")):
-        if cache.is_dir():
-            yield _FileCheck(folder, f"{CACHES}/{cache.name}", partial(check_cache, cache))
 
 
 def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_EpisodeCheck]:

@@ -29,6 +29,8 @@ GO_ON_WITHOUT = ("pi0", "pi05", "pi0_fast")
 ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
+REMOVED_FIELDS = {"align_weight", "feature_cache_dir", "min_lr_ratio", "shuffle_seed"}
+"""Fields of memobench_mem in checkpoints of earlier versions (`update_checkpoint`)."""
 
 
 class Feature(TypedDict, total=False):
@@ -134,7 +136,14 @@ def checkpoint_type(path: str) -> str | None:
     folder = Path(path).expanduser()
     if not folder.is_dir():
         return None
-    name = read_json(folder / CONFIG_FILE).get("type")
+    config = read_json(folder / CONFIG_FILE)
+    name = config.get("type")
+    removed = sorted(REMOVED_FIELDS & config.keys())
+    if name == "memobench_mem" and removed:
+        raise MemobenchError(
+            f"{folder / CONFIG_FILE} has {', '.join(removed)}, which an earlier version wrote; update the checkpoint: "
+            f"python -m lerobot_memobench.policies.update_checkpoint {folder}"
+        )
     if not isinstance(name, str):
         raise MemobenchError(
             f"{folder / CONFIG_FILE} names no policy type; expected a checkpoint of today's LeRobot, which cannot read "

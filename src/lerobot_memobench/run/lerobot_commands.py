@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import sys
 import typing
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import metadata
 from typing import Any
@@ -90,21 +88,3 @@ def call_lerobot(command: str, flags: Sequence[str]) -> int:
         return status
     print(status, file=sys.stderr)  # as Python does with such a status
     return 1
-
-
-@contextmanager
-def without_configuration() -> Iterator[None]:
-    """Drop the log record of LeRobot's training with its whole configuration, which is in `train_config.json`."""
-
-    def matters(record: logging.LogRecord) -> bool:
-        # It is logged once, as a printed dictionary.
-        if record.filename != "lerobot_train.py" or not record.getMessage().startswith("{'"):
-            return True
-        logging.getLogger().removeFilter(matters)
-        return False
-
-    logging.getLogger().addFilter(matters)
-    try:
-        yield
-    finally:
-        logging.getLogger().removeFilter(matters)

@@ -23,12 +23,12 @@ from einops import rearrange
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
-from lerobot_memobench.datasets.feature_cache.frames import LEVEL_COLUMNS, MEMORY_COLUMN, holds_texts
-from lerobot_memobench.datasets.feature_cache.reading import FrameLookup
+from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, MEMORY_COLUMN, holds_texts
+from lerobot_memobench.datasets.lookup import FrameLookup
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SHUFFLE_SEED, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.losses import joint, mean_over_ranks, world_size
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
-from lerobot_memobench.policies.memobench_mem.training import joint, mean_over_ranks, world_size
 
 logger = logging.getLogger(__name__)
 
@@ -253,63 +253,63 @@ def require_texts(root: Path, config: MemobenchMemConfig) -> None:
         )
 
 
-def text_rows(cache: FrameLookup, level: str, align: str, shuffle_seed: int | None) -> np.ndarray:
+def text_rows(lookup: FrameLookup, level: str, align: str, shuffle: bool) -> np.ndarray:
     """Return the row of the cache's embeddings for each frame of the dataset (N,), -1 where it has no subgoal.
 
     Args:
         level: subgoal level. align: the objective, for the message.
-        shuffle_seed: shuffle subgoals by this seed (`shuffled_subgoals`), and say how; None leaves them in place.
+        shuffle: whether subgoals are shuffled (`shuffled_subgoals`).
 
     Raises:
         MemobenchError: the dataset has no texts, or one only, which cannot be shuffled.
     """
-    rows = cache.text_rows(level)
-    if len(cache.texts) == 0:
+    rows = lookup.text_rows(level)
+    if len(lookup.texts) == 0:
         raise MemobenchError(
-            f"The dataset of {cache.folder} has no subgoal text, so --policy.align={align} has nothing to "
+            f"The dataset of {lookup.root} has no subgoal text, so --policy.align={align} has nothing to "
             "align to; use --policy.align=none, or a dataset with subgoals."
         )
-    if shuffle_seed is None:
+    if not shuffle:
         return rows
     if len(np.unique(rows[rows >= 0])) < 2:
         raise MemobenchError(
-            f"The dataset of {cache.folder} has one {level} subgoal, and --policy.shuffle_subgoals=true needs another "
+            f"The dataset of {lookup.root} has one {level} subgoal, and --policy.shuffle_subgoals=true needs another "
             "one to put in its place; use a dataset of several tasks, or another --policy.subgoal_level."
         )
-    shuffled, elsewhere = shuffled_subgoals(rows, cache.episodes, shuffle_seed)
+    shuffled, elsewhere = shuffled_subgoals(rows, lookup.episodes)
     logger.info(
         "%s subgoals are shuffled: in %d of %d episodes among themselves; %d have fewer than %d, which would only be "
         "renamed, and get texts of other episodes",
         level,
-        len(cache.episodes) - 1 - elsewhere,
-        len(cache.episodes) - 1,
+        len(lookup.episodes) - 1 - elsewhere,
+        len(lookup.episodes) - 1,
         elsewhere,
         SEVERAL,
     )
     return shuffled
 
 
-def texts_of_frames(cache: FrameLookup, rows: np.ndarray, frames: Sequence[int]) -> dict[str, Tensor]:
+def texts_of_frames(lookup: FrameLookup, rows: np.ndarray, frames: Sequence[int]) -> dict[str, Tensor]:
     """Return the texts (B, d_t) of frames of the dataset, and which have one (B,); ``rows`` as from `text_rows`."""
-    return _embed(cache, rows[np.asarray(frames)].astype(np.int64))
+    return _embed(lookup, rows[np.asarray(frames)].astype(np.int64))
 
 
 def texts_of_histories(
-    cache: FrameLookup, rows: np.ndarray, histories: Sequence[np.ndarray], frames: int
+    lookup: FrameLookup, rows: np.ndarray, histories: Sequence[np.ndarray], frames: int
 ) -> dict[str, Tensor]:
     """Return the texts (B, F, d_t) of remembered frames, right-padded to F, and which have one (B, F)."""
     padded = np.full((len(histories), frames), -1, dtype=np.int64)
     for sample, history in enumerate(histories):
         padded[sample, : len(history)] = rows[history]
-    return _embed(cache, padded)
+    return _embed(lookup, padded)
 
 
-def _embed(cache: FrameLookup, rows: np.ndarray) -> dict[str, Tensor]:
+def _embed(lookup: FrameLookup, rows: np.ndarray) -> dict[str, Tensor]:
     numbers = torch.from_numpy(rows)
-    return {TEXT_MASK: numbers >= 0, TEXT: cache.text_embeddings[numbers.clamp(min=0)]}
+    return {TEXT_MASK: numbers >= 0, TEXT: lookup.text_embeddings[numbers.clamp(min=0)]}
 
 
-def shuffled_subgoals(rows: np.ndarray, episodes: np.ndarray, seed: int = 7) -> tuple[np.ndarray, int]:
+def shuffled_subgoals(rows: np.ndarray, episodes: np.ndarray, seed: int = SHUFFLE_SEED) -> tuple[np.ndarray, int]:
     """The paper's control: the subgoals of each episode change places, each keeping its number of frames or not.
 
     Two that change places do so alike in every episode of their task, and one cannot: texts would be renamed and tell

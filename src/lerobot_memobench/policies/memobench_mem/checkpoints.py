@@ -1,6 +1,6 @@
 """Model checkpoints of the policy: its configuration, weights, statistics and saved processor steps, each checked.
 
-The model file holds the averaged weights; the trained ones lie beside it for going on.
+The model file holds the averaged weights; `training.average` keeps the trained ones beside it.
 """
 
 from __future__ import annotations
@@ -28,15 +28,12 @@ from lerobot_memobench.policies.checkpoint import (
     statistics_shapes,
     undamaged,
 )
-from lerobot_memobench.policies.memobench_mem.average import WeightAverage, states_of
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.fusion import plain_name
 from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 logger = logging.getLogger(__name__)
-
-TRAINING_FILE = "training_weights.safetensors"
 
 
 def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
@@ -140,32 +137,6 @@ def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str
     """Start from pi0.5's weights; only the memory's own parameters stay at their initial values."""
     placed = {model.place_of(plain_name(name.removeprefix("model."))): tensor for name, tensor in weights.items()}
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
-
-
-def restore_average(
-    policy: nn.Module, average: WeightAverage, source: str | Path, trained: MemobenchMemConfig, revision: str | None
-) -> WeightAverage | None:
-    """Load a checkpoint's trained weights and their average into a policy that holds the average; None without them.
-
-    The average of `restarted` parts, and of parts that the checkpoint did not train, begins with their present weights.
-
-    Raises:
-        MemobenchError: they cannot be read, or do not fit.
-    """
-    path = checkpoint_file(source, TRAINING_FILE, revision)
-    if path is None:
-        return None
-    with undamaged(path), safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
-    held = {name_here(policy, name, trained): one for name, one in states_of(read_tensors(path), metadata).items()}
-    states = {name: held[name] for name in held.keys() & average.parameters.keys() - restarted(policy, trained)}
-    wrong = sorted(name for name, one in states.items() if one.weights.shape != average.parameters[name].shape)
-    if wrong:
-        raise MemobenchError(f"{path} holds another shape of '{wrong[0]}' than this policy; copy the checkpoint again.")
-    new = average.restore(states)
-    if new:
-        logger.info("The average goes on from '%s'; that of %s begins anew.", source, ", ".join(new))
-    return average
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
@@ -272,7 +243,7 @@ _ORACLE = "memobench_oracle_memory"
 def require_agreement(source: str | Path, revision: str | None, config: MemobenchMemConfig, *, training: bool) -> None:
     """Check that the saved steps of a checkpoint do, or will do, what ``config`` says.
 
-    LeRobot loads them. Ours follow the policy (`sampler.TrainingRun`), and LeRobot hands some of its own their new
+    LeRobot loads them. Ours follow the training (`follow_training`), and LeRobot gives some of its own their new
     settings; the rest would keep the checkpoint's.
 
     A checkpoint without a preprocessor passes: LeRobot says what it lacks.

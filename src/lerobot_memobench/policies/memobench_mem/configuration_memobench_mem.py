@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import logging
 import math
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from huggingface_hub.constants import CONFIG_NAME
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig, parser
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
@@ -26,7 +25,6 @@ from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE, RANDOM
-from lerobot_memobench.policies.memobench_mem.inherited import MEMORY_FRAMES, of_another_memory
 from lerobot_memobench.policies.memobench_mem.memory import (
     NONE,
     OURS,
@@ -44,7 +42,9 @@ logger = logging.getLogger(__name__)
 
 FLOW_MATCHING, REGRESSION = "flow_matching", "regression"
 OBJECTIVES = (FLOW_MATCHING, REGRESSION)
-ALIGN_WEIGHTS = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
+ALIGN_WEIGHTS: Mapping[str, float] = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
+SHUFFLE_SEED = 7
+"""Seed of ``shuffle_subgoals``."""
 MODULATION, CONTEXT, OWN = "modulation", "context", "own"
 MEMORY_FUSIONS = (MODULATION, CONTEXT, OWN, NONE)
 PERCEPTIONS = ("pixels", "objects")
@@ -52,6 +52,7 @@ SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
 PROMPTED = "prompted"
 """Key of ``task_weights`` for tasks that begin with a demonstration prompt."""
 TOKENS_PER_FRAME = {"pixels": MEMORY_GRID**2, "objects": 2}
+MEMORY_FRAMES = 32
 MEMORY_STRIDE, FRAMES_PER_EPISODE = 8, 6
 """Where training decodes no video; 1 elsewhere."""
 ORACLE_TOKENS = 128
@@ -87,7 +88,6 @@ PAPERS: Mapping[str, Any] = {
     "n_action_steps": 50,
     "optimizer_weight_decay": 0.0,
     "ema_decay": 0.999,
-    "min_lr_ratio": 1.0,
     "objective": FLOW_MATCHING,
 }
 """Defaults of the fields that a size decides: the paper's."""
@@ -107,6 +107,7 @@ class Dimensions:
     text_dim: int
     learning_rate: float
     normalization: str = "QUANTILES"  # LeRobot's mode for states and actions
+    final_learning_rate: float = 1.0  # at the end, as a fraction of the highest; 1: it stays constant
     defaults: Mapping[str, Any] = field(default_factory=lambda: PAPERS)
 
 
@@ -132,12 +133,12 @@ SIZES = {
         vocabulary=512,
         tokenizer_max_length=48,
         normalization="MEAN_STD",
+        final_learning_rate=0.02,
         defaults={
             "chunk_size": 16,
             "n_action_steps": 6,
             "optimizer_weight_decay": 1e-4,
             "ema_decay": 0.995,
-            "min_lr_ratio": 0.02,
             "objective": REGRESSION,
         },
     ),
@@ -181,8 +182,8 @@ rule of its own (`checkpoints.read_config`); LeRobot makes ``output_features`` o
 `policies.compatibility` compares with the checkpoint's, and ``freeze_vision_encoder`` has one value here."""
 SINCE_BEGUN = _names(
     """
-    align subgoal_level shuffle_subgoals shuffle_seed text_encoder base_weights train_expert_only
-    ema_decay warmup_fraction min_lr_ratio optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
+    align subgoal_level shuffle_subgoals text_encoder base_weights train_expert_only
+    ema_decay warmup_fraction optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
     optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr
     """
 )
@@ -208,10 +209,6 @@ READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
     "a policy whose state is a token": (lambda it: it.state_token, "max_state_dim"),
     "a policy that sees pictures": (lambda it: it.uses_pictures, "memory_camera"),
     "size=small perception=pixels": (lambda it: it.size == "small" and not it.uses_objects, "visual_encoder"),
-    "a training that encodes pictures ahead": (
-        lambda it: it.encodes_ahead or it.needs_every_frame,
-        "feature_cache_dir",
-    ),
     "a memory": (_remembers, "memory_settings memory_fusion memory_stride tokens_per_frame"),
     "memory=frames or subgoal": (
         lambda it: _remembers(it, lambda one: issubclass(one, find_mechanism("frames"))),
@@ -226,12 +223,11 @@ READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
         "open_gate",
     ),
     "a memory that learns from texts": (lambda it: it.privileged_memory, "subgoals"),
-    "an alignment": (lambda it: it.align != NONE, "align_weight shuffle_subgoals text_encoder"),
+    "an alignment": (lambda it: it.align != NONE, "shuffle_subgoals text_encoder"),
     "an alignment or a memory that learns from texts": (
         lambda it: it.align != NONE or it.privileged_memory,
         "subgoal_level",
     ),
-    "shuffle_subgoals=true": (lambda it: it.shuffle_subgoals, "shuffle_seed"),
     "objective=flow_matching": (
         lambda it: it.objective == FLOW_MATCHING,
         "num_inference_steps rtc_config time_sampling_beta_alpha time_sampling_beta_beta time_sampling_scale "
@@ -250,8 +246,8 @@ default where nothing reads it."""
 RANGES = {
     **dict.fromkeys(_names("memory_frames memory_stride n_action_steps tokens_per_frame"), (1, math.inf)),
     **dict.fromkeys(_names("frames_per_episode num_inference_steps"), (1, math.inf)),
-    **dict.fromkeys(_names("min_lr_ratio warmup_fraction"), (0, 1)),
-    **dict.fromkeys(_names("detection_noise align_weight"), (0, math.inf)),
+    "warmup_fraction": (0, 1),
+    "detection_noise": (0, math.inf),
     "ema_decay": (0, math.nextafter(1, 0)),
 }
 """Smallest and largest value of fields."""
@@ -310,15 +306,11 @@ class MemobenchMemConfig(PI05Config):
     # -- alignment
     align: str = "none"
     """How memory is aligned with checkpoint language: ``none``, ``semantic``, ``contrastive`` or ``framewise``."""
-    align_weight: float | None = None
-    """Weight of the alignment loss; none or 0: the paper's for this objective (``align=none`` trains without one)."""
     subgoal_level: str = "intermediate"
     """Level of the language that memory is aligned with: ``coarse``, ``intermediate`` or ``fine``."""
     shuffle_subgoals: bool = False
     """Control of the paper: the subgoal texts of an episode change places among themselves, or with those of other
-    episodes where it has fewer than three."""
-    shuffle_seed: int = 7
-    """Seed of that shuffle; the result is the same for every epoch and on every machine."""
+    episodes where it has fewer than three; the same in every epoch and on every machine."""
     text_encoder: str | None = None
     """Encoder of subgoals: ``words`` (a hash of words), ``labels`` (a vector for each text, whatever its words), or
     folder or repository of a SigLIP model; none: the size's."""
@@ -352,8 +344,6 @@ class MemobenchMemConfig(PI05Config):
     memory_phase: bool = False
     """Whether a remembered frame of objects tells whether it was of the prompt. A memory that knows when the execution
     began has the clock of it, which strict tasks hide."""
-    feature_cache_dir: str | None = None
-    """Folder for feature caches, of several datasets perhaps; none: ``feature_cache`` in the dataset's folder."""
 
     # -- training
     objective: str = FROM_SIZE
@@ -370,10 +360,8 @@ class MemobenchMemConfig(PI05Config):
     types or ``prompted`` (tasks that begin with a demonstration prompt), of which the first that a task has counts;
     other tasks weigh 1, and ``{}`` draws all alike. None: ``{}`` where training decodes no video, else frames alike."""
     warmup_fraction: float = 0.05
-    """Share of the updates in which the learning rate rises to its highest."""
-    min_lr_ratio: float = FROM_SIZE
-    """Learning rate at the end, as a fraction of the highest, to which it falls as a cosine; 1: it stays constant.
-    None: the size's, 0.02 at ``small`` and the paper's 1 elsewhere."""
+    """Share of the updates in which the learning rate rises to its highest; it then stays, or falls as a cosine to
+    0.02 of it at ``size=small``."""
 
     # -- pi0.5's fields with this recipe's values, or the size's where they are None or empty
     freeze_vision_encoder: bool = True
@@ -391,8 +379,6 @@ class MemobenchMemConfig(PI05Config):
     tokenizer_max_length: int | None = None
     optimizer_lr: float | None = None
     optimizer_weight_decay: float = FROM_SIZE
-
-    drop_n_last_frames = 0  # no field: LeRobot asks it of a configuration when it makes its sampler (see `sampler`)
 
     def __post_init__(self) -> None:
         try:
@@ -430,8 +416,6 @@ class MemobenchMemConfig(PI05Config):
         self._check_read(defaults)
         if self.objective == REGRESSION:
             self.num_inference_steps = 1
-        # A checkpoint with align=none holds a weight of 0, with which another objective would change nothing.
-        self.align_weight = self.align_weight or ALIGN_WEIGHTS[self.align]
         self._check_numbers()  # before LeRobot's main, whose pi0.5 has a memory_stride too
         super().__post_init__()
         self._check_perception()
@@ -473,7 +457,6 @@ class MemobenchMemConfig(PI05Config):
             "memory_fusion": (NONE, MODULATION),
             "memory_camera": (f"{OBS_IMAGES}.{next(iter(CAMERAS))}",),
             "num_inference_steps": (1,),
-            "align_weight": (0.0,),
         }
         found: dict[str, str] = {}
         for reader, (present, names) in READERS.items():
@@ -493,9 +476,6 @@ class MemobenchMemConfig(PI05Config):
 
     def _complete_memory(self) -> None:
         """Set and check what makes the memory."""
-        if parser.parse_arg("policy.memory") == (self.memory or "null"):
-            for name, default in of_another_memory().items():
-                setattr(self, name, copy.copy(default))
         if self.memory in (None, "frames"):  # the default, as a recipe or checkpoint may name it
             self.memory = NONE if self.memory_fusion == NONE else "frames"
         if self.memory == NONE:
@@ -685,16 +665,6 @@ class MemobenchMemConfig(PI05Config):
                 "tell; leave it out"
             )
 
-    @property
-    def cache_place(self) -> Path | None:
-        """Folder that holds feature caches; None: the one beside each dataset."""
-        return None if self.feature_cache_dir is None else Path(self.feature_cache_dir).expanduser()
-
-    @property
-    def cache_name(self) -> str:
-        """First part of the name of this policy's feature cache of the memory."""
-        return f"{self.size}-stride{self.memory_stride}"
-
     # -- LeRobot's questions ---------------------------------------------------------------------------------------
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:
@@ -703,7 +673,8 @@ class MemobenchMemConfig(PI05Config):
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
         """Return the schedule that lerobot-train takes."""
-        return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction, final=self.min_lr_ratio)
+        final = self.dimensions.final_learning_rate
+        return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction, final=final)
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
         """Take the objects of a dataset with pictures for the input that LeRobot does not take them for.

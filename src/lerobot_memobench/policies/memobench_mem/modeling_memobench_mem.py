@@ -21,7 +21,6 @@ from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 from transformers.initialization import no_init_weights
@@ -30,11 +29,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_weights
 from lerobot_memobench.policies.compatibility import cure
-from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment, require_texts
-from lerobot_memobench.policies.memobench_mem.average import WeightAverage
-from lerobot_memobench.policies.memobench_mem.caching import open_frames
+from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
-    TRAINING_FILE,
     load_base_weights,
     load_weights,
     read_config,
@@ -42,15 +38,24 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     remembers_otherwise,
     require_agreement,
     require_statistics,
-    restore_average,
     weights_file,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import REGRESSION, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
+    ALIGN_WEIGHTS,
+    REGRESSION,
+    MemobenchMemConfig,
+)
 from lerobot_memobench.policies.memobench_mem.encoders import (
     ENCODED,
     ObservationEncoder,
     PrefixParts,
     VisualTokenEncoder,
+)
+from lerobot_memobench.policies.memobench_mem.losses import (
+    counted_actions,
+    losses_of,
+    mean_losses,
+    noise_and_time,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     AHEAD,
@@ -68,20 +73,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 )
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.products import keep_freed_memory, quick_gradients, quick_products
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
-from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, begin_training
-from lerobot_memobench.policies.memobench_mem.sharding import check_adapters, prepare_shards
-from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
-from lerobot_memobench.policies.memobench_mem.training import (
-    TrainingCurve,
-    counted_actions,
-    is_first_rank,
-    losses_of,
-    mean_losses,
-    means_over_ranks,
-    noise_and_time,
-)
 from lerobot_memobench.policies.memory_reads import Chunk, chunk_reads
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
@@ -90,8 +82,6 @@ from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # 
 
 logger = logging.getLogger(__name__)
 
-FSDP_PREFIX = "_fsdp_wrapped_module."
-"""What torch's FSDP puts into the names of what it wraps."""
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "modulator", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
@@ -105,9 +95,6 @@ class MemobenchMemPolicy(PI05Policy):
     Attributes:
         alignment: objective and head that tie memory to text; None without one.
         precision: in which the weights are kept.
-        average: moving average of the trained weights, which evaluation uses; None before training, or without one.
-        run: the dataset and its features that it is trained with; None where it only acts.
-        curve: how its losses fell.
         rollout: what is kept of the rows that it acts in.
     """
 
@@ -115,7 +102,6 @@ class MemobenchMemPolicy(PI05Policy):
     name = "memobench_mem"
     config: MemobenchMemConfig
     model: MemoryPI05
-    _fsdp_wrap_modules = None  # to LeRobot's main, whose FSDP is another than that of `sharding`
 
     def __init__(
         self,
@@ -129,17 +115,12 @@ class MemobenchMemPolicy(PI05Policy):
         """Build the policy from scratch, or from ``config.base_weights``.
 
         Args:
-            dataset_meta: metadata of the dataset to train on; its feature cache is checked, and made or finished.
-            load_base: False where a checkpoint's weights follow, with which training begins.
+            dataset_meta: metadata of the dataset to train on; None: the policy only acts.
+            load_base: False if a checkpoint's weights follow.
             draw: whether weights are drawn; False where all of them follow: at full size this takes two minutes.
         """
         # As PI05Policy.__init__, which names its model class.
         PreTrainedPolicy.__init__(self, config)
-        if dataset_meta is not None:
-            require_texts(Path(dataset_meta.root), config)
-            if config.privileged_memory:
-                config.subgoals = config.subgoals or subgoals_of(dataset_meta, config.subgoal_level)
-                require_known(config.subgoals, dataset_meta, config.subgoal_level)
         config.validate_features()
         self.init_rtc_processor()
         with contextlib.nullcontext() if draw else no_init_weights():
@@ -161,16 +142,10 @@ class MemobenchMemPolicy(PI05Policy):
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
-        self.average: WeightAverage | None = None
-        self.register_load_state_dict_post_hook(_restart_average)
-        self.run: TrainingRun | None = None
-        self.curve = TrainingCurve()
         self.rollout = Rollout(self._remembers, config.memory_stride)
         self._watched = False
         self.reset()
         self._thread: int | None = None  # whichever acts first
-        if dataset_meta is not None and load_base:
-            self._begin_training(dataset_meta)
 
     @property
     def perception(self) -> ObservationEncoder:
@@ -198,58 +173,26 @@ class MemobenchMemPolicy(PI05Policy):
             parts, masks = [*parts, state], [*masks, torch.ones(len(state), dtype=torch.bool)]
         return [part.to(self._device) for part in parts], [mask.to(self._device) for mask in masks]
 
-    @contextlib.contextmanager
-    def _acting(self) -> Iterator[None]:
-        """Compute as a checkpoint saved now would: by the average, in the precision that it is loaded in."""
-        wide = self.precision.narrowed()
-        whole = self.average is not None and self.average.whole  # a pass in shards has gathered the trained weights
-        average = self.average.applied(wide) if self.average is not None and whole else contextlib.nullcontext()
-        with average, self.precision.computing(self._device):
-            yield
-
     # -- training --------------------------------------------------------------------------------------------------
-
-    def _begin_training(self, meta: Any) -> None:
-        """Make ready to train on a dataset: the features that the preprocessor looks up, and LeRobot's sampler."""
-        cache = open_frames(Path(meta.root), self.config, self.perception)
-        self.run = TrainingRun(self.config, cache, meta)
-        begin_training(self.run)
-        if self._device.type == "cpu":
-            keep_freed_memory()
-        prepare_shards(self)
-
-    @property
-    def averages(self) -> bool:
-        """Whether weights are averaged: not those of adapters, of which peft writes a checkpoint's file."""
-        return bool(self.config.ema_decay) and not self.config.use_peft
 
     def trained_parameters(self) -> dict[str, nn.Parameter]:
         """Return the parameters that learn, by the names that they have in a checkpoint."""
-        return {
-            name.replace(FSDP_PREFIX, ""): parameter
-            for name, parameter in self.named_parameters()
-            if parameter.requires_grad
-        }
+        return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
 
     def get_optim_params(self) -> list[nn.Parameter]:
         """Return the parameters that learn, in float32: all but the image tower and what pi0.5 never uses."""
         self.precision.settle()
         return list(self.trained_parameters().values())
 
-    def update(self) -> None:
-        """Move the average of the weights; lerobot-train calls this after each optimiser step."""
-        if self.average is not None:
-            self.average.update()
-
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
         """Return the loss of the actions plus the weighted alignment on a preprocessed training batch.
 
-        A loss that is only measured (lerobot-train's ``eval_loss``: not training, no gradients) is that of the averaged
-        weights, which a checkpoint holds and rollouts act by. There actions follow the subgoal that a privileged memory
-        chooses, and its own losses compare with the true one.
+        In a loss that is only measured (``eval_loss``: not training, no gradients) actions follow the subgoal that a
+        privileged memory chooses, and its own losses compare with the true one.
 
         Args:
-            batch: what LeRobot's pi0.5 needs, and ``memory.*`` and ``phase`` as the preprocessor adds them.
+            batch: the inputs of LeRobot's pi0.5, and ``memory.*`` and ``phase`` as the preprocessor of a training adds
+                them. A policy without a memory takes batches of LeRobot's own trainer, too.
             reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
 
         Returns:
@@ -258,16 +201,11 @@ class MemobenchMemPolicy(PI05Policy):
             ``align_top1`` (share of memory vectors whose nearest text in the batch is theirs).
 
         Raises:
-            MemobenchError: the batch has no memory, or pictures where it should have their tokens.
+            MemobenchError: the batch has no memory.
         """
-        self._require_memory(batch)
-        batch = self.perception.observed(batch)
-        if self.averages and self.average is None and self.training:
-            self.average = WeightAverage(self.trained_parameters(), self.config.ema_decay)
+        batch = self.perception.observed(self._with_phase(batch))
         measures = not self.training and not torch.is_grad_enabled()
-        quick = self.training and self._device.type == "cpu" and not self.config.uses_visual_encoder
-        computing = self._acting() if measures else self.precision.computing(self._device)
-        with computing, quick_products() if quick else contextlib.nullcontext():
+        with self.precision.computing(self._device):
             memory = self.read_memory(batch)
             if measures and self.config.privileged_memory:  # whose losses are of the labels, and actions of its choice
                 memory = self.read_memory(_without_labels(batch))
@@ -276,36 +214,29 @@ class MemobenchMemPolicy(PI05Policy):
                 per_sample, total = per_sample + loss, total + loss.mean()
                 logged[f"memory_{name}_loss"] = loss.mean().item()
             if self.alignment is not None and memory is not None:
-                assert self.config.align_weight is not None
                 assert self.model.memory is not None
                 encoder = [parameter for parameter in self.model.memory.parameters() if parameter.requires_grad]
                 read = memory.rows(), memory.mask
-                weighted, numbers = alignment_loss(self.alignment, self.config.align_weight, batch, *read, encoder)
+                weighted, numbers = alignment_loss(
+                    self.alignment, ALIGN_WEIGHTS[self.config.align], batch, *read, encoder
+                )
                 per_sample, total, logged = per_sample + weighted, total + weighted, logged | numbers
         logged["loss"] = total.item()
-        if self.training:
-            self.curve.note(means_over_ranks(logged, self._device))
-        else:
-            self.curve.note_held_out(logged)
-        loss = per_sample if reduction == "none" else total
-        if quick:
-            quick_gradients(loss)
-        return loss, logged
+        return (per_sample if reduction == "none" else total), logged
 
-    def _require_memory(self, batch: dict[str, Tensor]) -> None:
-        needed = FRAMES if self._remembers else PHASE
-        if needed not in batch:
+    def _with_phase(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return a training batch with the phase of each sample, if the dataset records one.
+
+        Raises:
+            MemobenchError: a policy with a memory gets a batch without one.
+        """
+        if self._remembers and FRAMES not in batch:
             raise MemobenchError(
-                f"The training batch has no '{needed}': the preprocessor lacks the step memobench_gather_memory; to "
-                "start from pi0.5's weights pass --policy.base_weights instead of --policy.pretrained_path."
+                f"the training batch has no '{FRAMES}': memory={self.config.memory} learns from earlier frames of the "
+                "episode, which LeRobot's own trainer does not draw; train with `lerobot train policy=memobench_mem`, "
+                "or with --policy.memory=none"
             )
-        if self.config.encodes_ahead and self.training and any(key in batch for key in self.config.image_features):
-            raise MemobenchError(
-                "The training batch has pictures, which this policy does not read (they were encoded before training), "
-                "because a stream or loader processes made it, or because another policy is trained on the same "
-                "dataset object: pass --num_workers=0, which is quicker too, leave dataset.streaming out, and open the "
-                "dataset once for each policy."
-            )
+        return {PHASE: batch[OBS_PHASE], **batch} if OBS_PHASE in batch else batch
 
     def read_memory(self, batch: dict[str, Tensor]) -> MemoryTokens | None:
         """Read what the samples of a batch remember, and hand it to the model; None without a memory."""
@@ -446,7 +377,7 @@ class MemobenchMemPolicy(PI05Policy):
         memory = self.model.memory
         assert memory is not None
         frames = self.perception.remember(batch, rows).to(self._device)
-        with self._acting():
+        with self.precision.computing(self._device):
             for row, frame in zip(rows, frames.split(1), strict=True):  # one by one: no row depends on others
                 held = self.rollout.rows[row]
                 query = self._query(batch, [row], writes=True)
@@ -476,7 +407,7 @@ class MemobenchMemPolicy(PI05Policy):
         part = {key: batch[key][rows] for key in inputs if key in batch}
         images, image_masks = self._preprocess_images(part)
         words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
-        with self._acting():
+        with self.precision.computing(self._device):
             if training:
                 self.read_memory(_without_labels(batch))
             elif self._remembers:
@@ -603,7 +534,10 @@ class MemobenchMemPolicy(PI05Policy):
         dataset_meta: Any | None = None,
         **kwargs: Any,
     ) -> MemobenchMemPolicy:
-        """Load a checkpoint, with its averaged weights; to train on (``dataset_meta``), with its trained ones.
+        """Load a checkpoint: the averaged weights.
+
+        Args:
+            dataset_meta: metadata of the dataset to train on; None: the policy only acts.
 
         LeRobot's pi0.5 goes on with random weights when loading fails; this does not.
 
@@ -628,37 +562,10 @@ class MemobenchMemPolicy(PI05Policy):
         load_weights(policy, path, source, trained)
         policy.to(config.device)
         policy.eval()
-        if dataset_meta is None:
-            return policy
-        if policy.averages:
-            average = WeightAverage(policy.trained_parameters(), policy.config.ema_decay)
-            policy.average = restore_average(policy, average, source, trained, revision)
-        policy.curve = TrainingCurve.read(Path(source))
-        policy._begin_training(dataset_meta)
         return policy
 
-    def _save_pretrained(self, save_directory: Path, **gathered: Any) -> None:
-        """Save the averaged weights as the model, and beside it the trained ones for going on and the losses.
-
-        Args:
-            gathered: ``state_dict``, where LeRobot 0.6.1 has trained in shards: their average (`sharding`). Later
-                versions call this in every process.
-        """
-        writes = is_first_rank()
-        if writes:
-            self.curve.save(save_directory)
-        if self.average is None:
-            super()._save_pretrained(save_directory, **gathered)
-            return
-        # In float32, whatever precision it is evaluated in.
-        with self.average.applied() if self.average.whole else contextlib.nullcontext():
-            super()._save_pretrained(save_directory, **gathered)
-        if writes:
-            tensors, metadata = self.average.state()
-            save_file(tensors, save_directory / TRAINING_FILE, metadata=metadata)
-
     def __deepcopy__(self, memo: dict[int, Any]) -> MemobenchMemPolicy:
-        """Return a copy with weights, average and rollout of its own; it shares the run that it is trained in.
+        """Return a copy with weights and rollout of its own.
 
         The copy has no graph of the last pass: `backward` goes through the original.
         """
@@ -675,10 +582,6 @@ class MemobenchMemPolicy(PI05Policy):
 
         The adapters' base is what evaluation loads beneath them: a checkpoint's averaged weights.
         """
-        check_adapters()
-        if self.average is not None:
-            self.average.keep()
-            self.average = None
         wrapped = super().wrap_with_peft(peft_config, peft_cli_overrides)
         self.precision.settle()
         return wrapped
@@ -697,13 +600,6 @@ class MemobenchMemPolicy(PI05Policy):
         names = [name for name, _ in self.named_modules()]
         own = [end for end in OWN_MODULES if any(name == end or name.endswith(f".{end}") for name in names)]
         return [*asked, *(end for end in own if end not in set(asked))]
-
-
-def _restart_average(policy: Any, keys: Any) -> None:
-    """Begin the average of loaded weights at these, so that the policy acts by them."""
-    if policy.average is not None:
-        missing = set(keys.missing_keys)
-        policy.average.begin({name: one for name, one in policy.trained_parameters().items() if name not in missing})
 
 
 class _WithoutGraph(TorchFunctionMode):

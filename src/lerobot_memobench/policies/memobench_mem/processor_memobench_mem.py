@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import InitVar, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from tokenizers.pre_tokenizers import Split
 from tokenizers.processors import TemplateProcessing
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache.reading import FrameLookup, RecordedFrames
+from lerobot_memobench.datasets.lookup import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import (
     text_rows,
@@ -46,8 +46,7 @@ from lerobot_memobench.policies.memobench_mem.alignment import (
     texts_of_histories,
     words,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import ENCODED
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SHUFFLE_SEED, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     AHEAD,
@@ -60,7 +59,6 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     SUBGOALS,
 )
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.sampler import TrainingRun, prompt_texts, training_run
 from lerobot_memobench.policies.memobench_mem.subgoals import choices, texts_of
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
@@ -71,6 +69,7 @@ def make_memobench_mem_pre_post_processors(
     config: MemobenchMemConfig,
     dataset_stats: dict[str, dict[str, Any]] | None = None,
     dataset_meta: Any | None = None,
+    lookup: FrameLookup | None = None,
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
@@ -81,6 +80,7 @@ def make_memobench_mem_pre_post_processors(
         dataset_stats: normalisation statistics of the training dataset.
         dataset_meta: its metadata, whose task texts become the tiny tokenizer's words. LeRobot 0.6.1 leaves it on the
             config instead.
+        lookup: the frames of the training dataset; None in LeRobot's own trainer, and for a policy that only acts.
 
     Raises:
         MemobenchError: no statistics, as when a policy is evaluated that was never trained.
@@ -100,13 +100,13 @@ def make_memobench_mem_pre_post_processors(
     input_steps: list[ProcessorStep] = [
         steps.rename_observations,
         steps.add_batch_dim,
-        GatherMemoryProcessorStep(**gathering(config)),
-        OracleMemoryProcessorStep(enabled=config.oracle_memory),
+        GatherMemoryProcessorStep(**gathering(config), lookup=lookup),
+        OracleMemoryProcessorStep(enabled=config.oracle_memory, lookup=lookup),
         relative,
         *([RawStateProcessorStep()] if config.uses_objects else []),
         steps.normalize,  # before the prompt, which may spell the normalised state out
         *([] if config.state_token else [Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim)]),
-        _tokenizer(config, meta),
+        _tokenizer(config, prompt_texts(config, meta, lookup)),
         steps.to_device,
     ]
     output_steps: list[ProcessorStep] = [
@@ -114,13 +114,29 @@ def make_memobench_mem_pre_post_processors(
         AbsoluteActionsProcessorStep(enabled=config.use_relative_actions, relative_step=relative),
         steps.to_cpu,
     ]
-    run = training_run(config)
-    if run is not None:
-        run.follow(input_steps)
     return make_policy_processor_pipelines(input_steps=input_steps, output_steps=output_steps)
 
 
-def _tokenizer(config: MemobenchMemConfig, meta: Any | None) -> TokenizerProcessorStep:
+def follow_training(steps: Iterable[Any], config: MemobenchMemConfig, meta: Any, lookup: FrameLookup) -> None:
+    """Give the saved steps of a checkpoint the settings, prompts and frames of the training that they are used in."""
+    for step in steps:
+        if isinstance(step, GatherMemoryProcessorStep):
+            step.follow(config, lookup)
+        elif isinstance(step, OracleMemoryProcessorStep):
+            step.lookup, step.enabled = lookup, config.oracle_memory
+        elif isinstance(step, WordTokenizerProcessorStep):
+            step.follow(config, prompt_texts(config, meta, lookup))
+
+
+def prompt_texts(config: MemobenchMemConfig, meta: Any | None, lookup: FrameLookup | None) -> list[str]:
+    """Return a dataset's tasks, and with oracle memory every memory text that follows them in a prompt."""
+    tasks = [] if meta is None or meta.tasks is None else [str(task) for task in meta.tasks.index]
+    if config.oracle_memory and lookup is not None:
+        tasks += [with_memory("", memory) for memory in lookup.memories]
+    return tasks
+
+
+def _tokenizer(config: MemobenchMemConfig, texts: Sequence[str]) -> TokenizerProcessorStep:
     options = {"max_length": config.tokenizer_max_length, "padding_side": "right", "padding": "max_length"}
     if config.tokenizer_name != "words":
         try:
@@ -130,14 +146,12 @@ def _tokenizer(config: MemobenchMemConfig, meta: Any | None) -> TokenizerProcess
                 f"The tokenizer '{config.tokenizer_name}' could not be loaded: give a folder that holds PaliGemma's "
                 "tokenizer by --policy.tokenizer_name, or log in to the hub, where it is gated."
             ) from error
-    run = training_run(config)
-    texts = prompt_texts(config, meta, None if run is None else run.cache)
     return WordTokenizerProcessorStep(vocabulary=make_vocabulary(texts, config.dimensions.vocabulary), **options)
 
 
 def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
     """Return the fields of a policy's `GatherMemoryProcessorStep`."""
-    same = ("align", "subgoal_level", "shuffle_subgoals", "shuffle_seed", "memory")
+    same = ("align", "subgoal_level", "shuffle_subgoals", "memory")
     frames = 0 if config.memory == NONE else config.memory_frames
     subgoals = (config.subgoals or {}) if config.privileged_memory else {}
     return {"frames": frames, "subgoals": subgoals} | {name: getattr(config, name) for name in same}
@@ -145,30 +159,21 @@ def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
 
 @dataclass
 class LookupProcessorStep(ProcessorStep):
-    """A step that looks up the frames of training samples: in its own ``cache``, or in that of the run it follows."""
+    """A step that looks up the frames of training samples; without a ``lookup`` it sees none."""
 
-    cache: FrameLookup | None = field(default=None, repr=False, kw_only=True)
-    _run: TrainingRun | None = field(default=None, init=False, repr=False)
+    lookup: FrameLookup | None = field(default=None, repr=False, kw_only=True)
 
-    def frames_of(self, extra: Mapping[str, Any], transition: EnvTransition) -> tuple[FrameLookup, list[int]] | None:
-        """Return the cache, and a training sample's frames by their global indices; None in a rollout.
+    def sample_indices(self, transition: EnvTransition) -> list[int] | None:
+        """Return the global indices of training samples; None in a rollout.
 
-        LeRobot keeps of a training batch only what its transition knows, which is the frame's ``index``; rollouts carry
-        none.
-
-        Raises:
-            MemobenchError: there is no cache.
+        LeRobot keeps of a training batch only the keys of its transition, the frame's ``index`` among them; rollouts
+        carry none.
         """
+        extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
             return None
-        cache = self.cache or (self._run.cache if self._run is not None else None)
-        if cache is None:
-            raise MemobenchError(
-                "The preprocessor of memobench_mem has no feature cache to look up history in: make the policy with "
-                "its dataset_meta first, and then its processors with that policy's configuration, or give "
-                "GatherMemoryProcessorStep a cache."
-            )
-        return cache, extra["index"].reshape(-1).tolist()
+        found: list[int] = extra["index"].reshape(-1).tolist()
+        return found
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -193,79 +198,72 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
     of the frames. A memory that learns to foresee has ``memory.ahead`` (B, n). With ``frames`` 0 (``memory=none``)
     there is no history.
 
-    A step that is rebuilt from a checkpoint has the settings of the run that wrote it, until it is told to ``follow``
-    another one. One that is given a ``cache`` keeps its own.
+    A step without a ``lookup`` (a rollout, LeRobot's own trainer) adds nothing but ``memory.choices``.
     """
 
     frames: int = 32
     align: str = "none"
     subgoal_level: str = "intermediate"
     shuffle_subgoals: bool = False
-    shuffle_seed: int = 7
+    shuffle_seed: InitVar[int] = SHUFFLE_SEED  # written by earlier versions, always this
     memory: str = "frames"
     subgoals: dict[str, list[str]] = field(default_factory=dict)
     _texts: np.ndarray | None = field(default=None, init=False, repr=False)
 
-    def follow(self, run: TrainingRun) -> None:
-        """Look up in a run's cache from now on, by its settings, unless there is a cache of its own."""
-        if self.cache is not None:
-            return
-        self._run, self._texts = run, None
-        for name, value in gathering(run.config).items():
+    def follow(self, config: MemobenchMemConfig, lookup: FrameLookup) -> None:
+        """Look up frames for a training by its settings."""
+        self.lookup, self._texts = lookup, None
+        for name, value in gathering(config).items():
             setattr(self, name, value)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Return the transition with what was looked up."""
+        """Return the transition with the frames' history, phase and texts."""
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if self.subgoals:
             extra = {**extra, CHOICES: choices(self.subgoals, extra.get("task") or [])}
             transition = {**transition, TransitionKey.COMPLEMENTARY_DATA: extra}
-        found = self.frames_of(extra, transition)
-        if found is None:
+        indices, lookup = self.sample_indices(transition), self.lookup
+        if indices is None or lookup is None:
             return transition
-        cache, indices = found
         transition = transition.copy()
-        transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, **self.gather(cache, indices)}
+        transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, **self.gather(lookup, indices)}
         observation = transition.get(TransitionKey.OBSERVATION) or {}
-        # LeRobot passes on observations alone, and in a dataset with pictures objects are none by name.
-        if isinstance(cache, RecordedFrames) and OBS_ENV_STATE in cache.columns and OBS_ENV_STATE not in observation:
+        # LeRobot passes on observations only, and in a dataset with pictures the objects' column has another name.
+        if OBS_ENV_STATE in lookup.columns and OBS_ENV_STATE not in observation:
             transition[TransitionKey.OBSERVATION] = {
                 **observation,
-                OBS_ENV_STATE: cache.columns[OBS_ENV_STATE][indices],
+                OBS_ENV_STATE: lookup.columns[OBS_ENV_STATE][indices],
             }
         return transition
 
-    def gather(self, cache: FrameLookup, indices: Sequence[int]) -> dict[str, Tensor]:
+    def gather(self, lookup: FrameLookup, indices: Sequence[int]) -> dict[str, Tensor]:
         """Look up frames of the dataset by their global indices."""
-        places = [cache.locate(index) for index in indices]  # refuses frames that the cache does not know
-        phase = {PHASE: torch.from_numpy(cache.phase[np.asarray(indices)].astype(np.int64))}
-        if isinstance(cache, RecordedFrames):
-            encoded = [name for name in cache.columns if name.startswith(ENCODED)]
-            phase |= {name: cache.columns[name][torch.tensor(indices)] for name in encoded}
+        places = [lookup.locate(index) for index in indices]
+        found = {PHASE: torch.from_numpy(lookup.phase[np.asarray(indices)].astype(np.int64))}
+        found |= {name: encoded(indices) for name, encoded in lookup.encoded.items()}
         if not self.frames:
-            return phase
-        mechanism, stride = find_mechanism(self.memory), cache.meta.stride
+            return found
+        mechanism, stride = find_mechanism(self.memory), lookup.stride
         recalled = [(episode, np.asarray(mechanism.slots(frame // stride, self.frames))) for episode, frame in places]
         ahead = [np.arange(frame // stride + 1, frame // stride + 1 + mechanism.ahead) for _, frame in places]
-        memory, numbers = _histories(cache, recalled, ahead)
+        memory, numbers = _histories(lookup, recalled, ahead)
         if self.subgoals:
             number = {text: row for row, text in enumerate(texts_of(self.subgoals))}
-            known = np.array([*(number.get(text, -1) for text in cache.texts), -1])
-            rows = cache.text_rows(self.subgoal_level)
+            known = np.array([*(number.get(text, -1) for text in lookup.texts), -1])
+            rows = lookup.text_rows(self.subgoal_level)
             asked = {SUBGOAL: np.asarray(indices), SUBGOALS: numbers.numpy()}
             memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
         if self.align == "none":
-            return memory | phase
-        rows = self._text_rows(cache)
+            return memory | found
+        rows = self._text_rows(lookup)
         if self.align != "framewise":
-            return memory | phase | texts_of_frames(cache, rows, indices)
-        histories = [int(cache.episodes[episode]) + read * stride for episode, read in recalled]
-        return memory | phase | texts_of_histories(cache, rows, histories, self.frames)
+            return memory | found | texts_of_frames(lookup, rows, indices)
+        histories = [int(lookup.episodes[episode]) + read * stride for episode, read in recalled]
+        return memory | found | texts_of_histories(lookup, rows, histories, self.frames)
 
-    def _text_rows(self, cache: FrameLookup) -> np.ndarray:
+    def _text_rows(self, lookup: FrameLookup) -> np.ndarray:
         if self._texts is None:
-            seed = self.shuffle_seed if self.shuffle_subgoals else None
-            self._texts = text_rows(cache, self.subgoal_level, self.align, seed)
+            self._texts = text_rows(lookup, self.subgoal_level, self.align, self.shuffle_subgoals)
         return self._texts
 
     def get_config(self) -> dict[str, Any]:
@@ -275,7 +273,6 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             "align": self.align,
             "subgoal_level": self.subgoal_level,
             "shuffle_subgoals": self.shuffle_subgoals,
-            "shuffle_seed": self.shuffle_seed,
         }
         if self.subgoals:
             found["subgoals"] = self.subgoals
@@ -283,15 +280,15 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
 
 
 def _histories(
-    cache: FrameLookup, recalled: Sequence[tuple[int, np.ndarray]], ahead: Sequence[np.ndarray]
+    lookup: FrameLookup, recalled: Sequence[tuple[int, np.ndarray]], ahead: Sequence[np.ndarray]
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Load frames of episodes by their slots, each once; return them for a batch, and their numbers in the dataset.
 
     Args:
         ahead: slots that follow each of those, beyond the episode's end perhaps.
     """
-    stride, needed = cache.meta.stride, dict[int, list[np.ndarray]]()
-    counts = -(-np.diff(cache.episodes) // stride)
+    stride, needed = lookup.stride, dict[int, list[np.ndarray]]()
+    counts = -(-np.diff(lookup.episodes) // stride)
     following = [(episode, slots[slots < counts[episode]]) for (episode, _), slots in zip(recalled, ahead, strict=True)]
     for episode, slots in (*recalled, *following):
         needed.setdefault(episode, []).append(slots)
@@ -305,8 +302,8 @@ def _histories(
         return torch.from_numpy(found)
 
     steps = torch.from_numpy(np.concatenate([slots * stride for slots in unique.values()]))
-    starts = np.repeat([cache.episodes[episode] for episode in unique], [len(slots) for slots in unique.values()])
-    frames = torch.cat([cache.tokens(episode, slots.tolist()) for episode, slots in unique.items()])
+    starts = np.repeat([lookup.episodes[episode] for episode in unique], [len(slots) for slots in unique.values()])
+    frames = torch.cat([lookup.tokens(episode, slots.tolist()) for episode, slots in unique.items()])
     found = {FRAMES: frames, STEPS: steps, PLACES: places(recalled, max(len(slots) for _, slots in recalled))}
     found |= {AHEAD: places(following, len(ahead[0]))} if len(ahead[0]) else {}
     return found, steps + torch.from_numpy(starts)
@@ -319,31 +316,29 @@ class OracleMemoryProcessorStep(LookupProcessorStep):
 
     Training samples take it from the dataset's column ``memory``. In a rollout the environment, which alone knows what
     has been done, writes the same words into its instruction; one that does not is refused, because the policy would
-    be scored without the memory it was trained on. A step that is not ``enabled`` does nothing; one that is told to
-    ``follow`` a training does as its policy says.
+    be scored without the memory it was trained on. A step that is not ``enabled`` does nothing.
     """
 
     enabled: bool = True
-
-    def follow(self, run: TrainingRun) -> None:
-        """Read memory texts out of a run's cache, if its policy does, unless there is a cache of its own."""
-        if self.cache is None:
-            self._run, self.enabled = run, run.config.oracle_memory
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with memory text in its tasks.
 
         Raises:
-            MemobenchError: a rollout's instruction brings none.
+            MemobenchError: a rollout's instruction has none, or LeRobot's own trainer runs the step.
         """
         if not self.enabled:
             return transition
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         tasks = extra.get("task") or []
-        found = self.frames_of(extra, transition)
-        if found is not None:
-            cache, indices = found
-            memories = cache.memory_texts(indices)
+        indices = self.sample_indices(transition)
+        if indices is not None:
+            if self.lookup is None:
+                raise MemobenchError(
+                    "policy.oracle_memory=true reads the memory text of each sample, which LeRobot's own trainer does "
+                    "not look up; train with `lerobot train policy=memobench_mem`"
+                )
+            memories = self.lookup.memory_texts(indices)
             tasks = [with_memory(task, memory) for task, memory in zip(tasks, memories, strict=True)]
         elif not tasks or not all(MARK in task for task in tasks):
             raise MemobenchError(
@@ -480,8 +475,8 @@ class PromptTokenizerProcessorStep(TokenizerProcessorStep):
 class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
     """LeRobot's tokenizer step with the word tokenizer; its words are saved in the checkpoint's processor file.
 
-    A step that is told to ``follow`` a training takes the length of its prompts, and learns the words of its dataset
-    that it does not have, behind its own, which keep their numbers.
+    In a training from a checkpoint it takes the length of the training's prompts, and adds their new words behind its
+    own, which keep their numbers.
     """
 
     vocabulary: list[str] = field(default_factory=list)
@@ -495,12 +490,10 @@ class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
         self.tokenizer = make_word_tokenizer(self.vocabulary)
         super().__post_init__()
 
-    def follow(self, run: TrainingRun) -> None:
-        """Learn the words of a run's prompts, and take their length."""
-        config = run.config
+    def follow(self, config: MemobenchMemConfig, texts: Sequence[str]) -> None:
+        """Learn the words of a training's prompts, and take their length."""
         assert config.tokenizer_max_length is not None  # set by the configuration
         self.max_length = config.tokenizer_max_length
-        texts = prompt_texts(config, run.meta, run.cache)
         self.vocabulary = extend(self.vocabulary, texts, config.dimensions.vocabulary)
         self.__post_init__()
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.feature_cache.frames import LEVEL_COLUMNS, read_frame_table
+from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, read_frame_table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.memory_text import MARK
 

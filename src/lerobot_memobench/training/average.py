@@ -1,13 +1,25 @@
-"""Trained weights and their moving average."""
+"""The moving average of the trained weights: a checkpoint's model is the average, the trained weights lie beside it."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import as_trained, checkpoint_file, undamaged
+from lerobot_memobench.policies.memobench_mem.checkpoints import name_here, read_tensors, restarted
+
+logger = logging.getLogger(__name__)
+
+TRAINING_FILE = "training_weights.safetensors"
 
 
 class Averaged(NamedTuple):
@@ -33,35 +45,21 @@ class WeightAverage:
 
     Attributes:
         parameters: name -> trained parameter. average: name -> its average. counts: name -> number of its updates.
-        whole: whether this process holds all of it (see `sharding.ShardedAverage`).
     """
 
-    whole = True
-
     def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
-        self.decay = decay
-        self.parameters: dict[str, nn.Parameter] = {}
-        self.average: dict[str, Tensor] = {}
-        self.counts: dict[str, int] = {}
-        self._cast: dict[str, Tensor] = {}  # the average in another precision, until it moves on
-        self.begin(parameters)
+        self.decay, self.parameters = decay, dict(parameters)
+        self.counts = dict.fromkeys(self.parameters, 0)
+        self.average = {name: one.detach().to(torch.float32, copy=True) for name, one in self.parameters.items()}
 
     @property
     def updates(self) -> int:
         """Number of updates of the parameter that has been averaged the longest."""
         return max(self.counts.values(), default=0)
 
-    def begin(self, parameters: Mapping[str, nn.Parameter]) -> None:
-        """Set the average of some parameters to their present weights, and their number of updates to 0."""
-        self._cast.clear()
-        for name, parameter in parameters.items():
-            self.parameters[name], self.counts[name] = parameter, 0
-            self.average[name] = parameter.detach().to(torch.float32, copy=True)
-
     @torch.no_grad()
     def update(self) -> None:
         """Move the average towards the current weights by one step."""
-        self._cast.clear()
         for count in set(self.counts.values()):
             names = [name for name, updates in self.counts.items() if updates == count]
             decay = min(self.decay, (1 + count) / (10 + count))
@@ -73,8 +71,7 @@ class WeightAverage:
     def applied(self, dtypes: Mapping[nn.Parameter, torch.dtype] | None = None) -> Iterator[None]:
         """Let the module hold the average inside the block.
 
-        Nothing is copied for float32 parameters, and what is cast is cast once for all blocks until the next update:
-        an evaluation enters one for every plan.
+        Nothing is copied for float32 parameters.
 
         Args:
             dtypes: parameters that are to hold the average in another precision than their own.
@@ -82,23 +79,11 @@ class WeightAverage:
         trained = {name: parameter.data for name, parameter in self.parameters.items()}
         try:
             for name, parameter in self.parameters.items():
-                parameter.data = self._as(name, (dtypes or {}).get(parameter, parameter.dtype))
+                parameter.data = self.average[name].to((dtypes or {}).get(parameter, parameter.dtype))
             yield
         finally:
             for name, parameter in self.parameters.items():
                 parameter.data = trained[name]
-
-    def keep(self) -> None:
-        """Let the module hold the average for good."""
-        for name, parameter in self.parameters.items():
-            parameter.data = self.average[name]
-
-    def _as(self, name: str, dtype: torch.dtype) -> Tensor:
-        if self.average[name].dtype == dtype:
-            return self.average[name]
-        if name not in self._cast or self._cast[name].dtype != dtype:
-            self._cast[name] = self.average[name].to(dtype)
-        return self._cast[name]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, str]]:
         """Return tensors and metadata of a safetensors file, next to one that holds the averaged module.
@@ -109,11 +94,14 @@ class WeightAverage:
         for name, parameter in self.parameters.items():
             if parameter.dtype != torch.float32:
                 tensors[f"average.{name}"] = self.average[name]
-        return tensors, self._metadata()
-
-    def _metadata(self) -> dict[str, str]:
         others = {f"updates.{name}": str(count) for name, count in self.counts.items() if count != self.updates}
-        return {"updates": str(self.updates), **others}
+        return tensors, {"updates": str(self.updates), **others}
+
+    def save(self, folder: Path) -> None:
+        """Write the trained weights into a checkpoint's folder."""
+        folder.mkdir(parents=True, exist_ok=True)
+        tensors, metadata = self.state()
+        save_file(tensors, folder / TRAINING_FILE, metadata=metadata)
 
     @torch.no_grad()
     def restore(self, states: Mapping[str, Averaged]) -> list[str]:
@@ -127,7 +115,6 @@ class WeightAverage:
             held = parameter.detach() if average is None else average
             self.average[name] = held.to(parameter.device, torch.float32, copy=True)
             parameter.copy_(weights.to(parameter.device))
-        self._cast.clear()
         return [name for name in self.parameters if name not in states]
 
 
@@ -142,3 +129,34 @@ def states_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> dic
         )
         for name in names
     }
+
+
+def begin_average(policy: Any) -> WeightAverage | None:
+    """Return the average of a policy that is about to be trained; None if it has none (``ema_decay=0``, adapters).
+
+    A policy that was loaded from a checkpoint holds the checkpoint's average. It gets the trained weights back, and the
+    average continues; that of parts which begin again, or which the checkpoint did not train, starts at their weights.
+
+    Raises:
+        MemobenchError: the checkpoint's trained weights cannot be read, or do not fit.
+    """
+    config = policy.config
+    if not config.ema_decay or config.use_peft:
+        return None
+    average = WeightAverage(policy.trained_parameters(), config.ema_decay)
+    source, revision = config.pretrained_path, config.pretrained_revision
+    path = None if source is None else checkpoint_file(source, TRAINING_FILE, revision)
+    if path is None:
+        return average
+    trained: Any = as_trained(source, config, revision)
+    with undamaged(path), safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    held = {name_here(policy, name, trained): one for name, one in states_of(read_tensors(path), metadata).items()}
+    states = {name: held[name] for name in held.keys() & average.parameters.keys() - restarted(policy, trained)}
+    wrong = sorted(name for name, one in states.items() if one.weights.shape != average.parameters[name].shape)
+    if wrong:
+        raise MemobenchError(f"{path} holds another shape of '{wrong[0]}' than this policy; copy the checkpoint again.")
+    new = average.restore(states)
+    if new:
+        logger.info("the average continues from '%s'; that of %s starts again", source, ", ".join(new))
+    return average

@@ -1,0 +1,337 @@
+"""Open what a memory policy learns from: datasets, the lookup of their frames, samples and processors."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets.compute_stats import get_feature_stats
+from lerobot.datasets.factory import make_train_eval_datasets
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from lerobot_memobench.datasets.frames import TextEncoder, read_frame_table
+from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, without_pattern
+from lerobot_memobench.datasets.lerobot_format.reading import check_idling
+from lerobot_memobench.datasets.lookup import FrameLookup, read_recorded
+from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import count_of
+from lerobot_memobench.policies.memobench_mem.alignment import make_text_encoder, require_texts
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.encoders import (
+    ImageTowerEncoder,
+    ObservationEncoder,
+    VisualTokenEncoder,
+    encoded_key,
+)
+from lerobot_memobench.policies.memobench_mem.objects import DETECTED, OBS_RAW_STATE, VIEWS, DetectionEncoder
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
+    follow_training,
+    make_memobench_mem_pre_post_processors,
+)
+from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
+from lerobot_memobench.protocol import OBS_PHASE, PROMPT
+from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
+
+logger = logging.getLogger(__name__)
+
+RECORDED = (OBS_STATE, OBS_ENV_STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index", "index")
+"""Columns of which samples are made if training decodes no video."""
+LEAST_DEVIATION = 0.01
+"""Added to the standard deviations of actions, so that a number that hardly varies is not scaled up to noise."""
+
+
+@dataclass
+class Training:
+    """A policy and what it learns from.
+
+    Attributes:
+        policy: LeRobot's, with adapters perhaps. processors: pre- and postprocessor.
+        dataset: the episodes to train on. held_out: those held out, None without any.
+        lookup: all frames of the dataset.
+    """
+
+    policy: Any
+    processors: tuple[Any, Any]
+    dataset: LeRobotDataset
+    held_out: LeRobotDataset | None
+    lookup: FrameLookup
+
+    def samples(self, dataset: LeRobotDataset | None = None) -> Dataset[dict[str, Any]]:
+        """Return the samples of a part of the dataset by their global indices; of the episodes to train on if None."""
+        dataset = dataset or self.dataset
+        if not self.lookup.columns:
+            return DecodedSamples(dataset)
+        return RecordedSamples(self.lookup, dataset.meta.tasks.index.tolist(), self.policy.config.action_delta_indices)
+
+
+def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
+    """Make or load the policy of a training, compute features that are not cached yet, and make the processors.
+
+    Args:
+        datasets: of `open_datasets`.
+
+    Raises:
+        MemobenchError: the dataset does not fit the policy.
+    """
+    dataset, held_out = datasets
+    policy_config: Any = config.policy
+    complete_policy(policy_config, dataset.meta)
+    policy: Any = make_policy(policy_config, ds_meta=dataset.meta, rename_map=config.rename_map)
+    if config.peft is not None and not policy_config.use_peft:
+        policy = policy.wrap_with_peft(peft_cli_overrides=asdict(config.peft))
+    lookup = open_lookup(Path(dataset.meta.root), policy_config, policy.perception, config.rename_map)
+    processors = make_processors(config, dataset.meta, lookup)
+    return Training(policy, processors, dataset, held_out, lookup)
+
+
+# -- datasets ----------------------------------------------------------------------------------------------------------
+
+
+def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
+    """Open the episodes to train on and those that are held out, as LeRobot does; complete their statistics.
+
+    Raises:
+        MemobenchError: the dataset has no such episodes, or an earlier version made it.
+    """
+    opened = copy.copy(config)
+    if config.dataset.root is not None:
+        opened.dataset = replace(config.dataset, root=str(without_pattern(Path(config.dataset.root))))
+    given = opened.dataset
+    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
+    check_episodes(given.episodes, meta)
+    complete_statistics(config.policy, meta, given)
+    train, held_out = make_train_eval_datasets(opened)
+    check_dataset_version(train.meta)
+    return train, held_out
+
+
+def check_dataset_version(meta: LeRobotDatasetMetadata) -> None:
+    """Refuse a dataset that an earlier version of the benchmark made."""
+    check_clock(meta.features, meta.root)
+    if EPISODE_INFO in meta.features:
+        check_idling(Path(meta.root))
+
+
+def check_episodes(episodes: Sequence[int] | None, meta: LeRobotDatasetMetadata) -> None:
+    """Refuse episodes that a dataset does not have; LeRobot leaves them out, and fails if none is left."""
+    if episodes is None:
+        return
+    absent = [episode for episode in episodes if episode >= meta.total_episodes]
+    if absent or not episodes:
+        raise MemobenchError(
+            f"found episodes={absent or episodes}, and the dataset {meta.root} has "
+            f"{count_of(meta.total_episodes, 'episode')}; name some of 0 to {meta.total_episodes - 1}, or leave "
+            "episodes out for all"
+        )
+
+
+def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -> None:
+    """Add the statistics that a policy normalises by and its dataset lacks.
+
+    Args:
+        policy: its configuration. given: LeRobot's configuration of the dataset.
+    """
+    root = Path(meta.root)
+    missing = lacking(root, needed_by(policy, meta.features, given.use_imagenet_stats))
+    if not missing:
+        return
+    if not (root / "data").is_dir():
+        root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
+    complete(root, missing, logger.warning)
+
+
+def complete_policy(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Set the subgoals of a memory that learns from them.
+
+    Raises:
+        MemobenchError: the dataset lacks texts that the policy learns from.
+    """
+    require_texts(Path(meta.root), config)
+    if config.privileged_memory:
+        config.subgoals = config.subgoals or subgoals_of(meta, config.subgoal_level)
+        require_known(config.subgoals, meta, config.subgoal_level)
+
+
+# -- frames ------------------------------------------------------------------------------------------------------------
+
+
+def open_lookup(
+    root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str] | None = None
+) -> FrameLookup:
+    """Open the lookup of a dataset's frames; compute features first that are not cached yet.
+
+    Args:
+        encoder: the policy's perception.
+        renamed: LeRobot's ``rename_map``: names of the dataset -> names of the policy.
+
+    Raises:
+        MemobenchError: the dataset lacks a column, or features cannot be computed.
+    """
+    in_data = {known: given for given, known in (renamed or {}).items()}
+    stride = config.memory_stride
+    if isinstance(encoder, ImageTowerEncoder):
+        table, remember = read_frame_table(root), None
+        if config.memory != "none":
+            remembered = encoder.memory_input
+            camera = in_data.get(remembered, remembered) or next(iter(cameras_of(root)), "")
+            how = {"progress": partial(logger.info, "feature cache: %d of %d episodes")}
+            remember = remembered_features(root, config, encoder, camera, **how).tokens
+        return FrameLookup(root, table, stride=stride, texts=text_encoder(config), remember=remember)
+    names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
+    columns, table = read_recorded(root, names)
+    logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
+    if isinstance(encoder, VisualTokenEncoder):
+        cameras = dict.fromkeys(encoder.cameras or [*cameras_of(root), encoder.memory_input])
+        names_in_data = {name: in_data.get(name, name) for name in cameras}
+        how = {"progress": partial(logger.info, "pictures encoded: %d of %d episodes")}
+        memory, present = picture_tokens(root, config, encoder, names_in_data, **how)
+        encoded = {encoded_key(camera): one.of_frames for camera, one in present.items()}
+        remember = None if memory is None else memory.tokens
+        return FrameLookup(
+            root, table, stride=stride, texts=text_encoder(config), remember=remember, columns=columns, encoded=encoded
+        )
+    observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
+    encoded = {}
+    if isinstance(encoder, DetectionEncoder):
+        names_in_data = {name: in_data.get(name, name) for name in VIEWS}
+        how = {"progress": partial(logger.info, "objects detected in %d of %d episodes")}
+        found = detections(root, encoder.detect, names_in_data, in_data.get(OBS_STATE, OBS_STATE), **how)
+        slots = found.all_frames().sum(dim=1, dtype=torch.float32)
+        observed[DETECTED], encoded[DETECTED] = slots, lambda indices: slots[indices]
+
+    def remember_objects(episode: int, slots: Sequence[int]) -> Tensor:
+        first = int(table.episodes[episode])
+        return encoder.remember(observed, [first + slot * stride for slot in slots])
+
+    return FrameLookup(
+        root,
+        table,
+        stride=stride,
+        texts=text_encoder(config),
+        remember=remember_objects,
+        columns=columns,
+        encoded=encoded,
+    )
+
+
+def text_encoder(config: MemobenchMemConfig) -> TextEncoder:
+    """Return the encoder of the subgoals that memory is aligned with; without an alignment nothing reads its output."""
+    name = "words" if config.align == "none" else config.text_encoder
+    assert name is not None  # set by the configuration
+    return make_text_encoder(name, config.dimensions.text_dim, str(config.device))
+
+
+# -- samples -----------------------------------------------------------------------------------------------------------
+
+
+class RecordedSamples(Dataset[dict[str, Any]]):
+    """LeRobot's samples by their global indices, made of numbers in main memory, without pictures.
+
+    Args:
+        chunk: actions of a sample, counted from its frame.
+    """
+
+    def __init__(self, lookup: FrameLookup, tasks: Sequence[str], chunk: Sequence[int]) -> None:
+        self._lookup, self._tasks, self._chunk = lookup, tasks, torch.tensor([*chunk])
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        lookup = self._lookup
+        episode, _ = lookup.locate(index)
+        first, end = lookup.episodes[episode : episode + 2].tolist()
+        found: dict[str, Any] = {name: column[index] for name, column in lookup.columns.items()}
+        wanted = index + self._chunk
+        found[ACTION] = lookup.columns[ACTION][wanted.clamp(first, end - 1)]
+        found[f"{ACTION}_is_pad"] = (wanted < first) | (wanted >= end)
+        return found | {"task": self._tasks[int(found["task_index"])]}
+
+
+class DecodedSamples(Dataset[dict[str, Any]]):
+    """LeRobot's samples by their global indices, pictures included."""
+
+    def __init__(self, dataset: LeRobotDataset) -> None:
+        self._dataset, self._row = dataset, dataset.absolute_to_relative_idx
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        found: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
+        return found
+
+
+# -- processors --------------------------------------------------------------------------------------------------------
+
+
+def make_processors(config: TrainPipelineConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup) -> tuple[Any, Any]:
+    """Return pre- and postprocessor of the policy in training: new ones, or those of the checkpoint it begins with."""
+    policy: Any = config.policy
+    stats = {**meta.stats, **execution_statistics(policy, meta, lookup)}
+    if not policy.pretrained_path:
+        return make_memobench_mem_pre_post_processors(policy, stats, meta, lookup)
+    normalizer: dict[str, Any] = {
+        "features": {**policy.input_features, **policy.output_features},
+        "norm_map": policy.normalization_mapping,
+    }
+    unnormalizer: dict[str, Any] = {**normalizer, "features": policy.output_features}
+    if not config.resume:  # a training that is resumed keeps its statistics
+        normalizer["stats"] = unnormalizer["stats"] = stats
+    before: dict[str, Any] = {
+        "device_processor": {"device": torch.device(policy.device).type},
+        "normalizer_processor": normalizer,
+        "rename_observations_processor": {"rename_map": config.rename_map},
+    }
+    after: dict[str, Any] = {"unnormalizer_processor": unnormalizer}
+    if policy.use_relative_actions:
+        before["relative_actions_processor"] = {
+            "enabled": True,
+            "exclude_joints": policy.relative_exclude_joints,
+            "action_names": policy.action_feature_names,
+        }
+        after["absolute_actions_processor"] = {"enabled": True}
+    preprocessor, postprocessor = make_pre_post_processors(
+        policy_cfg=policy,
+        pretrained_path=policy.pretrained_path,
+        pretrained_revision=policy.pretrained_revision,
+        preprocessor_overrides=before,
+        postprocessor_overrides=after,
+    )
+    follow_training(preprocessor.steps, policy, meta, lookup)
+    return preprocessor, postprocessor
+
+
+def execution_statistics(
+    config: MemobenchMemConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup
+) -> dict[str, dict[str, Any]]:
+    """Return the statistics of states and actions over execution frames; none if LeRobot makes the samples.
+
+    Relative actions depend on the chunk, so theirs are the dataset's.
+
+    Raises:
+        MemobenchError: actions are relative, and the dataset's statistics are of absolute ones.
+    """
+    if not lookup.columns:
+        return {}
+    columns = {name: lookup.columns[name].numpy() for name in (OBS_STATE, ACTION)}
+    executed = lookup.phase != PROMPT
+    found = {name: get_feature_stats(one[executed], axis=0, keepdims=False) for name, one in columns.items()}
+    if config.use_relative_actions:
+        found[ACTION] = dict(meta.stats[ACTION])
+        if np.allclose(found[ACTION]["mean"], columns[ACTION].mean(axis=0), atol=1e-4):
+            raise MemobenchError(
+                f"The dataset {meta.root} has statistics of absolute actions, and "
+                "--policy.use_relative_actions=true normalises relative ones; recompute them "
+                "(`lerobot-edit-dataset --operation.type=recompute_stats --operation.relative_action=true "
+                f"--operation.chunk_size={config.chunk_size}`) or leave use_relative_actions out."
+            )
+    found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + LEAST_DEVIATION
+    return found

@@ -1,0 +1,379 @@
+"""Cache the outputs of frozen encoders for every frame of a dataset: one safetensors file per episode.
+
+A memory reads up to 32 earlier frames per sample, and a policy that reads pictures through a frozen encoder needs their
+tokens at every update. They are computed once, before training, and lie in ``feature_cache/<name>/`` in the dataset's
+folder. The name ends with a hash of the frames, the encoder's weights, the camera and the stride, so a cache that does
+not fit has another name. A file that exists is complete. With several processes each encodes a part of the episodes.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import OBS_STATE
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from lerobot_memobench.datasets.frames import FrameReader, frame_reader, read_frame_table
+from lerobot_memobench.datasets.lerobot_format.layout import read_info
+from lerobot_memobench.datasets.lookup import read_recorded
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import free_bytes, in_words, telling_of_the_disk, write_file
+from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.perception.visual_encoder import GRID, WIDTH, VisualEncoder
+from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
+from lerobot_memobench.policies.checkpoint import undamaged
+from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.encoders import (
+    THUMBNAIL,
+    THUMBNAILS,
+    VISION_SEED,
+    ImageTowerEncoder,
+    VisualTokenEncoder,
+    seed_parameters,
+    thumbnails,
+)
+from lerobot_memobench.policies.memobench_mem.losses import rank_of_world
+from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
+from lerobot_memobench.policies.memobench_mem.objects import VIEWS, ObjectsFromPictures
+from lerobot_memobench.sim.object_layout import SIZE
+
+logger = logging.getLogger(__name__)
+
+FOLDER = "feature_cache"
+TOKENS = "tokens"
+"""Name of the tensor (n, P, D) in each file."""
+MOST_THREADS = 8
+BYTES = 2
+"""Of a bfloat16 number."""
+_SAMPLE = 1 << 16
+"""Bytes of a video that are hashed at its start, middle and end."""
+_VISION_PREFIX = "paligemma_with_expert.paligemma.model."
+Progress = Callable[[int, int], None]
+"""Called as progress(episodes done, episodes in all)."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of a frame.
+
+    Attributes:
+        key: identity of the encoder: weights and input size.
+        tokens_per_frame: P. dim: D.
+        make: from images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16.
+    """
+
+    key: str
+    tokens_per_frame: int
+    dim: int
+    make: Callable[..., Tensor]
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one stored frame: 64 KiB at full size."""
+        return BYTES * self.tokens_per_frame * self.dim
+
+
+class EpisodeFeatures:
+    """Stored features of every ``stride``-th frame of each episode, read through memory maps.
+
+    Args:
+        episodes: (E + 1,) first frame of each episode.
+    """
+
+    def __init__(self, folder: Path, episodes: np.ndarray, stride: int) -> None:
+        self.folder, self._episodes, self._stride = folder, episodes, stride
+        self._opened: dict[int, Tensor] = {}
+
+    def episode(self, number: int) -> Tensor:
+        """Return the features (n, P, D) bfloat16 of an episode's stored frames."""
+        if number not in self._opened:
+            path = episode_file(self.folder, number)
+            with undamaged(path), safe_open(path, framework="pt") as file:
+                self._opened[number] = file.get_tensor(TOKENS)
+        return self._opened[number]
+
+    def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
+        """Return the features (n, P, D) of slots of an episode; slot k is its frame k * stride."""
+        return self.episode(episode)[torch.as_tensor(slots, dtype=torch.long)]
+
+    def of_frames(self, indices: Sequence[int]) -> Tensor:
+        """Return the features (n, P, D) of stored frames by their global indices."""
+        numbers = np.searchsorted(self._episodes, indices, "right") - 1
+        slots = (np.asarray(indices) - self._episodes[numbers]) // self._stride
+        return torch.stack(
+            [self.episode(one)[slot] for one, slot in zip(numbers.tolist(), slots.tolist(), strict=True)]
+        )
+
+    def all_frames(self) -> Tensor:
+        """Return the features of all stored frames, in main memory."""
+        return torch.cat([self.episode(number) for number in range(len(self._episodes) - 1)])
+
+
+def episode_file(folder: Path, number: int) -> Path:
+    """Return the file of an episode's features."""
+    return folder / f"episode_{number:06d}.safetensors"
+
+
+def features_folder(root: Path, prefix: str, features: Features, camera: str, stride: int) -> Path:
+    """Return the folder of a dataset's features: a readable prefix, and a hash of everything they depend on."""
+    parts = (dataset_fingerprint(root, camera), features.key, camera, str(stride))
+    return root / FOLDER / f"{prefix}-{hashlib.blake2b(chr(10).join(parts).encode(), digest_size=8).hexdigest()}"
+
+
+def make_features(
+    root: Path,
+    prefix: str,
+    features: Features,
+    *,
+    camera: str,
+    stride: int = 1,
+    read: FrameReader | None = None,
+    batch_size: int = 64,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    tell: Callable[[str], None] = logger.info,
+) -> EpisodeFeatures:
+    """Compute the features of the episodes that have none yet, and open all.
+
+    Args:
+        camera: image column that is encoded. stride: every how many frames one is stored.
+        read: source of frames; by default the camera's videos.
+        batch_size: frames per pass of the encoder.
+        workers: threads that decode videos ahead of the encoder; by default one per core, up to 8.
+        progress: called with (episodes done, episodes in all).
+        tell: called with the folder and its size before anything is encoded.
+
+    Raises:
+        MemobenchError: ``root`` is no dataset, has no such camera, or the disk has no room.
+    """
+    folder, table = features_folder(root, prefix, features, camera, stride), read_frame_table(root)
+    progress = progress or (lambda _done, _all: None)
+    counts = -(-np.diff(table.episodes) // stride)
+    missing = [number for number in range(table.num_episodes) if not episode_file(folder, number).is_file()]
+    progress(table.num_episodes - len(missing), table.num_episodes)
+    if not missing:
+        return EpisodeFeatures(folder, table.episodes, stride)
+    read = read or frame_reader(root, camera)
+    needed, free = int(counts[missing].sum()) * features.frame_bytes, free_bytes(folder)
+    tell(f"The feature cache {folder} takes {in_words(needed)} more; {in_words(free)} are free there.")
+    if needed > free:
+        raise MemobenchError(
+            f"the feature cache {folder} needs {in_words(needed)} and its disk has {in_words(free)} left; make room, "
+            f"replace {root / FOLDER} by a link to a folder on another disk, or store fewer frames "
+            "(policy.memory_stride=)"
+        )
+    rank, world = rank_of_world()
+    with telling_of_the_disk(folder), ThreadPoolExecutor(workers or min(cores(), MOST_THREADS)) as pool:
+        folder.mkdir(parents=True, exist_ok=True)
+        _keep_from_the_hub(root)
+        for number in [number for number in missing if number % world == rank]:
+            frames = [slot * stride for slot in range(counts[number])]
+            parts = [frames[first : first + batch_size] for first in range(0, len(frames), batch_size)]
+            images = pool.map(functools.partial(read, number), parts)
+            encoded = torch.cat([features.make(part).to("cpu", torch.bfloat16) for part in images])
+            write_file(episode_file(folder, number), save({TOKENS: encoded.contiguous()}))
+            progress(sum(episode_file(folder, one).is_file() for one in range(table.num_episodes)), table.num_episodes)
+    while not all(episode_file(folder, number).is_file() for number in missing):  # other processes encode these
+        time.sleep(1)
+    return EpisodeFeatures(folder, table.episodes, stride)
+
+
+def _keep_from_the_hub(root: Path) -> None:
+    """Exclude caches from uploads of the dataset's folder, by the ``.gitignore`` that the hub obeys."""
+    path, line = root / ".gitignore", f"/{FOLDER}/"
+    there = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    if line not in there:
+        write_file(path, "\n".join([*there, line]) + "\n")
+
+
+def dataset_fingerprint(root: Path, camera: str) -> str:
+    """Hash the frame tables in full, and the camera's videos by their size and three samples each.
+
+    Raises:
+        MemobenchError: ``root`` holds no LeRobotDataset.
+    """
+    if not (root / "meta" / "info.json").is_file():
+        raise MemobenchError(
+            f"{root} is no LeRobotDataset: it has no meta/info.json; give the folder that holds meta, data and videos."
+        )
+    digest = hashlib.blake2b(digest_size=12)
+    for path in sorted((root / "data").rglob("*.parquet")):
+        digest.update(str(path.relative_to(root)).encode())
+        digest.update(path.read_bytes())
+    for path in sorted((root / "videos" / camera).rglob("*.mp4")):
+        size = path.stat().st_size
+        digest.update(f"{path.relative_to(root)}{size}".encode())
+        with path.open("rb") as file:
+            for start in {0, max(0, size // 2), max(0, size - _SAMPLE)}:
+                file.seek(start)
+                digest.update(file.read(_SAMPLE))
+    return digest.hexdigest()
+
+
+def cameras_of(root: Path) -> list[str]:
+    """Return the cameras of a dataset, in its order."""
+    features = read_info(root)["features"].items()
+    return [name for name, feature in features if feature.get("dtype") in ("video", "image")]
+
+
+# -- features of each kind of policy -----------------------------------------------------------------------------------
+
+
+SMALL = Features(THUMBNAILS, 1, THUMBNAIL**2, thumbnails)
+"""Grey thumbnails, for a memory of motion."""
+
+
+def remembered_features(
+    root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncoder, camera: str, **how: Any
+) -> EpisodeFeatures:
+    """Make the features that a memory of a policy with an image tower reads: pooled tokens, or thumbnails.
+
+    Args:
+        camera: the dataset's name of the remembered camera. how: of `make_features`.
+    """
+    prefix, features = f"{config.size}-stride{config.memory_stride}", SMALL
+    if config.remembers_thumbnails:
+        prefix = f"thumbnails-stride{config.memory_stride}"
+    else:
+        features = Features(encoder.key, encoder.tokens_per_frame, encoder.dim, encoder)
+    return make_features(root, prefix, features, camera=camera, stride=config.memory_stride, **how)
+
+
+def picture_tokens(
+    root: Path, config: MemobenchMemConfig, encoder: VisualTokenEncoder, cameras: dict[str, str], **how: Any
+) -> tuple[EpisodeFeatures | None, dict[str, EpisodeFeatures]]:
+    """Make a visual encoder's tokens of the present pictures, and what a memory reads of them.
+
+    Pooled tokens are made of the present ones, so no video is decoded twice.
+
+    Args:
+        cameras: the policy's name of each camera -> the dataset's. how: of `make_features`.
+
+    Returns:
+        The memory's features, None without a memory, and those of present pictures by the policy's camera.
+    """
+    whole = Features(encoder.present_key, GRID**2, WIDTH, encoder.encode)
+    prefix = f"{config.size}-present"
+    present = {name: make_features(root, prefix, whole, camera=of, **how) for name, of in cameras.items()}
+    if config.memory == "none":
+        return None, present
+    stride, remembered = config.memory_stride, encoder.memory_input
+    where: dict[str, Any] = {"camera": cameras[remembered], "stride": stride, **how}
+    if config.remembers_thumbnails:
+        return make_features(root, f"thumbnails-stride{stride}", SMALL, **where), present
+    pooled = Features(encoder.key, encoder.tokens_per_frame, WIDTH, encoder.pooled)
+    read = present[remembered].tokens
+    return make_features(root, f"{config.size}-stride{stride}", pooled, read=read, **where), present
+
+
+def detections(
+    root: Path, detect: ObjectsFromPictures, cameras: dict[str, str], state: str, **how: Any
+) -> EpisodeFeatures:
+    """Make a detector's object slots at every frame.
+
+    A number is stored as two bfloat16 ones, its rounded value and the rest: one alone knows places to 4 mm.
+
+    Args:
+        cameras: the policy's name of each camera -> the dataset's. state: the dataset's name of the state.
+        how: of `make_features`.
+    """
+    readers = {name: frame_reader(root, of) for name, of in cameras.items()}
+    recorded = functools.cache(lambda: read_recorded(root, [state]))  # complete features need none
+
+    def read(episode: int, numbers: list[int]) -> tuple[dict[str, Tensor], Tensor]:
+        columns, table = recorded()
+        states = columns[state][[int(table.episodes[episode]) + number for number in numbers]]
+        return {name: one(episode, numbers) for name, one in readers.items()}, states
+
+    def make(observed: tuple[dict[str, Tensor], Tensor]) -> Tensor:
+        slots = detect(*observed)
+        rounded = slots.to(torch.bfloat16)
+        return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
+
+    features = Features(detect.key, 2, SIZE, make)
+    return make_features(root, "objects", features, camera=next(iter(cameras.values())), read=read, **how)
+
+
+# -- encoders without the rest of a policy -----------------------------------------------------------------------------
+
+
+def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = None) -> ImageTowerEncoder:
+    """Load the frozen image tower of ``config``'s size alone, without the rest of the model.
+
+    Args:
+        weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None takes ``config.base_weights``, or
+            the fixed-seed tower when there are none.
+
+    Raises:
+        MemobenchError: the weights cannot be read or do not fit, or there is no tower.
+    """
+    if config.uses_objects:
+        raise MemobenchError(
+            "perception=objects needs no feature cache where the environment gives the objects: training reads the "
+            "dataset's columns; leave this command out, or name a detector."
+        )
+    with torch.device("meta"):
+        model = SizedPaliGemmaWithExpert(config).paligemma.model
+    towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
+    tower, projector = (part.to(torch.float32).eval().requires_grad_(False) for part in towers)
+    for part, name in ((tower, "vision_tower."), (projector, "multi_modal_projector.")):
+        source = weights or config.base_weights
+        if source is None:
+            seed_parameters(part, VISION_SEED)
+        else:
+            load_exactly(part, read_weights(source, _VISION_PREFIX + name), source, optional=set())
+        part.to(config.device)
+    return ImageTowerEncoder(tower, projector, config.image_size, config.memory_camera or "")
+
+
+def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = None) -> VisualTokenEncoder:
+    """Load ``config``'s visual encoder alone; arguments and errors as of `load_image_tower`."""
+    source = weights or config.base_weights
+    if source is None:
+        assert config.visual_encoder is not None  # asked of a configuration that has one
+        tower = load_visual_encoder(config.visual_encoder)
+    else:
+        tower = VisualEncoder(folded=True).eval()
+        load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
+    width = config.dimensions.vlm.width
+    return VisualTokenEncoder(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)
+
+
+def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path | None = None, **how: Any) -> Path:
+    """Make (or finish) the features that ``config`` reads of the dataset at ``root``.
+
+    Args:
+        config: a policy configuration, for example ``MemobenchMemConfig(size="tiny", memory_stride=1)``.
+        weights: model checkpoint whose image tower or visual encoder is used, see `load_image_tower`.
+        how: of `make_features`.
+
+    Returns:
+        Their folder, ``<root>/feature_cache/<prefix>-<hash>``; with a visual encoder that of the memory.
+
+    Raises:
+        MemobenchError: the dataset lacks a camera, the disk has no room, or the policy needs no cache.
+    """
+    cameras = cameras_of(root)
+    config.memory_camera = config.memory_camera or next(iter(cameras), None)
+    if config.detector is not None:
+        detect = ObjectsFromPictures(load_detector(config.detector))
+        return detections(root, detect, {name: name for name in VIEWS}, OBS_STATE, **how).folder
+    camera = config.memory_camera or ""
+    if config.uses_visual_encoder:
+        encoder = load_token_encoder(config, weights)
+        memory, present = picture_tokens(root, config, encoder, {name: name for name in cameras or [camera]}, **how)
+        return (memory or next(iter(present.values()))).folder
+    return remembered_features(root, config, load_image_tower(config, weights), camera, **how).folder

@@ -1,0 +1,321 @@
+"""Train ``policy=memobench_mem``: datasets, policy, processors, updates, checkpoints.
+
+The checkpoints are LeRobot's, so that LeRobot and `lerobot eval` load them; ``training_weights.safetensors`` beside the
+model holds the trained weights, of which the model is the average. A training that is resumed continues to the bit.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from accelerate.utils import DistributedDataParallelKwargs, DistributedType
+from lerobot.common.train_utils import (
+    get_step_checkpoint_dir,
+    get_step_identifier,
+    load_training_batch_size,
+    load_training_num_processes,
+    load_training_state,
+    push_checkpoint_to_hub,
+    save_checkpoint,
+    should_save_checkpoint,
+    update_last_checkpoint,
+)
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
+from lerobot.optim.factory import make_optimizer_and_scheduler
+from lerobot.scripts.lerobot_eval import eval_policy_all
+from lerobot.utils.collate import lerobot_collate_fn
+from lerobot.utils.random_utils import set_seed
+from lerobot.utils.utils import cycle, init_logging
+from torch.utils.data import DataLoader, Subset
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.training.average import WeightAverage, begin_average
+from lerobot_memobench.training.checks import check_environment
+from lerobot_memobench.training.data import Training, open_datasets, open_training
+from lerobot_memobench.training.log import TrainingLog
+from lerobot_memobench.training.sampler import FrameSampler, frame_sampler, task_weights
+from lerobot_memobench.training.speed import keep_freed_memory, quick_products
+
+logger = logging.getLogger(__name__)
+
+DISTRIBUTED = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
+
+
+def train(config: TrainPipelineConfig) -> None:
+    """Train a memory policy until ``config.steps``, from the beginning or from ``config.checkpoint_path``.
+
+    Args:
+        config: complete, as of `configuration.read_training`.
+    """
+    accelerator = begin(config)
+    with accelerator.main_process_first():  # the others find the dataset downloaded
+        datasets = open_datasets(config)
+    meta = datasets[0].meta
+    check_environment(config, meta, meta.features)
+    training = open_training(config, datasets)
+    policy_config: Any = config.policy
+    average = begin_average(training.policy)
+    optimizer, scheduler = make_optimizer_and_scheduler(config, training.policy)
+    sampler, step = make_sampler(config, training), 0
+    if config.resume:
+        step, optimizer, scheduler = load_training_state(config.checkpoint_path, optimizer, scheduler)
+        processes = load_training_num_processes(config.checkpoint_path) or accelerator.num_processes
+        sampler.go_on(step, load_training_batch_size(config.checkpoint_path) or config.batch_size, processes)
+
+    loader = make_loader(config, training, training.samples(), sampler=sampler)
+    held_out_loader = None if training.held_out is None else make_held_out_loader(config, training)
+    model, optimizer, loader, scheduler, held_out_loader = accelerator.prepare(
+        training.policy, optimizer, loader, scheduler, held_out_loader
+    )
+    run = Run(config, accelerator, training, model, average, optimizer, scheduler)
+    log, batches = TrainingLog(config, training.dataset, accelerator, step), cycle(loader)
+    model.train()
+    while step < config.steps:
+        begun = time.perf_counter()
+        batch = run.preprocessed(next(batches))
+        log.numbers.dataloading_s = time.perf_counter() - begun
+        log.note(run.update(batch))
+        step += 1
+        if config.log_freq > 0 and step % config.log_freq == 0:
+            log.write(step)
+        if held_out_loader is not None and config.eval_steps > 0 and step % config.eval_steps == 0:
+            log.write_held_out(step, run.held_out_loss(held_out_loader))
+        if config.save_checkpoint and should_save_checkpoint(step, config.save_freq, config.steps):
+            if accelerator.is_main_process:
+                log.keep_model(run.save(step))
+            accelerator.wait_for_everyone()
+        if config.env is not None and config.env_eval_freq > 0 and step % config.env_eval_freq == 0:
+            if accelerator.is_main_process:
+                log.write_evaluation(step, run.evaluate(step))
+            accelerator.wait_for_everyone()
+    log.close()
+    if accelerator.is_main_process and policy_config.push_to_hub:
+        run.push()
+    accelerator.wait_for_everyone()
+    accelerator.end_training()
+
+
+def begin(config: TrainPipelineConfig) -> Accelerator:
+    """Return accelerate's handle of this process, after seeding and settings as in LeRobot's trainer."""
+    policy: Any = config.policy
+    accelerator = Accelerator(
+        step_scheduler_with_optimizer=False,
+        mixed_precision={"bfloat16": "bf16", "float16": "fp16", "float32": "no"}.get(policy.dtype),
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
+        cpu=policy.device == "cpu",
+    )
+    if accelerator.distributed_type not in DISTRIBUTED:
+        raise MemobenchError(
+            f"accelerate was asked for {accelerator.distributed_type}, and each process of this training holds the "
+            "whole policy; launch it with --multi_gpu"
+        )
+    init_logging(accelerator=accelerator)
+    if config.seed is not None:
+        set_seed(config.seed, accelerator=accelerator)
+    torch.backends.cudnn.deterministic = config.cudnn_deterministic
+    torch.backends.cudnn.benchmark = not config.cudnn_deterministic
+    torch.backends.cuda.matmul.allow_tf32 = True
+    if accelerator.device.type == "cpu":
+        keep_freed_memory()
+    return accelerator
+
+
+@dataclass
+class Run:
+    """What a training changes and saves.
+
+    Attributes:
+        model: the policy as accelerate wraps it.
+        average: of its weights; None if there is none.
+    """
+
+    config: TrainPipelineConfig
+    accelerator: Accelerator
+    training: Training
+    model: Any
+    average: WeightAverage | None
+    optimizer: Any
+    scheduler: Any
+
+    def preprocessed(self, batch: dict[str, Any]) -> dict[str, Any]:
+        """Return the model's inputs of a batch of samples."""
+        pictures = [
+            key for key in self.training.dataset.meta.camera_keys if key in batch and batch[key].dtype == torch.uint8
+        ]
+        batch |= {key: batch[key].to(torch.float32) / 255.0 for key in pictures}
+        found: dict[str, Any] = self.training.processors[0](batch)
+        return found
+
+    def update(self, batch: dict[str, Any]) -> dict[str, Any]:
+        """Train on a batch; return the numbers to log."""
+        begun = time.perf_counter()
+        on_cpu = self.accelerator.device.type == "cpu" and not self.training.policy.config.uses_visual_encoder
+        with quick_products() if on_cpu else nullcontext():
+            with self.accelerator.autocast():
+                loss, logged = self.model(batch)
+            self.accelerator.backward(loss)
+        assert self.config.optimizer is not None
+        most = self.config.optimizer.grad_clip_norm
+        norm = self.accelerator.clip_grad_norm_(self.model.parameters(), most if most > 0 else float("inf"))
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        if self.scheduler is not None:
+            self.scheduler.step()
+        if self.average is not None:
+            self.average.update()
+        return {
+            **logged,
+            "loss": loss.item(),
+            "grad_norm": norm.item(),
+            "lr": self.optimizer.param_groups[0]["lr"],
+            "update_s": time.perf_counter() - begun,
+        }
+
+    @contextmanager
+    def _averaged(self, *, acting: bool = False) -> Iterator[None]:
+        """Let the model hold the average: in the precision that a loaded checkpoint acts in, or as it is saved."""
+        narrowed = self.training.policy.precision.narrowed() if acting else None
+        with nullcontext() if self.average is None else self.average.applied(narrowed):
+            yield
+
+    def held_out_loss(self, loader: Any) -> float:
+        """Return the mean loss of held-out samples over all processes."""
+        self.model.eval()
+        found: list[float] = []
+        with self._averaged(acting=True), torch.no_grad(), self.accelerator.autocast():
+            for batch in loader:
+                loss, _ = self.model(self.preprocessed(batch))
+                found.append(loss.item())
+        self.model.train()
+        mean = torch.tensor(sum(found) / max(len(found), 1), device=self.accelerator.device)
+        return float(self.accelerator.reduce(mean, reduction="mean").item())
+
+    def save(self, step: int) -> Path:
+        """Save a checkpoint in LeRobot's layout; return its folder."""
+        config = self.config
+        assert config.output_dir is not None
+        assert config.policy is not None
+        logger.info("Checkpoint policy after step %d", step)
+        folder: Path = get_step_checkpoint_dir(config.output_dir, config.steps, step)
+        if self.average is not None:  # before LeRobot's files, so that a checkpoint that looks whole has it
+            self.average.save(folder / "pretrained_model")
+        with self._averaged():
+            save_checkpoint(
+                folder,
+                step,
+                config,
+                self.accelerator.unwrap_model(self.model),
+                self.optimizer,
+                self.scheduler,
+                *self.training.processors,
+                num_processes=self.accelerator.num_processes,
+                batch_size=config.batch_size,
+            )
+        update_last_checkpoint(folder)
+        if config.save_checkpoint_to_hub:
+            push_checkpoint_to_hub(folder, config.policy.repo_id, private=config.policy.private)
+        return folder
+
+    def evaluate(self, step: int) -> Mapping[str, Any]:
+        """Return the rates of rollouts in ``config.env``, as LeRobot's trainer does."""
+        config = self.config
+        assert config.output_dir is not None
+        assert config.env is not None
+        environments = make_env(config.env, n_envs=config.eval.batch_size, use_async_envs=config.eval.use_async_envs)
+        before, after = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
+        try:
+            with self._averaged(acting=True), torch.no_grad(), self.accelerator.autocast():
+                found: Mapping[str, Any] = eval_policy_all(
+                    envs=environments,
+                    policy=self.accelerator.unwrap_model(self.model),
+                    env_preprocessor=before,
+                    env_postprocessor=after,
+                    preprocessor=self.training.processors[0],
+                    postprocessor=self.training.processors[1],
+                    n_episodes=config.eval.n_episodes,
+                    videos_dir=config.output_dir / "eval" / f"videos_step_{get_step_identifier(step, config.steps)}",
+                    max_episodes_rendered=4,
+                    start_seed=config.seed,
+                    max_parallel_tasks=config.env.max_parallel_tasks,
+                )
+        finally:
+            close_envs(environments)
+        self.model.train()
+        return found
+
+    def push(self) -> None:
+        """Upload the model and its processors to the hub."""
+        model = self.accelerator.unwrap_model(self.model)
+        adapters = {"peft_model": model} if self.training.policy.config.use_peft else {}
+        with self._averaged():
+            model.push_model_to_hub(self.config, dataset_meta=self.training.dataset.meta, **adapters)
+        for processor in self.training.processors:
+            processor.push_to_hub(self.training.policy.config.repo_id)
+
+
+# -- batches -----------------------------------------------------------------------------------------------------------
+
+
+def make_sampler(config: TrainPipelineConfig, training: Training) -> FrameSampler:
+    """Return the sampler of the frames that are trained on."""
+    policy, lookup, dataset = training.policy.config, training.lookup, training.dataset
+    weights = policy.task_weights
+    tasks = None if weights is None else task_weights(dataset.meta, lookup.episodes, lookup.phase, weights)
+    return frame_sampler(
+        lookup.episodes,
+        lookup.phase,
+        dataset.episodes,
+        together=policy.frames_per_episode,
+        tasks=tasks,
+        seed=0 if config.seed is None else config.seed,
+    )
+
+
+def make_loader(
+    config: TrainPipelineConfig, training: Training, samples: Any, sampler: FrameSampler | None = None
+) -> DataLoader[Any]:
+    """Return batches of samples: as a sampler draws them, or each once and in order."""
+    workers = 0 if training.lookup.columns else config.num_workers  # samples in main memory need no processes
+    decoding: dict[str, Any] = {
+        "prefetch_factor": config.prefetch_factor,
+        "persistent_workers": config.persistent_workers,
+        "multiprocessing_context": config.dataloader_multiprocessing_context,
+    }
+    return DataLoader(
+        samples,
+        batch_size=config.batch_size,
+        sampler=sampler,
+        num_workers=workers,
+        pin_memory=training.policy.config.device != "cpu",
+        collate_fn=lerobot_collate_fn if training.dataset.meta.has_language_columns else None,
+        # Of its own: an iteration that begins draws from it, and a resumed training begins one more.
+        generator=torch.Generator(),
+        **(decoding if workers else {}),
+    )
+
+
+def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> DataLoader[Any]:
+    """Return batches of the execution frames of held-out episodes.
+
+    There are at most ``max_eval_samples``, the first of each task.
+    """
+    dataset, lookup = training.held_out, training.lookup
+    assert dataset is not None
+    frames = frame_sampler(lookup.episodes, lookup.phase, dataset.episodes).frames.tolist()
+    if config.max_eval_samples > 0:
+        tasks, rows = dataset.hf_dataset.data.column("task_index").to_pylist(), dataset.absolute_to_relative_idx
+        of_task: dict[int, list[int]] = {}
+        for frame in frames:
+            of_task.setdefault(tasks[frame if rows is None else rows[frame]], []).append(frame)
+        most = max(1, config.max_eval_samples // len(of_task))
+        frames = [frame for task in sorted(of_task) for frame in of_task[task][:most]]
+    return make_loader(config, training, Subset(training.samples(dataset), frames))

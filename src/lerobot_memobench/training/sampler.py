@@ -1,0 +1,187 @@
+"""Draw the frames of a training: execution frames only, several of an episode in a row, tasks by their weights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import PROMPTED
+from lerobot_memobench.protocol import PROMPT
+
+
+@dataclass
+class FrameSampler:
+    """Yield global indices of frames, in an order that depends on the seed and the epoch alone.
+
+    Every process draws the same order, of which accelerate gives each its share; a training that is resumed draws the
+    rest of the epoch. With one frame of an episode at a time and no weights it is the order of LeRobot's sampler.
+
+    Args:
+        starts: (E,) first execution frame of each episode that is drawn. ends: (E,) the frame after its last.
+        together: frames of an episode that follow one another.
+        tasks: (E,) number of each episode's task, with ``weights``; None: each frame is drawn once per epoch.
+        weights: (T,) how often each task is drawn. An epoch has as many frames as without weights.
+        epoch, offset: where the next iteration begins.
+    """
+
+    starts: np.ndarray
+    ends: np.ndarray
+    together: int = 1
+    tasks: np.ndarray | None = None
+    weights: np.ndarray | None = None
+    seed: int = 0
+    epoch: int = 0
+    offset: int = 0
+
+    def __post_init__(self) -> None:
+        drawn = self.starts < self.ends
+        if not drawn.any():
+            raise MemobenchError(
+                "no episode has an execution frame to train on; name a dataset of `memobench generate`"
+            )
+        self.starts, self.ends = self.starts[drawn], self.ends[drawn]
+        self.tasks = None if self.tasks is None else self.tasks[drawn]
+        self.frames = np.concatenate(list(map(np.arange, self.starts, self.ends)))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[int]:
+        order = self.order(self.epoch)[self.offset :]
+        self.epoch, self.offset = self.epoch + 1, 0
+        return iter(self.frames[order.numpy()].tolist())
+
+    def order(self, epoch: int) -> Tensor:
+        """Return the places in ``frames`` that an epoch draws, in their order."""
+        seed = np.random.SeedSequence([self.seed, epoch]).generate_state(1, dtype=np.uint64)[0]
+        generator = torch.Generator().manual_seed(int(seed))
+        ends = np.cumsum(self.ends - self.starts)
+        if self.tasks is not None and self.weights is not None:
+            return weighted_order(ends, self.tasks, self.weights, self.together, generator)
+        if self.together > 1:
+            return grouped_order(ends, self.together, generator)
+        return torch.randperm(len(self), generator=generator)
+
+    def go_on(self, step: int, batch_size: int, processes: int) -> None:
+        """Continue after so many updates, of a batch size per process."""
+        per_epoch = math.ceil(math.ceil(len(self) / batch_size) / processes)  # accelerate fills up the last batches
+        self.epoch, batches = divmod(step, per_epoch)
+        self.offset = min(batches * batch_size * processes, len(self))
+
+
+def grouped_order(ends: np.ndarray, together: int, generator: torch.Generator) -> Tensor:
+    """Return all places 0 ... N - 1 in a random order in which ``together`` of an episode follow one another.
+
+    Args:
+        ends: (E,) end of each episode's places, counted from the first's beginning; the last is N.
+    """
+    lengths = torch.from_numpy(np.diff(ends, prepend=0))
+    episode = torch.repeat_interleave(lengths)
+    mixed = torch.randperm(len(episode), generator=generator)
+    mixed = mixed[episode[mixed].argsort(stable=True)]  # within each episode
+    rank = torch.arange(len(mixed)) - (lengths.cumsum(0) - lengths)[episode]
+    groups = (lengths + together - 1) // together
+    group = (groups.cumsum(0) - groups)[episode] + rank // together
+    return mixed[torch.randperm(int(groups.sum()), generator=generator)[group].argsort(stable=True)]
+
+
+def weighted_order(
+    ends: np.ndarray, tasks: np.ndarray, weights: np.ndarray, together: int, generator: torch.Generator
+) -> Tensor:
+    """Return N random places, ``together`` of an episode in a row: tasks by their weights, a task's episodes equally.
+
+    Args:
+        ends: (E,) as for `grouped_order`. tasks: (E,) number of each episode's task. weights: (T,) of the tasks.
+    """
+    first, count = torch.from_numpy(np.r_[0, ends[:-1]]), int(ends[-1])
+    order = torch.from_numpy(np.argsort(tasks, kind="stable"))
+    present, episodes = np.unique(tasks, return_counts=True)
+    of_task = torch.from_numpy(episodes)
+    groups = -(-count // together)
+    task = torch.multinomial(torch.from_numpy(weights[present]), groups, replacement=True, generator=generator)
+    rank = (torch.rand(groups, generator=generator) * of_task[task]).long()
+    episode = order[(of_task.cumsum(0) - of_task)[task] + rank].repeat_interleave(together)
+    lengths = torch.from_numpy(ends) - first
+    offset = (torch.rand(len(episode), generator=generator, dtype=torch.float64) * lengths[episode]).long()
+    return (first[episode] + offset)[:count]
+
+
+def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Return the first execution frame of each episode (E,); its end for an episode without one.
+
+    Args:
+        episodes: (E + 1,) first frame of each episode, and the number of frames N. phase: (N,) 0 in the prompt.
+    """
+    acting = np.append(np.flatnonzero(phase != PROMPT), episodes[-1])
+    found: np.ndarray = np.minimum(acting[acting.searchsorted(episodes[:-1])], episodes[1:])
+    return found
+
+
+def frame_sampler(
+    episodes: np.ndarray,
+    phase: np.ndarray,
+    used: Collection[int] | None,
+    *,
+    together: int = 1,
+    tasks: tuple[np.ndarray, np.ndarray] | None = None,
+    seed: int = 0,
+) -> FrameSampler:
+    """Return the sampler of a dataset's execution frames.
+
+    Args:
+        episodes: (E + 1,) first frame of each episode, and N. phase: (N,) 0 in the prompt.
+        used: the episodes that are drawn; None: all.
+        tasks: of `task_weights`.
+    """
+    chosen = np.arange(len(episodes) - 1) if used is None else np.array(sorted(used), dtype=np.int64)
+    starts = execution_starts(episodes, phase)[chosen]
+    numbers, weights = (None, None) if tasks is None else (tasks[0][chosen], tasks[1])
+    return FrameSampler(starts, episodes[1:][chosen], together, numbers, weights, seed)
+
+
+def task_weights(
+    meta: Any, episodes: np.ndarray, phase: np.ndarray, weights: Mapping[str, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number (E,) of each episode's task, and the weight (T,) of each task.
+
+    A task is that of our records, which may have several instructions ("twice", "three times"); of another dataset it
+    is the episode's instruction.
+
+    Args:
+        meta: the dataset's metadata. episodes: (E + 1,) first frame of each episode, and N.
+        phase: (N,) 0 in the prompt.
+        weights: by task name, memory type or ``prompted``; the first of them that a task has counts, and else 1.
+
+    Raises:
+        MemobenchError: a name is none of the dataset's, or no task is left to draw.
+    """
+    records = [place.record for place in list_episodes(Path(meta.root))]
+    said = (" / ".join(tasks) for tasks in meta.episodes["tasks"])
+    names = [words if record is None else record.task_name for record, words in zip(records, said, strict=True)]
+    tasks, numbers = np.unique(names, return_inverse=True)
+    types = {name: record.memory_type for name, record in zip(names, records, strict=True) if record is not None}
+    prompted = np.bincount(np.repeat(numbers, np.diff(episodes)), phase == PROMPT) > 0
+    keys = [
+        (str(name), types.get(str(name), ""), PROMPTED * bool(begins))
+        for name, begins in zip(tasks, prompted, strict=True)
+    ]
+    known = sorted({key for row in keys for key in row if key} | {PROMPTED})
+    for name in weights:
+        if name not in known:
+            raise MemobenchError(
+                f"policy.task_weights names '{name}', which is no task, memory type or '{PROMPTED}' of the dataset "
+                f"{meta.root}; {nearest(name, known)}"
+            )
+    found = np.array([next((weights[key] for key in row if key in weights), 1.0) for row in keys])
+    if not found.any():
+        raise MemobenchError(f"policy.task_weights={dict(weights)} leaves no task of {meta.root} to draw.")
+    return numbers, found

@@ -1,0 +1,296 @@
+"""Write a view of a dataset for LeRobot's own trainer: without prompt frames, and with the columns of chosen inputs.
+
+LeRobot trains on all frames of all episodes, also on those of demonstration prompts, in which actions have no effect.
+It takes every column that begins with ``observation`` for an input: pictures, object state, phase and step. A view is a
+LeRobotDataset v3.0 that holds the wanted frames and columns; its videos are links to the dataset's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from lerobot.configs import FeatureType
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.utils.feature_utils import dataset_to_policy_features
+
+from lerobot_memobench.datasets.frames import read_frame_table
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    INFO_FILE,
+    LANGUAGE,
+    PRIVILEGED,
+    STATS_FILE,
+    TASKS_FILE,
+    read_info,
+    undamaged,
+    without_pattern,
+)
+from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
+from lerobot_memobench.datasets.statistics import recorded
+from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import cache_folder, telling_of_the_disk, write_file
+from lerobot_memobench.protocol import CLOCK, EXECUTION
+from lerobot_memobench.run.arguments import LerobotArguments
+from lerobot_memobench.training.checks import check_environment
+from lerobot_memobench.training.configuration import read_config
+from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
+
+OURS = {*CLOCK, "simple_subgoal"}
+"""Columns of a dataset of the benchmark; a phase alone may have another meaning."""
+EPISODES_FOLDER = Path("meta") / "episodes"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a view keeps of a dataset.
+
+    Attributes:
+        prompts: whether it keeps the frames of demonstration prompts, and with them the clock.
+        obs_type: `envs.observations.OBS_TYPES`; None: all observations.
+    """
+
+    prompts: bool = False
+    obs_type: str | None = None
+
+    def columns(self, features: Mapping[str, Any]) -> dict[str, str]:
+        """Return column -> its name in the view, for the columns that are kept.
+
+        Raises:
+            MemobenchError: the dataset has no such observations.
+        """
+        cameras = cameras_of(features)
+        objects = [name for name in (PRIVILEGED, OBJECTS_COLUMN) if name in features][:1]
+        dropped = set() if self.prompts else {*CLOCK}
+        if (self.obs_type in (OBJECTS, BOTH) and not objects) or (self.obs_type in (PIXELS, BOTH) and not cameras):
+            found = ", ".join(cameras + objects) or "neither pictures nor objects"
+            raise MemobenchError(
+                f"obs_type={self.obs_type} was asked for, and the dataset has {found}; "
+                "choose another obs_type, or generate a dataset that has it"
+            )
+        if self.obs_type == OBJECTS:
+            dropped |= {*cameras}
+        if self.obs_type == PIXELS:
+            dropped |= {OBJECTS_COLUMN}
+        renamed = {PRIVILEGED: OBJECTS_COLUMN} if self.obs_type in (OBJECTS, BOTH) else {}
+        return {name: renamed.get(name, name) for name in features if name not in dropped}
+
+
+def cameras_of(features: Mapping[str, Any]) -> list[str]:
+    """Return the cameras among a dataset's features."""
+    return [name for name, one in features.items() if one["dtype"] in ("video", "image")]
+
+
+# -- for a training ----------------------------------------------------------------------------------------------------
+
+
+def viewed(
+    arguments: LerobotArguments, prompt_frames: bool | None, obs_type: str | None, tell: Callable[[str], None]
+) -> LerobotArguments:
+    """Return the arguments of a training by LeRobot's trainer, on a view of its dataset if it needs one.
+
+    Args:
+        prompt_frames: whether prompt frames are trained on; None: if the policy reads prompts.
+        obs_type: kind of observation; None: pictures if the dataset has them, else objects.
+        tell: called with the view's folder.
+
+    Raises:
+        MemobenchError: the dataset lacks the observations, or is streamed from the hub.
+    """
+    config = read_config(arguments.for_parser)
+    given, policy = config.dataset, config.policy
+    if policy is None:
+        return arguments
+    if given.root is not None:
+        given = replace(given, root=str(without_pattern(Path(given.root))))
+    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
+    check_dataset_version(meta)
+    check_episodes(given.episodes, meta)
+    choice = choice_for(policy, meta.features, prompt_frames, obs_type)
+    kept = choice.columns(meta.features)
+    check_environment(config, meta, {new: meta.features[name] for name, new in kept.items()})
+    if given.streaming and not (Path(meta.root) / "data").is_dir():
+        if needs_view(meta.features, choice):
+            raise MemobenchError(
+                f"dataset.streaming=true reads {given.repo_id} from the hub with its prompts and all of its columns; "
+                "leave dataset.streaming out"
+            )
+        return arguments
+    complete_statistics(policy, meta, given)
+    if policy.input_features or chooses_inputs(policy) or not choice.prompts:
+        told = arguments
+    else:  # the clock is kept, and is no input
+        inputs = {
+            name: {"type": one.type.name, "shape": list(one.shape)}
+            for name, one in dataset_to_policy_features({new: meta.features[old] for old, new in kept.items()}).items()
+            if one.type is not FeatureType.ACTION and name not in CLOCK
+        }
+        told = arguments.default("policy.input_features", json.dumps(inputs))
+    if not needs_view(meta.features, choice):
+        return told
+    root = Path(meta.root)
+    if not (root / "data").is_dir():
+        root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
+    folder = cache_folder() / "views" / f"{root.resolve().name}-{view_hash(root, choice)}"
+    if not (folder / INFO_FILE).is_file():
+        write_view(root, folder, choice)
+    tell(f"LeRobot's trainer reads {folder}: {described(choice)}")
+    return told.changed("dataset.root", folder).changed("dataset.repo_id", given.repo_id)
+
+
+def choice_for(policy: Any, features: Mapping[str, Any], prompt_frames: bool | None, obs_type: str | None) -> Choice:
+    """Return what a policy is trained on: as asked now, or as its checkpoint was."""
+    prompts = reads_prompt(policy) if prompt_frames is None else prompt_frames
+    begun = getattr(policy, "input_features", None) or {}
+    if chooses_inputs(policy):
+        return Choice(prompts, None)
+    if begun:
+        pictures = any(one.type is FeatureType.VISUAL for one in begun.values())
+        objects = OBJECTS_COLUMN in begun
+        seen = {(True, True): BOTH, (True, False): PIXELS, (False, True): OBJECTS}.get((pictures, objects))
+        return Choice(prompts, seen)
+    if obs_type is None:
+        objects = PRIVILEGED in features or OBJECTS_COLUMN in features
+        obs_type = PIXELS if cameras_of(features) else OBJECTS if objects else None
+    return Choice(prompts, obs_type)
+
+
+def needs_view(features: Mapping[str, Any], choice: Choice) -> bool:
+    """Return whether a dataset differs from its view."""
+    kept = choice.columns(features)
+    return (set(features) >= OURS and not choice.prompts) or kept != {name: name for name in features}
+
+
+def described(choice: Choice) -> str:
+    """Return a view's content in words."""
+    frames = "all frames" if choice.prompts else "without the frames of prompts"
+    return f"{frames}, {choice.obs_type or 'all observations'}"
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def view_hash(root: Path, choice: Choice) -> str:
+    """Return a hash of a dataset's place, tables and metadata, and of the choice."""
+    digest = hashlib.blake2b(f"{root.resolve()} {choice}".encode(), digest_size=8)
+    for path in (*sorted((root / "meta").rglob("*.*")), *sorted((root / "data").rglob("*.parquet"))):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def write_view(root: Path, out: Path, choice: Choice) -> None:
+    """Write a view of the dataset in ``root``.
+
+    Raises:
+        MemobenchError: ``out`` exists, the dataset lacks the observations or is damaged, or the disk has no room.
+    """
+    if out.exists():
+        raise MemobenchError(f"{out} exists already; name another folder, or delete this one")
+    info, table = read_info(root), read_frame_table(root)
+    kept = choice.columns(info["features"])
+    wanted = np.ones(len(table.phase), dtype=bool)
+    if set(info["features"]) >= OURS and not choice.prompts:
+        wanted = table.phase == EXECUTION
+    ends = np.concatenate([[0], np.cumsum(wanted)])[table.episodes]
+    left_out = np.diff(table.episodes) - np.diff(ends)
+    build = out.with_name(f".{out.name}.{os.getpid()}")
+    with telling_of_the_disk(out):
+        shutil.rmtree(build, ignore_errors=True)
+        for path in sorted((root / "data").rglob("*.parquet")):
+            with undamaged(path):
+                rows = pq.read_table(path)
+            _write_table(_part_of(rows, kept, wanted, left_out, info["fps"]), build / path.relative_to(root))
+        for path in sorted((root / EPISODES_FOLDER).rglob("*.parquet")):
+            with undamaged(path):
+                rows = pq.read_table(path)
+            _write_table(_episodes_of(rows, ends, left_out / info["fps"]), build / path.relative_to(root))
+        features = {new: info["features"][name] for name, new in kept.items()}
+        info |= {"features": features, "total_frames": int(ends[-1])}
+        write_file(build / INFO_FILE, json.dumps(info, indent=4))
+        stats = recorded(root)
+        write_file(build / STATS_FILE, json.dumps({kept[name]: one for name, one in stats.items() if name in kept}))
+        shutil.copyfile(root / TASKS_FILE, build / TASKS_FILE)
+        for camera in cameras_of(features):
+            for path in sorted((root / "videos" / camera).rglob("*.mp4")):
+                _link(path.resolve(), build / path.relative_to(root))
+        build.rename(out)
+
+
+def _part_of(rows: pa.Table, kept: Mapping[str, str], wanted: np.ndarray, left_out: np.ndarray, fps: float) -> pa.Table:
+    """Return the wanted rows and columns of a data file, renumbered.
+
+    Args:
+        wanted: (N,) which frames of the dataset. left_out: (E,) frames before the first that is kept.
+    """
+    index = rows.column("index").to_numpy()
+    rows = rows.filter(pa.array(wanted[index])).replace_schema_metadata(None)
+    before = left_out[rows.column("episode_index").to_numpy()]
+    numbers = {
+        "index": (np.cumsum(wanted) - 1)[index[wanted[index]]],
+        "frame_index": rows.column("frame_index").to_numpy() - before,
+    }
+    numbers["timestamp"] = (numbers["frame_index"] / fps).astype(np.float32)
+    for name, values in numbers.items():
+        place = rows.column_names.index(name)
+        rows = rows.set_column(place, name, pa.array(values, rows.schema.field(name).type))
+    if LANGUAGE in rows.column_names:
+        place = rows.column_names.index(LANGUAGE)
+        rows = rows.set_column(place, LANGUAGE, _earlier(rows.column(LANGUAGE).combine_chunks(), before / fps))
+    there = [name for name in rows.column_names if name in kept]
+    return rows.select(there).rename_columns([kept[name] for name in there])
+
+
+def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
+    """Return LeRobot's language rows (N,) with earlier timestamps, by so many seconds (N,)."""
+    lengths, rows = pc.list_value_length(texts).fill_null(0).to_numpy(zero_copy_only=False), texts.flatten()
+    columns = {field.name: rows.field(place) for place, field in enumerate(rows.type)}
+    kind = columns["timestamp"].type
+    columns["timestamp"] = pc.subtract(columns["timestamp"], pa.array(np.repeat(seconds, lengths), kind))
+    offsets = pa.array(np.concatenate([[0], np.cumsum(lengths)]), pa.int32())
+    return pa.ListArray.from_arrays(offsets, pa.StructArray.from_arrays(list(columns.values()), fields=list(rows.type)))
+
+
+def _episodes_of(rows: pa.Table, ends: np.ndarray, seconds: np.ndarray) -> pa.Table:
+    """Return the episodes' table with the bounds of the frames that are kept, and the videos' beginnings moved.
+
+    Args:
+        ends: (E + 1,) first frame of each episode in the view, and the number of frames. seconds: (E,) left out.
+    """
+    numbers = rows.column("episode_index").to_numpy()
+    changed = {
+        "dataset_from_index": ends[numbers],
+        "dataset_to_index": ends[numbers + 1],
+        "length": ends[numbers + 1] - ends[numbers],
+    }
+    for name in rows.column_names:
+        if name.endswith("/from_timestamp"):
+            changed[name] = rows.column(name).to_numpy() + seconds[numbers]
+    for name, values in changed.items():
+        rows = rows.set_column(rows.column_names.index(name), name, pa.array(values, rows.schema.field(name).type))
+    kept = [name for name in rows.column_names if not name.startswith("stats/")]
+    return rows.select(kept).replace_schema_metadata(None)
+
+
+def _write_table(table: pa.Table, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table, path)
+
+
+def _link(path: Path, place: Path) -> None:
+    """Link to a file; copy it where the system allows no links."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        place.symlink_to(path)
+    except OSError:
+        shutil.copyfile(path, place)

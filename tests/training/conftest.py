@@ -1,0 +1,66 @@
+"""Datasets that policies are trained on, and trainings by the command's own way."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors import safe_open
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Pictures of squares, with one prompt; tests that change it copy it."""
+    from tests.support.synthetic_dataset import make_dataset
+
+    return make_dataset(tmp_path_factory.mktemp("data") / "synthetic")
+
+
+@pytest.fixture(scope="session")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Object slots without pictures, with two prompts and records."""
+    from tests.support.object_dataset import make_object_dataset
+
+    return make_object_dataset(tmp_path_factory.mktemp("data") / "objects", records=True)
+
+
+@pytest.fixture(scope="session")
+def pictured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Object slots and pictures, with two prompts."""
+    from tests.support.object_dataset import make_object_dataset
+
+    return make_object_dataset(tmp_path_factory.mktemp("data") / "pictured", pictures=True)
+
+
+@pytest.fixture(scope="session")
+def train() -> Callable[..., None]:
+    """Train a memory policy by the words of ``lerobot train``."""
+
+    def run(*words: str) -> None:
+        from lerobot_memobench.run.arguments import read_arguments, split_arguments
+        from lerobot_memobench.training.command import complete_training
+        from lerobot_memobench.training.configuration import read_training
+        from lerobot_memobench.training.loop import train as loop
+        from lerobot_memobench.training.resume import resumed
+
+        given = resumed(split_arguments(["policy.device=cpu", "seed=3", *words]))
+        loop(read_training(complete_training(read_arguments("train", given)).for_parser))
+
+    return run
+
+
+def hashes(checkpoint: Path) -> dict[str, str]:
+    """Return the hash of every tensor of a checkpoint, the optimizer's and the random state's among them."""
+    found: dict[str, str] = {}
+    for path in sorted(checkpoint.rglob("*.safetensors")):
+        with safe_open(path, framework="pt") as file:
+            for name in file.keys():  # noqa: SIM118 (not a dict)
+                tensor: Any = file.get_tensor(name).contiguous().reshape(-1)
+                found[f"{path.name} {name}"] = hashlib.sha256(tensor.view(torch.uint8).numpy().tobytes()).hexdigest()
+    return found

@@ -1,0 +1,157 @@
+"""The feature cache: a file per episode, made once, found by what decides its content."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from lerobot_memobench.datasets.frames import read_frame_table
+from lerobot_memobench.datasets.lookup import FrameLookup
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.training import features as module
+from lerobot_memobench.training.features import EpisodeFeatures, Features, episode_file, features_folder, make_features
+from tests.support.synthetic_dataset import LENGTHS
+
+CAMERA = "observation.images.image"
+
+
+class Encoder:
+    """Numbers frames: the features of frame t of an episode are t."""
+
+    def __init__(self) -> None:
+        self.calls: list[int] = []
+
+    def features(self, key: str = "numbers") -> Features:
+        return Features(key, 2, 3, self.encode)
+
+    def encode(self, frames: torch.Tensor) -> torch.Tensor:
+        return frames.view(-1, 1, 1).expand(-1, 2, 3)
+
+    def read(self, episode: int, frames: Sequence[int]) -> torch.Tensor:
+        self.calls.append(episode)
+        return torch.tensor(frames, dtype=torch.float32)
+
+    def made(self, root: Path, **how: Any) -> EpisodeFeatures:
+        return make_features(root, "test", self.features(), camera=CAMERA, read=self.read, **{"batch_size": 7} | how)
+
+
+@pytest.fixture
+def root(synthetic: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(synthetic, tmp_path / "data"))
+
+
+@pytest.mark.parametrize("stride", [1, 4])
+def test_contents(root: Path, stride: int) -> None:
+    found = Encoder().made(root, stride=stride)
+    for episode, length in enumerate(LENGTHS):
+        slots = range(0, -(-length // stride))
+        assert found.tokens(episode, [*slots])[:, 0, 0].tolist() == [stride * slot for slot in slots]
+    lookup = FrameLookup(root, read_frame_table(root), stride=stride, remember=found.tokens)
+    assert lookup.tokens(1, [0, 2])[:, 1, 2].tolist() == [0, 2 * stride]
+    index = LENGTHS[0] + 2 * stride
+    assert found.of_frames([index, 0])[:, 0, 0].tolist() == [2 * stride, 0]
+    assert len(found.all_frames()) == sum(-(-length // stride) for length in LENGTHS)
+
+
+def test_a_finished_cache_is_left_alone_and_moves_with_its_dataset(root: Path, tmp_path: Path) -> None:
+    Encoder().made(root)
+    moved = Path(shutil.move(root, tmp_path / "elsewhere"))
+    again = Encoder()
+    assert again.made(moved).tokens(2, [3]).shape == (1, 2, 3)
+    assert again.calls == []
+
+
+def test_a_killed_build_makes_what_is_missing(root: Path) -> None:
+    first = Encoder().made(root)
+    episode_file(first.folder, 1).unlink()
+    again, seen = Encoder(), list[tuple[int, int]]()
+    again.made(root, progress=lambda done, count: seen.append((done, count)))
+    assert set(again.calls) == {1}
+    assert seen == [(2, 3), (3, 3)]
+
+
+def test_what_decides_the_content_decides_the_name(root: Path) -> None:
+    encoder = Encoder()
+    names = {
+        features_folder(root, "test", encoder.features(key), camera, stride).name
+        for key, camera, stride in (
+            *(("numbers", CAMERA, 1), ("numbers", CAMERA, 2), ("others", CAMERA, 1)),
+            ("numbers", "observation.images.wrist_image", 1),
+        )
+    }
+    video = next((root / "videos" / CAMERA).rglob("*.mp4"))
+    video.write_bytes(video.read_bytes() + b"0")
+    names.add(features_folder(root, "test", encoder.features(), CAMERA, 1).name)
+    assert len(names) == 5
+
+
+def test_ranks_share_the_episodes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second of two encodes every second episode, and waits for the first."""
+    calls = {}
+    for rank in (0, 1):
+        encoder = Encoder()
+        monkeypatch.setattr(module, "rank_of_world", lambda rank=rank: (rank, 2))
+        monkeypatch.setattr(module.time, "sleep", lambda _: (_ for _ in ()).throw(TimeoutError))
+        if rank == 0:
+            with pytest.raises(TimeoutError):
+                encoder.made(root)
+        else:
+            encoder.made(root)
+        calls[rank] = set(encoder.calls)
+    assert calls[0] == {0, 2}
+    assert calls[1] == {1}
+
+
+def test_a_disk_without_room_is_refused_before_anything_is_encoded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "free_bytes", lambda _: 10)
+    encoder = Encoder()
+    with pytest.raises(MemobenchError, match="feature cache"):
+        encoder.made(root)
+    assert encoder.calls == []
+    assert not features_folder(root, "test", encoder.features(), CAMERA, 1).exists()
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_takes_nothing_is_named(root: Path) -> None:
+    root.chmod(0o500)
+    try:
+        with pytest.raises(MemobenchError, match="cannot be written"):
+            Encoder().made(root)
+    finally:
+        root.chmod(0o700)
+
+
+def test_a_damaged_file_is_named(root: Path) -> None:
+    found = Encoder().made(root)
+    path = episode_file(found.folder, 0)
+    path.write_bytes(path.read_bytes()[:-4])
+    with pytest.raises(MemobenchError, match=path.name):
+        Encoder().made(root).tokens(0, [1])
+
+
+def test_uploads_leave_it_out(root: Path) -> None:
+    (root / ".gitignore").write_text("mine\n")
+    for _ in range(2):
+        Encoder().made(root)
+    assert (root / ".gitignore").read_text() == "mine\n/feature_cache/\n"
+
+
+@pytest.mark.parametrize("case", ["no dataset", "no camera"])
+def test_a_wrong_folder_or_camera_is_refused(case: str, root: Path, tmp_path: Path) -> None:
+    where, camera = (tmp_path, CAMERA) if case == "no dataset" else (root, "observation.images.front")
+    with pytest.raises(MemobenchError):
+        make_features(where, "test", Encoder().features(), camera=camera)
+
+
+def test_videos_are_read_by_default(root: Path) -> None:
+    bright = Features("mean", 1, 1, lambda images: images.mean(dim=(1, 2, 3)).view(-1, 1, 1))
+    found = make_features(root, "test", bright, camera=CAMERA, stride=8, workers=2)
+    assert set(load_file(episode_file(found.folder, 0))) == {"tokens"}
+    assert 0 < found.tokens(0, [1]).item() < 1

@@ -1,0 +1,103 @@
+"""The loss of an update: padding, the memory's choice, ranks; and batches of LeRobot's own trainer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_policy, make_pre_post_processors
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.losses import counted_actions, mean_losses
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
+from tests.support import rank_case
+from tests.support.fork_server import ForkServer
+from tests.support.small_policy import CHUNK, batch_of, made_for_training, small_config
+
+
+@pytest.mark.parametrize("memory", ["none", "frames"])
+def test_lerobots_own_trainer_trains_without_a_memory(synthetic: Path, memory: str) -> None:
+    """Frames as LeRobot draws them; actions of prompts do not count."""
+    config = small_config(size="tiny", memory=memory)
+    times = {"action": [step / 20 for step in range(CHUNK)]}
+    dataset = LeRobotDataset("memobench/synthetic", root=synthetic, delta_timestamps=times)
+    policy: Any = make_policy(config, ds_meta=dataset.meta)
+    before, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    batch = before(batch_of(dataset, [5, 42, 50]))
+    if memory == "frames":
+        with pytest.raises(MemobenchError, match="lerobot train policy=memobench_mem"):
+            policy.train().forward(batch)
+        return
+    per_sample, _ = policy.train().forward(batch, reduction="none")
+    assert (per_sample > 0).tolist() == [True, False, True], "the second frame is of a prompt"
+
+
+def test_padded_actions_do_not_count(synthetic: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frame 38 is the last but one of its episode: of its chunk two actions are real."""
+    policy, before, _, dataset = made_for_training(synthetic)
+    batch = before(batch_of(dataset, [38, 5]))
+    losses = torch.ones(2, CHUNK, policy.config.max_action_dim)
+    losses[0, 2:] = 1000.0
+    losses[0, :2] = 5.0
+    monkeypatch.setattr(policy.model, "forward", lambda *_: losses)
+    _, logged = policy.forward(batch)
+    assert logged["action_loss"] == pytest.approx((2 * 5.0 + CHUNK * 1.0) / (2 + CHUNK))
+    per_sample, _ = policy.forward(batch, reduction="none")
+    assert per_sample.mean().item() == pytest.approx(logged["action_loss"])
+
+
+def test_mean_losses_without_padding_is_the_mean() -> None:
+    losses = torch.rand(4, 5, 3)
+    found = mean_losses(losses, counted_actions({}, losses))
+    torch.testing.assert_close(found.mean, losses.mean())
+    torch.testing.assert_close(found.per_sample, losses.mean(dim=(1, 2)))
+    nothing = mean_losses(losses, torch.zeros(4, 5))
+    assert nothing.mean == 0
+    assert nothing.per_sample.tolist() == [0] * 4
+
+
+@pytest.mark.parametrize("memory", ["subgoal", "keyframes"])
+def test_a_loss_that_is_measured_follows_the_memorys_own_choice(objects: Path, memory: str) -> None:
+    policy, before, _, dataset = made_for_training(
+        objects, memory=memory, memory_frames=32, perception="objects", size="small"
+    )
+    if memory == "keyframes":
+        policy.model.fusion.open_gate()  # so that actions depend on what it reads
+    batch = before(batch_of(dataset, [10, 30, 50]))
+    others = {name: (batch[name] + 1) % len(policy.config.subgoal_texts) for name in (SUBGOAL, SUBGOALS)}
+    with torch.no_grad():
+        for learns in (True, False):
+            mine, other = (policy.train(learns).forward(one)[1] for one in (batch, {**batch, **others}))
+            assert (mine["action_loss"] == other["action_loss"]) is not learns
+            own = [name for name in mine if name.startswith("memory_")]
+            assert any(mine[name] != other[name] for name in own), "it is measured by the labels all the same"
+
+
+@pytest.fixture(scope="module")
+def ranks(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("ranks")
+    forks = ForkServer([rank_case.__name__])
+    code = "from pathlib import Path; from tests.support.rank_case import run_rank; run_rank({}, Path({!r}))"
+    running = [forks.start(code.format(rank, str(folder)), folder / f"{rank}.txt") for rank in range(2)]
+    assert [fork.wait() for fork in running] == [0, 0], [file.read_text() for file in folder.glob("*.txt")]
+    forks.close()
+    return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(len(rank_case.CASES)), ids=lambda n: f"{n}-{rank_case.CASES[n][0]}")
+def test_two_ranks_are_one_batch(ranks: Any, number: int) -> None:
+    joint = rank_case.step(*rank_case.CASES[number], slice(None))
+    first, second = (rank[number] for rank in ranks)
+    close = {"rtol": 1e-5, "atol": 1e-6}
+    torch.testing.assert_close((first["loss"] + second["loss"]) / 2, joint["loss"], **close)
+    assert first["top1"] == second["top1"] == joint["top1"]
+    for name in joint.keys() - {"loss", "top1"}:
+        torch.testing.assert_close(first[name], joint[name], **close)
+        torch.testing.assert_close(second[name], joint[name], **close)
+    if rank_case.CASES[number][0] == "contrastive":
+        torch.testing.assert_close(first["loss"], joint["loss"], **close)
+        assert "alignment.log_temperature" in joint

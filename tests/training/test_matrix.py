@@ -1,0 +1,135 @@
+"""Every memory and every input: a training saves, resumes to the bit, and its checkpoint acts."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.policies import make_pre_post_processors
+from safetensors.torch import load_file
+
+from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.protocol import OBS_PHASE, OBS_STEP
+from lerobot_memobench.training.average import TRAINING_FILE
+from lerobot_memobench.training.log import LOSSES, read_losses
+from tests.training.conftest import hashes
+
+SEEN = {
+    "objects": ("perception=objects", "size=small", "batch_size=12", "policy.chunk_size=4"),
+    "pixels": ("perception=pixels", "size=tiny", "batch_size=2", "num_workers=0", "policy.chunk_size=4"),
+}
+DEFAULT = {("pixels", "frames"), *(("objects", memory) for memory in (NONE, *OURS))}
+CASES = [
+    pytest.param(seen, memory, marks=() if (seen, memory) in DEFAULT else pytest.mark.slow)
+    for seen in SEEN
+    for memory in (NONE, *OURS)
+]
+
+
+@pytest.mark.parametrize(("seen", "memory"), CASES)
+def test_a_training_saves_resumes_to_the_bit_and_acts(
+    seen: str, memory: str, objects: Path, synthetic: Path, tmp_path: Path, train: Callable[..., None]
+) -> None:
+    root = objects if seen == "objects" else synthetic
+    words = ("policy=memobench_mem", *SEEN[seen], f"policy.memory={memory}", f"dataset={root}", "log_freq=1")
+    run, again = tmp_path / "run", tmp_path / "again"
+    train(*words, f"output_dir={run}", "steps=3", "save_freq=2")
+    shutil.copytree(run, again, symlinks=True)
+    shutil.rmtree(again / "checkpoints/000003")
+    (again / "checkpoints/last").unlink()
+    train(f"output_dir={again}", "resume=true")
+    straight = hashes(run / "checkpoints/000003")
+    assert len(straight) > 100
+    assert hashes(again / "checkpoints/000003") == straight
+    losses = [row for row in read_losses(run / LOSSES) if row[2] == "action_loss"]
+    assert [row[0] for row in losses] == [1, 2, 3]
+    assert [row for row in read_losses(again / LOSSES) if row[2] == "action_loss"] == losses
+
+    checkpoint = run / "checkpoints/last/pretrained_model"
+    saved, trained = load_file(checkpoint / "model.safetensors"), load_file(checkpoint / TRAINING_FILE)
+    averaged = [name.removeprefix("weights.") for name in trained if name.startswith("weights.")]
+    assert any(not torch.equal(saved[name], trained[f"weights.{name}"]) for name in averaged)
+    policy = MemobenchMemPolicy.from_pretrained(checkpoint)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
+    for step in range(3):
+        action = after(policy.select_action(before(observation(policy, step))))
+        assert action.shape == (1, 7)
+        assert action.isfinite().all()
+
+
+def observation(policy: Any, step: int) -> dict[str, Any]:
+    features = policy.config.input_features.items()
+    found: dict[str, Any] = {name: torch.full((1, *feature.shape), 0.1) for name, feature in features}
+    return found | {OBS_PHASE: torch.ones(1, 1), OBS_STEP: torch.full((1, 1), step), "task": ["open the drawer"]}
+
+
+def test_an_epoch_that_was_begun_is_finished(objects: Path, tmp_path: Path, train: Callable[..., None]) -> None:
+    """A training that is resumed in its second epoch draws the rest of that."""
+    words = ("policy=memobench_mem", *SEEN["objects"], "batch_size=50", f"dataset={objects}", "policy.memory=none")
+    run, again = tmp_path / "run", tmp_path / "again"
+    train(*words, f"output_dir={run}", "steps=6", "save_freq=3")
+    shutil.copytree(run / "checkpoints/000003", again / "checkpoints/000003")
+    (again / "checkpoints/last").symlink_to("000003")
+    train(f"output_dir={again}", "resume=true")
+    assert hashes(again / "checkpoints/000006") == hashes(run / "checkpoints/000006")
+
+
+def test_held_out_episodes_are_measured_by_the_average(
+    objects: Path, tmp_path: Path, train: Callable[..., None]
+) -> None:
+    held_out = ("dataset.eval_split=0.3", "eval_steps=2", "max_eval_samples=20")
+    words = ("policy=memobench_mem", *SEEN["objects"], f"dataset={objects}", *held_out)
+    train(*words, f"output_dir={tmp_path / 'run'}", "steps=4", "policy.ema_decay=0.5")
+    found = [row for row in read_losses(tmp_path / "run" / LOSSES) if row[1:3] == ("eval", "eval_loss")]
+    assert [row[0] for row in found] == [2, 4]
+    assert all(0 < row[3] < 100 for row in found)
+
+
+def test_a_training_begins_with_a_checkpoint(objects: Path, tmp_path: Path, train: Callable[..., None]) -> None:
+    """Another memory starts from its initial weights; everything else continues, its average as well."""
+    words = (*SEEN["objects"], f"dataset={objects}")
+    train("policy=memobench_mem", *words, f"output_dir={tmp_path / 'first'}", "steps=2")
+    begun = tmp_path / "first/checkpoints/last/pretrained_model"
+    train(f"policy={begun}", *words[2:], "policy.memory=bank", f"output_dir={tmp_path / 'second'}", "steps=1")
+    config = MemobenchMemPolicy.from_pretrained(tmp_path / "second/checkpoints/last/pretrained_model").config
+    assert config.memory == "bank"
+    counts = {}
+    from safetensors import safe_open
+
+    with safe_open(tmp_path / "second/checkpoints/last/pretrained_model" / TRAINING_FILE, framework="pt") as file:
+        counts = file.metadata()
+    assert counts["updates"] == "3"
+    assert any(name.startswith("updates.model.memory.") and value == "1" for name, value in counts.items())
+
+
+@pytest.mark.parametrize("align", ["semantic", "contrastive", "framewise"])
+def test_alignments_log_their_loss(align: str, objects: Path, tmp_path: Path, train: Callable[..., None]) -> None:
+    words = ("policy=memobench_mem", *SEEN["objects"], f"align={align}", f"dataset={objects}", "log_freq=1")
+    train(*words, f"output_dir={tmp_path / 'run'}", "steps=1")
+    names = {row[2] for row in read_losses(tmp_path / "run" / LOSSES)}
+    assert {"action_loss", "align_loss", "align_grad_norm", "align_top1"} <= names
+
+
+def test_oracle_memory_is_part_of_the_prompt(objects: Path, tmp_path: Path, train: Callable[..., None]) -> None:
+    words = ("policy=memobench_mem", *SEEN["objects"], "policy.memory=none", f"dataset={objects}")
+    train(*words, "policy.oracle_memory=true", f"output_dir={tmp_path / 'run'}", "steps=1")
+    checkpoint = tmp_path / "run/checkpoints/last/pretrained_model"
+    config = MemobenchMemPolicy.from_pretrained(checkpoint).config
+    before, _ = make_pre_post_processors(config, pretrained_path=str(checkpoint))
+    words_known = next(step.vocabulary for step in before.steps if hasattr(step, "vocabulary"))
+    assert {"memory"} <= set(words_known)
+
+
+def test_adapters_are_trained_beside_a_checkpoint(objects: Path, tmp_path: Path, train: Callable[..., None]) -> None:
+    words = (*SEEN["objects"], f"dataset={objects}")
+    train("policy=memobench_mem", *words, f"output_dir={tmp_path / 'first'}", "steps=1")
+    begun = tmp_path / "first/checkpoints/last/pretrained_model"
+    train(f"policy={begun}", *words[2:], "peft.method_type=LORA", f"output_dir={tmp_path / 'second'}", "steps=1")
+    made = tmp_path / "second/checkpoints/last/pretrained_model"
+    assert (made / "adapter_model.safetensors").is_file()
+    assert not (made / TRAINING_FILE).exists()

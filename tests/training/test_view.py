@@ -1,0 +1,156 @@
+"""A view holds the dataset's frames after the prompt, and the columns of the chosen inputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.utils.feature_utils import dataset_to_policy_features
+
+from lerobot_memobench.cli.memobench import main as memobench
+from lerobot_memobench.conformance.streams import write_streams
+from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.training.view import Choice, choice_for, needs_view, viewed, write_view
+from tests.support.object_dataset import LENGTHS, PROMPTS
+
+STATE, SLOTS, PICTURE = "observation.state", "observation.environment_state", "observation.images.image"
+ACT = {"device": "cpu", "push_to_hub": False, "chunk_size": 4, "n_action_steps": 4}
+
+
+def opened(root: Path, **options: Any) -> LeRobotDataset:
+    return LeRobotDataset("local/data", root=root, **options)
+
+
+def inputs(root: Path) -> dict[str, FeatureType]:
+    """Return what LeRobot takes for inputs of a policy."""
+    found = dataset_to_policy_features(opened(root).meta.features).items()
+    return {name: one.type for name, one in found if one.type is not FeatureType.ACTION}
+
+
+def test_its_frames_are_the_datasets_after_the_prompt(pictured: Path, tmp_path: Path) -> None:
+    """Pictures, state, action and time within the episode; chunks end with their episode."""
+    write_view(pictured, tmp_path / "view", Choice(obs_type=BOTH))
+    times = {"action": [0.0, 0.05, 0.1]}
+    whole, view = opened(pictured, delta_timestamps=times), opened(tmp_path / "view", delta_timestamps=times)
+    assert view.num_frames == sum(LENGTHS) - sum(PROMPTS)
+    first = 0
+    for episode, (length, prompt) in enumerate(zip(LENGTHS, PROMPTS, strict=True)):
+        begin, end = (view.meta.episodes[episode][name] for name in ("dataset_from_index", "dataset_to_index"))
+        assert (begin, end) == (first, first + length - prompt)
+        for frame in (0, 1, length - prompt - 1):
+            there, here = whole[sum(LENGTHS[:episode]) + prompt + frame], view[first + frame]
+            for name in (PICTURE, STATE, "action", "action_is_pad"):
+                assert torch.equal(here[name], there[name]), (episode, frame, name)
+            assert torch.equal(here[SLOTS], there["privileged.environment_state"])
+            assert here["task"] == there["task"]
+            assert here["timestamp"].item() == pytest.approx(there["timestamp"].item() - prompt / 20, abs=1e-5)
+            assert (here["frame_index"], here["index"], here["episode_index"]) == (frame, first + frame, episode)
+        first += length - prompt
+    assert next((tmp_path / "view").rglob("*.mp4")).is_symlink()
+
+
+def test_histories_do_not_reach_into_the_prompt(pictured: Path, tmp_path: Path) -> None:
+    write_view(pictured, tmp_path / "view", Choice(obs_type=PIXELS))
+    view = opened(tmp_path / "view", delta_timestamps={STATE: [-0.1, -0.05, 0.0]})
+    start = view.meta.episodes[1]["dataset_from_index"]
+    assert view[start][f"{STATE}_is_pad"].tolist() == [True, True, False]
+    assert view[start + 2][f"{STATE}_is_pad"].tolist() == [False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("obs_type", "seen"),
+    [(PIXELS, {STATE, PICTURE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, PICTURE})],
+)
+def test_lerobot_takes_the_chosen_inputs(obs_type: str, seen: set[str], pictured: Path, tmp_path: Path) -> None:
+    write_view(pictured, tmp_path / "view", Choice(obs_type=obs_type))
+    assert set(inputs(tmp_path / "view")) == seen
+    stats = opened(tmp_path / "view").meta.stats
+    assert seen <= set(stats)
+    theirs = opened(pictured).meta.stats
+    assert np.array_equal(stats[STATE]["mean"], theirs[STATE]["mean"])
+
+
+def test_language_is_as_old_as_its_frame(tmp_path: Path) -> None:
+    root = write_streams(tmp_path / "streams", frames=9)
+    write_view(root, tmp_path / "view", Choice(obs_type=PIXELS))
+    whole, view = opened(root), opened(tmp_path / "view")
+    start = view.meta.episodes[1]["dataset_from_index"]
+    of_whole = int(whole.meta.episodes[1]["dataset_to_index"] - view.meta.episodes[1]["length"])
+    there, here = whole[of_whole], view[start]
+    for old, new in zip(there["language_persistent"], here["language_persistent"], strict=True):
+        assert new["content"] == old["content"]
+        age = float(there["timestamp"]) - float(old["timestamp"])
+        assert float(here["timestamp"]) - float(new["timestamp"]) == pytest.approx(age, abs=1e-5)
+
+
+def test_who_is_trained_on_what(pictured: Path, synthetic: Path) -> None:
+    features = opened(pictured).meta.features
+    plain = ACTConfig(**ACT)
+    assert choice_for(plain, features, None, None) == Choice(False, PIXELS)
+    assert choice_for(plain, features, True, OBJECTS) == Choice(True, OBJECTS)
+    reader = SimpleNamespace(reads_prompt=True, perception=None, input_features={})
+    assert choice_for(reader, features, None, None) == Choice(True, PIXELS)
+    assert choice_for(SimpleNamespace(perception="pixels", input_features={}), features, None, None) == Choice()
+    begun = ACTConfig(**ACT)
+    begun.input_features = {SLOTS: SimpleNamespace(type=FeatureType.ENV)}
+    assert choice_for(begun, features, None, None).obs_type == OBJECTS
+    features = opened(synthetic).meta.features.items()
+    foreign = {name: one for name, one in features if not name.endswith(("phase", "step"))}
+    assert not needs_view(foreign, Choice(False, PIXELS))
+    assert needs_view(foreign | {SLOTS: {"dtype": "float32", "shape": (3,)}}, Choice(False, PIXELS))
+
+
+def test_observations_that_are_not_there_are_refused(synthetic: Path, objects: Path, tmp_path: Path) -> None:
+    for root, obs_type in ((synthetic, OBJECTS), (objects, PIXELS), (objects, BOTH)):
+        with pytest.raises(MemobenchError, match=f"obs_type={obs_type}"):
+            write_view(root, tmp_path / "view", Choice(obs_type=obs_type))
+    assert not (tmp_path / "view").exists()
+
+
+def test_a_training_reads_one_view_however_often_it_starts(
+    pictured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    given = read_arguments("train", split_arguments(["policy=act", "policy.device=cpu", f"dataset={pictured}"]))
+    told: list[str] = []
+    for _ in range(2):
+        found = viewed(given, None, OBJECTS, told.append)
+    folder = Path(str(found.get("dataset.root")))
+    assert set(inputs(folder)) == {STATE, SLOTS}
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    kept = viewed(given, True, None, told.append)
+    assert "observation.phase" not in str(kept.get("policy.input_features"))
+    assert "observation.images.image" in str(kept.get("policy.input_features"))
+    with pytest.raises(MemobenchError, match=r"episodes=\[7\]"):
+        viewed(given.default("dataset.episodes", "[7]"), None, None, told.append)
+
+
+def test_the_command_writes_one(pictured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "view"
+    assert memobench(["view", str(pictured), "--obs-type", OBJECTS, "--out", str(out)]) == 0
+    assert set(inputs(out)) == {STATE, SLOTS}
+    for words in (["--out", str(out)], ["--out", str(tmp_path / "b"), "--obs-type", "some"]):
+        assert memobench(["view", str(pictured), *words]) == 2
+
+
+@pytest.mark.slow
+def test_lerobots_trainer_trains_on_it(pictured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lerobot_memobench.cli.lerobot import main as lerobot
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    words = ["policy=act", "policy.dim_model=32", "policy.n_heads=2", "policy.dim_feedforward=64", "policy.device=cpu"]
+    words += ["policy.chunk_size=4", "policy.n_action_steps=4", "obs_type=" + OBJECTS, f"dataset={pictured}"]
+    run = tmp_path / "run"
+    assert lerobot(["train", *words, "steps=2", "batch_size=4", "num_workers=0", f"output_dir={run}"]) == 0
+    assert lerobot(["train", f"output_dir={run}", "resume=true", "steps=3", "num_workers=0"]) == 0
+    assert (run / "checkpoints/000003/pretrained_model/model.safetensors").is_file()
+    assert lerobot(["train", *words, "policy.chunk_size=-1", f"output_dir={tmp_path / 'no'}"]) != 0
