@@ -43,6 +43,7 @@ from lerobot_memobench.io import in_words
 from lerobot_memobench.perception.visual_encoder import GRID, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.memobench_mem.alignment import SiglipTextEncoder, WordTextEncoder, make_text_encoder
+from lerobot_memobench.policies.memobench_mem.backbone import make_backbone
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -56,7 +57,6 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     seed_parameters,
     thumbnails,
 )
-from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import (
     DETECTED,
     OBS_RAW_STATE,
@@ -218,7 +218,7 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
             "dataset's columns; leave this command out, or name a detector."
         )
     with torch.device("meta"):
-        model = SizedPaliGemmaWithExpert(config).paligemma.model
+        model = make_backbone(config).paligemma.model
     towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
     tower, projector = (part.to(torch.float32).eval().requires_grad_(False) for part in towers)
     for part, name in ((tower, "vision_tower."), (projector, "multi_modal_projector.")):
