@@ -77,7 +77,7 @@ def count_operations(fields: dict[str, Any]) -> int:
 
     from lerobot_memobench.policies.memobench_mem.alignment import make_alignment
     from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS, Histories
-    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 
     settings = config("pi05", device="cpu", **fields)
     dims = settings.dimensions
@@ -89,16 +89,17 @@ def count_operations(fields: dict[str, Any]) -> int:
     seen = torch.ones(1, dtype=torch.bool, device="meta")
     actions = torch.zeros(1, settings.chunk_size, settings.max_action_dim, device="meta")
     with FlopCounterMode(display=False) as counter:
-        loss = torch.zeros((), device="meta")
+        loss, reading = torch.zeros((), device="meta"), None
         if settings.memory_fusion != "none":
             assert model.memory is not None
             read = model.memory.replay(Histories(batch[FRAMES], batch[STEPS], batch[PLACES]))
-            model.set_memory(read)
+            reading = model.reading(read)
             if head is not None:
                 loss = loss + head(read.rows(), read.mask, batch["memory.text"])
         tokens, tokens_mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
         time = torch.zeros(1, device="meta")
-        losses = model(images, [seen, seen], tokens, tokens_mask, actions, torch.zeros_like(actions), time)
+        observed = Observation(images, [seen, seen], tokens, tokens_mask)
+        losses = model(observed, actions, torch.zeros_like(actions), time, reading)
         (loss + losses.mean()).backward()
     return counter.get_total_flops()
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import dataclasses
 import resource
 import time
-from types import MethodType
 
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
-from lerobot.policies.pi05.modeling_pi05 import PaliGemmaWithExpertModel, PI05Pytorch
+from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor
 
@@ -20,7 +19,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frame
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.rollout import Row
 
 CAMERA = "observation.images.image"
@@ -59,7 +58,7 @@ def _batch(config: MemobenchMemConfig) -> dict[str, Tensor]:
     }
 
 
-def _lerobots(policy: MemobenchMemPolicy) -> PI05Pytorch:
+def _lerobots(policy: MemobenchMemPolicy) -> PI05Pytorch | MemoryPI05:
     """LeRobot's own model over the policy's weights: a second set would not fit."""
     config = policy.config
     with torch.device("meta"):
@@ -67,8 +66,6 @@ def _lerobots(policy: MemobenchMemPolicy) -> PI05Pytorch:
             theirs = PI05Pytorch(PI05Config(device="cpu", dtype="bfloat16", train_expert_only=True))
         else:
             theirs = MemoryPI05(dataclasses.replace(config, memory_fusion="none", align="none"))
-            pair = theirs.paligemma_with_expert
-            pair.embed_image = MethodType(PaliGemmaWithExpertModel.embed_image, pair)
     own = dict(policy.model.named_parameters())
     for path, module in theirs.named_modules():
         for key, wanted in list(module.named_parameters(recurse=False)):
@@ -97,11 +94,14 @@ def _equals_lerobots(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> No
         "time": torch.full((1,), 0.3),
     }
     assert policy.model.memory is not None
-    policy.model.set_memory(policy.model.memory.replay(_memory(batch)))
-    ours = policy.model.forward(**inputs)
+    reading = policy.model.reading(policy.model.memory.replay(_memory(batch)))
+    seen = Observation(*(inputs[key] for key in ("images", "img_masks", "tokens", "masks")))
+    drawn = [inputs[key] for key in ("actions", "noise", "time")]
+    ours = policy.model.forward(seen, *drawn, reading)
     assert torch.isfinite(ours).all()
     assert ours.abs().max() > 0
-    assert torch.equal(ours, theirs.forward(**inputs))
+    expected = theirs.forward(**inputs) if isinstance(theirs, PI05Pytorch) else theirs.forward(seen, *drawn)
+    assert torch.equal(ours, expected)
 
 
 def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem import network
+from lerobot_memobench.policies.memobench_mem import passes
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryModulator
 from lerobot_memobench.policies.memobench_mem.layers import attend, rms_norm
 from lerobot_memobench.policies.memobench_mem.memory import OURS
@@ -61,7 +61,7 @@ def test_a_modulator_tells_what_it_looks_at() -> None:
     read: list[torch.Tensor] = []
     modulator.out.register_forward_hook(lambda _, inputs, __: read.append(inputs[0]))
     found: list[torch.Tensor] = []
-    modulator.read(actions, memory, (key, units), found)
+    modulator(actions, memory, (key, units), found)
     of_heads = read[0].unflatten(-1, (4, modulator.head_dim))[..., :length]
     torch.testing.assert_close(found[0], of_heads.mean(dim=(1, 2)))
     torch.testing.assert_close(found[0].sum(dim=1), torch.tensor([1.0, 1.0, 0.0]))
@@ -102,7 +102,7 @@ def test_what_actions_attend_to_in_context_is_what_was_summed(root: Path, monkey
             weights.append(scores.softmax(dim=-1))
         return read
 
-    monkeypatch.setattr(network, "attend", noting)
+    monkeypatch.setattr(passes, "attend", noting)
     policy.watch_memory()
     rolled(policy, batches[:9])
     (read,), _ = policy.memory_reads()

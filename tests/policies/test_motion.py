@@ -262,8 +262,8 @@ def test_queries_stand_before_the_actions(trained: tuple[Any, dict[str, Any]]) -
     model, chunk = trained[0].model, trained[0].config.chunk_size
     actions = torch.randn(4, chunk, model.foresight.queries.shape[1])
     real = torch.ones(4, 1, dtype=torch.bool)
-    model.set_memory(MemoryTokens(torch.randn(4, 1, model.memory.out.out_features), real))
-    tokens = model.fusion.actions(actions)
+    reading = model.reading(MemoryTokens(torch.randn(4, 1, model.memory.out.out_features), real))
+    tokens = reading.actions(actions)
     assert torch.equal(tokens[:, FORESIGHT:], actions)
     assert torch.equal(tokens[1, :FORESIGHT], model.foresight.queries)
 
@@ -276,13 +276,13 @@ def test_gradients_are_the_same_where_layers_are_run_again(trained: tuple[Any, d
     """Gradient checkpointing passes the queries' states a second time."""
     policy, batch = trained
     found = []
-    for begin in (policy.model.gradient_checkpointing_disable, policy.model.gradient_checkpointing_enable):
-        begin()
+    for checkpoints in (False, True):
+        policy.model.gradient_checkpointing_enabled = checkpoints
         policy.train().zero_grad()
         torch.manual_seed(0)
         policy.forward(batch)[0].backward()
         found.append(policy.model.foresight.queries.grad)
-    policy.model.gradient_checkpointing_disable()
+    policy.model.gradient_checkpointing_enabled = False
     assert found[0].any()
     assert torch.equal(*found)
 

@@ -9,17 +9,14 @@ from lerobot.policies.pi05.modeling_pi05 import PaliGemmaWithExpertModel, PI05Py
 from torch._dynamo.utils import counters
 
 from lerobot_memobench.policies.memobench_mem import layers, network
+from lerobot_memobench.policies.memobench_mem.backbone import make_backbone
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import pool_tokens
-from lerobot_memobench.policies.memobench_mem.fusion import (
-    MemoryModulator,
-    ModulatedNorm,
-    SharedMemory,
-    rotate_from,
-)
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryModulator, ModulatedReading, Reading, rotate_from
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, SizedPaliGemmaWithExpert
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
+from lerobot_memobench.policies.memobench_mem.passes import adaptive_norms
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from tests.support.lerobots_passes import lerobots_passes
 from tests.support.memory import histories
@@ -61,21 +58,25 @@ def _memory(config: MemobenchMemConfig, device: str = "cpu") -> tuple[torch.Tens
     return tokens.to(device), steps.to(device), mask.to(device)
 
 
-def _losses(model: PI05Pytorch, inputs: dict) -> torch.Tensor:
-    return model.forward(**inputs)
+def _seen(inputs: dict) -> Observation:
+    return Observation(inputs["images"], inputs["img_masks"], inputs["tokens"], inputs["masks"])
 
 
-def _hand_over(model: MemoryPI05, frames: torch.Tensor, steps: torch.Tensor, mask: torch.Tensor) -> MemoryTokens:
-    """Let the next passes read these frames (B, F, 16, D)."""
+def _losses(model: MemoryPI05, inputs: dict, memory: MemoryTokens | None = None) -> torch.Tensor:
+    drawn = (inputs[key] for key in ("actions", "noise", "time"))
+    return model.forward(_seen(inputs), *drawn, model.reading(memory))
+
+
+def _read(model: MemoryPI05, frames: torch.Tensor, steps: torch.Tensor, mask: torch.Tensor) -> MemoryTokens:
+    """Return the memory of these frames (B, F, 16, D)."""
     assert model.memory is not None
-    memory = model.memory.replay(histories(frames, steps, mask))
-    model.set_memory(memory)
-    return memory
+    return model.memory.replay(histories(frames, steps, mask))
 
 
-def _actions(model: PI05Pytorch, inputs: dict) -> torch.Tensor:
-    keys = ("images", "img_masks", "tokens", "masks", "noise")
-    return model.sample_actions(**{key: inputs[key] for key in keys})
+def _actions(model: MemoryPI05, inputs: dict, memory: MemoryTokens | None = None) -> torch.Tensor:
+    with torch.no_grad():
+        reading = model.reading(memory)
+    return model.sample_actions(_seen(inputs), inputs["noise"], reading)
 
 
 def _pair(memory_fusion: str = "modulation") -> tuple[MemoryPI05, MemoryPI05]:
@@ -104,9 +105,9 @@ def _pair(memory_fusion: str = "modulation") -> tuple[MemoryPI05, MemoryPI05]:
 def test_without_modulation_the_policy_is_pi05_output_for_output() -> None:
     plain, ours = _pair()
     inputs = _inputs(ours.config)
-    _hand_over(ours, *_memory(ours.config))
-    assert torch.equal(_losses(plain, inputs), _losses(ours, inputs))
-    assert torch.equal(_actions(plain, inputs), _actions(ours, inputs))
+    memory = _read(ours, *_memory(ours.config))
+    assert torch.equal(_losses(plain, inputs), _losses(ours, inputs, memory))
+    assert torch.equal(_actions(plain, inputs), _actions(ours, inputs, memory))
 
 
 @pytest.mark.parametrize(
@@ -138,17 +139,15 @@ def test_passes_are_lerobots_to_rounding(fields: dict[str, object]) -> None:
     each, mask = torch.randn(BATCH, 2, ours.config.dimensions.vlm.width), torch.arange(2) < torch.tensor([[2], [1]])
     memory = MemoryTokens(each[:, :1], mask[:, :1]) if ours.config.memory == "motion" else MemoryTokens(each, mask)
 
-    def passed(model: PI05Pytorch) -> list[torch.Tensor | None]:
+    def gradients(losses: torch.Tensor) -> list[torch.Tensor | None]:
         ours.zero_grad()
-        if ours.memory is not None:
-            ours.set_memory(memory)
-        losses = _losses(model, inputs)
         losses.mean().backward()
-        return [losses, _actions(model, inputs), *(parameter.grad for parameter in ours.parameters())]
+        return [losses, *(parameter.grad for parameter in ours.parameters())]
 
-    found = passed(ours)
-    with lerobots_passes(ours) as theirs:
-        expected = passed(theirs)
+    found = [_actions(ours, inputs, memory), *gradients(_losses(ours, inputs, memory))]
+    with lerobots_passes(ours, memory) as theirs:
+        observed = {key: inputs[key] for key in ("images", "img_masks", "tokens", "masks", "noise")}
+        expected = [theirs.sample_actions(**observed), *gradients(theirs.forward(**inputs))]
     assert sum(one is not None for one in found) > 20
     for one, other in zip(found, expected, strict=True):
         if one is None:  # last states of the prefix, which none reads
@@ -165,16 +164,14 @@ def test_modulation_reaches_both_paths() -> None:
                 parameter.normal_(std=0.2)
     inputs = _inputs(ours.config)
     tokens, steps, mask = _memory(ours.config)
-    _hand_over(ours, tokens, steps, mask)
-    losses, actions = _losses(ours, inputs), _actions(ours, inputs)
+    memory = _read(ours, tokens, steps, mask)
+    losses, actions = _losses(ours, inputs, memory), _actions(ours, inputs, memory)
     assert not torch.allclose(losses, _losses(plain, inputs))
     assert not torch.allclose(actions, _actions(plain, inputs))
     # Padding says nothing, real tokens and their times do.
     changed = torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0))
-    _hand_over(ours, changed, steps, mask)
-    torch.testing.assert_close(_actions(ours, inputs), actions)
-    _hand_over(ours, tokens, steps + 40, mask)
-    assert not torch.allclose(_actions(ours, inputs), actions)
+    torch.testing.assert_close(_actions(ours, inputs, _read(ours, changed, steps, mask)), actions)
+    assert not torch.allclose(_actions(ours, inputs, _read(ours, tokens, steps + 40, mask)), actions)
 
 
 @pytest.mark.parametrize("memory_fusion", ["modulation", "context"])
@@ -183,24 +180,22 @@ def test_all_masked_memory_is_finite(memory_fusion: str) -> None:
     ours.train()
     inputs = _inputs(ours.config)
     tokens, steps, mask = _memory(ours.config)
-    _hand_over(ours, tokens, steps, torch.zeros_like(mask))
-    loss = _losses(ours, inputs).mean()
+    memory = _read(ours, tokens, steps, torch.zeros_like(mask))
+    loss = _losses(ours, inputs, memory).mean()
     loss.backward()
     assert torch.isfinite(loss)
     assert all(torch.isfinite(p.grad).all() for p in ours.parameters() if p.grad is not None)
-    assert torch.isfinite(_actions(ours, inputs)).all()
+    assert torch.isfinite(_actions(ours, inputs, memory)).all()
 
 
 def test_context_memory_joins_the_prefix_and_padding_says_nothing() -> None:
     _, ours = _pair("context")
     inputs = _inputs(ours.config)
     tokens, steps, mask = _memory(ours.config)
-    _hand_over(ours, tokens, steps, mask)
-    actions = _actions(ours, inputs)
-    _hand_over(ours, torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0)), steps, mask)
-    torch.testing.assert_close(_actions(ours, inputs), actions)
-    _hand_over(ours, -tokens, steps, mask)
-    assert not torch.allclose(_actions(ours, inputs), actions)
+    actions = _actions(ours, inputs, _read(ours, tokens, steps, mask))
+    padded = torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0))
+    torch.testing.assert_close(_actions(ours, inputs, _read(ours, padded, steps, mask)), actions)
+    assert not torch.allclose(_actions(ours, inputs, _read(ours, -tokens, steps, mask)), actions)
 
 
 @pytest.mark.parametrize("few", [0, 99])
@@ -234,10 +229,9 @@ def test_passes_are_captured_whole(monkeypatch: pytest.MonkeyPatch) -> None:
         ours = MemoryPI05(_config(compile_model=compiles, open_gate=True))
         inputs = _inputs(ours.config)
         with torch.no_grad():
-            _hand_over(ours, *_memory(ours.config))
-            actions = [_actions(ours, inputs) for _ in range(2)]
-        _hand_over(ours, *_memory(ours.config))
-        _losses(ours, inputs).mean().backward()
+            memory = _read(ours, *_memory(ours.config))
+            actions = [_actions(ours, inputs, memory) for _ in range(2)]
+        _losses(ours, inputs, _read(ours, *_memory(ours.config))).mean().backward()
         found.append([*actions, *(one.grad for one in ours.parameters() if one.grad is not None)])
     network.compiled.cache_clear()
     assert counters["stats"]["unique_graphs"] > 0
@@ -249,15 +243,16 @@ def test_the_instruction_conditions_the_experts_norms_and_its_padding_does_not()
     config = _config(size="small", perception="objects")
     torch.manual_seed(0)
     model = MemoryPI05(config)
-    torch.nn.init.normal_(next(model.paligemma_with_expert.adaptive_norms()).dense.weight)  # zero at first
+    torch.nn.init.normal_(next(adaptive_norms(model.paligemma_with_expert)).dense.weight)  # zero at first
     tokens = torch.randint(0, 200, (2, 12))
     short = torch.arange(12) < torch.tensor([[12], [7]])
     seen = [torch.zeros(2, SIZE + HAND_DIM), torch.zeros(2, config.max_state_dim)]
     shown = [torch.zeros(2, SLOTS, dtype=torch.bool), torch.ones(2, dtype=torch.bool)]
 
     def condition(words: torch.Tensor) -> torch.Tensor:
-        model.embed_prefix(seen, shown, words, short)
-        (modulation, *_) = model.modulations(torch.ones(2))
+        reading = Reading()
+        prefix = model.embed(Observation(seen, shown, words, short), reading)
+        (modulation, *_) = model.modulations(torch.ones(2), prefix.instruction, reading)
         return modulation.flatten(1)
 
     told = condition(tokens)
@@ -273,8 +268,7 @@ def test_gradients_reach_memory_expert_and_vlm_but_not_the_tower() -> None:
             if ".modulation." in name:
                 parameter.normal_(std=0.2)
     ours.train()
-    _hand_over(ours, *_memory(ours.config))
-    _losses(ours, _inputs(ours.config)).mean().backward()
+    _losses(ours, _inputs(ours.config), _read(ours, *_memory(ours.config))).mean().backward()
     with_gradient = {name for name, p in ours.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
     trained = {name for name, p in ours.named_parameters() if p.requires_grad}
     # The last layer of the language model is only read through its keys and values.
@@ -294,8 +288,7 @@ def test_gradient_checkpointing_gives_the_same_gradients() -> None:
 
     def gradients() -> list[torch.Tensor]:
         ours.zero_grad()
-        _hand_over(ours, *_memory(ours.config))
-        _losses(ours, _inputs(ours.config)).mean().backward()
+        _losses(ours, _inputs(ours.config), _read(ours, *_memory(ours.config))).mean().backward()
         return [p.grad.clone() for p in ours.memory_parameters().values()]
 
     plain = gradients()
@@ -327,10 +320,10 @@ def test_full_size_runs_in_shape(memory_fusion: str) -> None:
     config = _config(size="pi05", memory_fusion=memory_fusion)
     with torch.device("meta"):
         ours = MemoryPI05(config)
-    memory = _hand_over(ours, *_memory(config, "meta"))
+    memory = _read(ours, *_memory(config, "meta"))
     assert memory.rows().shape == (BATCH, FRAMES * 16, 2048)
     assert memory.mask.shape == (BATCH, FRAMES * 16)
-    assert _losses(ours, _inputs(config, "meta")).shape == (BATCH, CHUNK, 32)
+    assert _losses(ours, _inputs(config, "meta"), memory).shape == (BATCH, CHUNK, 32)
 
 
 def test_the_tower_without_weights_is_the_same_every_time() -> None:
@@ -357,9 +350,13 @@ def _modulator() -> MemoryModulator:
     return modulator
 
 
+def _modulated(modulator: MemoryModulator, actions: torch.Tensor, memory: MemoryTokens) -> tuple[torch.Tensor, ...]:
+    return modulator(layers.rms_norm(actions), memory, modulator.keys(memory))
+
+
 def test_modulator_starts_at_zero() -> None:
     memory = MemoryTokens(torch.randn(2, 7, 32), torch.ones(2, 7, dtype=torch.bool))
-    scale, shift = MemoryModulator(32)(torch.randn(2, 5, 32), memory)
+    scale, shift = _modulated(MemoryModulator(32), torch.randn(2, 5, 32), memory)
     assert not scale.any()
     assert not shift.any()
 
@@ -368,8 +365,7 @@ def test_modulator_starts_at_zero() -> None:
 def test_memory_gets_gradients_from_the_first_update_on_where_the_gate_is_open(opened: bool) -> None:
     ours = MemoryPI05(_config(size="tiny", open_gate=opened))
     tokens, *rest = _memory(ours.config)
-    _hand_over(ours, tokens.requires_grad_(), *rest)
-    _losses(ours, _inputs(ours.config)).mean().backward()
+    _losses(ours, _inputs(ours.config), _read(ours, tokens.requires_grad_(), *rest)).mean().backward()
     assert tokens.grad is not None
     assert tokens.grad.any() == opened
 
@@ -379,10 +375,10 @@ def test_modulator_sees_only_unmasked_memory() -> None:
     mask = torch.tensor([[True, True, True, True, False, False]])
     changed = memory.clone()
     changed[:, 4:] = 1e4
-    seen = modulator(actions, MemoryTokens(memory, mask))
-    for a, b in zip(seen, modulator(actions, MemoryTokens(changed, mask)), strict=True):
+    seen = _modulated(modulator, actions, MemoryTokens(memory, mask))
+    for a, b in zip(seen, _modulated(modulator, actions, MemoryTokens(changed, mask)), strict=True):
         torch.testing.assert_close(a, b)
-    all_seen = modulator(actions, MemoryTokens(memory, torch.ones_like(mask)))
+    all_seen = _modulated(modulator, actions, MemoryTokens(memory, torch.ones_like(mask)))
     assert not torch.allclose(all_seen[0], seen[0])
 
 
@@ -391,7 +387,7 @@ def test_all_masked_memory_is_finite_and_reads_zero() -> None:
     memory = torch.randn(2, 6, 32, requires_grad=True)
     mask = torch.zeros(2, 6, dtype=torch.bool)
     mask[1] = True
-    scale, shift = modulator(actions, MemoryTokens(memory, mask))
+    scale, shift = _modulated(modulator, actions, MemoryTokens(memory, mask))
     assert not scale[0].any()
     assert not shift[0].any()
     assert scale[1].abs().sum() > 0
@@ -404,30 +400,25 @@ def test_all_masked_memory_is_finite_and_reads_zero() -> None:
 def test_positions_matter_to_the_modulator() -> None:
     modulator, actions, memory = _modulator(), torch.randn(1, 5, 32), torch.randn(1, 6, 32)
     mask = torch.ones(1, 6, dtype=torch.bool)
-    seen, flipped = (modulator(actions, MemoryTokens(tokens, mask))[0] for tokens in (memory, memory.flip(1)))
+    seen, flipped = (
+        _modulated(modulator, actions, MemoryTokens(tokens, mask))[0] for tokens in (memory, memory.flip(1))
+    )
     assert not torch.allclose(seen, flipped)
 
 
 def test_keys_are_computed_once_per_memory_and_only_without_gradients() -> None:
-    modulator, state = _modulator(), SharedMemory()
-    norm = ModulatedNorm(torch.nn.Identity(), modulator, state)
-    calls: list[int] = []
+    modulator, calls = _modulator(), list[int]()
     keys = modulator.keys
     modulator.keys = lambda memory: calls.append(1) or keys(memory)  # type: ignore[method-assign]
-    actions, mask, zero = torch.randn(2, 5, 32), torch.ones(2, 9, dtype=torch.bool), torch.zeros(2, 1, 96)
-    memories = torch.randn(3, 2, 9, 32)
-    fresh = []
-    for memory in memories:
-        state.set(MemoryTokens(memory, mask), [modulator])
-        fresh.append(norm(actions, zero)[0].detach())
-        norm(actions, zero)
-    assert len(calls) == 6  # with gradients: every time, as checkpointing runs layers again
+    normed, memory = torch.randn(2, 5, 32), MemoryTokens(torch.randn(2, 9, 32), torch.ones(2, 9, dtype=torch.bool))
+    learning = ModulatedReading(memory, [modulator], watched=False)
+    expected = [learning.feed_forward(0, normed, normed).detach() for _ in range(2)]
+    assert len(calls) == 2  # with gradients: every time, as checkpointing runs layers again
     with torch.no_grad():
-        for memory, expected in zip(memories, fresh, strict=True):
-            state.set(MemoryTokens(memory, mask), [modulator])
-            for _ in range(3):
-                torch.testing.assert_close(norm(actions, zero)[0], expected)
-    assert len(calls) == 9
+        acting = ModulatedReading(memory, [modulator], watched=False)
+        for _ in range(3):
+            torch.testing.assert_close(acting.feed_forward(0, normed, normed), expected[0])
+    assert len(calls) == 3
 
 
 def test_memory_that_rows_share_is_read_as_their_own() -> None:
@@ -440,7 +431,7 @@ def test_memory_that_rows_share_is_read_as_their_own() -> None:
     for share in (True, False):
         each = frames.clone().requires_grad_()
         memory = MemoryTokens(each, mask, places)
-        read = modulator(actions, memory if share else MemoryTokens(memory.rows(), mask))
+        read = _modulated(modulator, actions, memory if share else MemoryTokens(memory.rows(), mask))
         wanted = [each, *(weight for name, weight in modulator.named_parameters() if "action" not in name)]
         found.append((*read, *torch.autograd.grad(read[0].square().sum() + read[1].sum(), wanted)))
     for ours, theirs in zip(*found, strict=True):
@@ -468,10 +459,11 @@ def test_pooling_is_bit_for_bit_the_one_that_caches_were_made_with() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_the_prefix_is_lerobots(dtype: torch.dtype) -> None:
-    pair = SizedPaliGemmaWithExpert(MemobenchMemConfig(device="cpu"))
+    backbone = make_backbone(MemobenchMemConfig(device="cpu"))
     pictures = (torch.rand(2, 3, 96, 96, generator=torch.Generator().manual_seed(0)) * 2 - 1).to(dtype)
     with torch.no_grad():
-        assert torch.equal(pair.embed_image(pictures), PaliGemmaWithExpertModel.embed_image(pair, pictures))
+        expected = PaliGemmaWithExpertModel.embed_image(backbone, pictures)
+        assert torch.equal(backbone.perception.prefix(pictures), expected)
 
 
 def test_positions_of_a_rollout_serve_a_training() -> None:

@@ -18,6 +18,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.fusion import Reading
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     FRAMES,
@@ -257,7 +258,7 @@ def test_the_present_is_the_same_in_training_and_in_a_rollout(root: Path) -> Non
     trained, acted = before(batch_of(dataset, [index])), before(observed(dataset, index, task=dataset[index]["task"]))
     words = ("observation.language.tokens", "observation.language.attention_mask")
     prefixes = [
-        policy.train(learning).model.embed_prefix(*policy._preprocess_images(batch), *(batch[key] for key in words))
+        policy.train(learning).model.embed(policy._seen(batch), Reading())
         for batch, learning in ((trained, True), (acted, False))
     ]
     seen = [prefix.tokens[prefix.real] for prefix in prefixes]

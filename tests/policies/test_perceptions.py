@@ -20,6 +20,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.fusion import Reading
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.training.features import FOLDER
 from tests.support.memory import remembered, trained_on
@@ -122,7 +123,7 @@ def test_a_rollout_perceives_and_remembers_what_training_reads(case: Case) -> No
     assert apart(frames[0], frames[7]) > 4 * case.of.rounding, "moments differ"
     prefixes = []
     for batch in (trained, acted):
-        prefix = policy.model.embed_prefix(*policy._preprocess_images(batch), *(trained[key] for key in WORDS))
+        prefix = policy.model.embed(policy._seen(batch | {key: trained[key] for key in WORDS}), Reading())
         prefixes.append(prefix.tokens[prefix.real])
     assert apart(*prefixes) <= 2 * case.of.rounding
 

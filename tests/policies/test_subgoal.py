@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -14,9 +12,9 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.fusion import Prefix
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Query
-from lerobot_memobench.policies.memobench_mem.memory.subgoal import SCORES, NarrowChannel
+from lerobot_memobench.policies.memobench_mem.memory.subgoal import SCORES, NarrowReading
 from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.policies.memobench_mem.subgoals import choices
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
@@ -50,7 +48,7 @@ def test_oracle_memory_behind_an_instruction_changes_no_choice() -> None:
     assert not choices(OF_TASKS, told).all(dim=1).any()
 
 
-def inputs_of(model: MemoryPI05, seed: int = 1) -> dict[str, Any]:
+def inputs_of(model: MemoryPI05, seed: int = 1) -> Observation:
     """Return the present of two rows."""
     chance = torch.Generator().manual_seed(seed)
     real = torch.ones(B, 7, dtype=torch.bool)
@@ -63,11 +61,17 @@ def inputs_of(model: MemoryPI05, seed: int = 1) -> dict[str, Any]:
         seen = [torch.randn(B, width, generator=chance) for width in (SIZE + HAND_DIM, model.config.max_state_dim)]
         shown = [torch.ones(B, SLOTS, dtype=torch.bool), torch.ones(B, dtype=torch.bool)]
     words = torch.randint(4, 200, (B, 7), generator=chance)
-    return {"images": seen, "img_masks": shown, "tokens": words, "masks": real}
+    return Observation(seen, shown, words, real)
 
 
-def remember(model: MemoryPI05, seed: int = 2, subgoal: list[int] | None = None, learns: bool = False) -> Tensor:
-    """Hand a history of three frames to the model, with what is true of it; return its tokens."""
+def remember(
+    model: MemoryPI05,
+    seed: int = 2,
+    subgoal: list[int] | None = None,
+    learns: bool = False,
+    watched: bool = False,
+) -> NarrowReading:
+    """Begin a pass over a history of three frames, with the true texts if they are given."""
     memory, chance = model.memory, torch.Generator().manual_seed(seed)
     assert memory is not None
     frames = torch.randn(B, 3, memory.spec.tokens, memory.spec.dim, generator=chance)
@@ -76,55 +80,47 @@ def remember(model: MemoryPI05, seed: int = 2, subgoal: list[int] | None = None,
     query = Query(choices=choices, subgoal=None if subgoal is None else torch.tensor(subgoal))
     read = memory.replay(histories(frames, torch.arange(3).repeat(B, 1), torch.ones(B, 3, dtype=torch.bool)), query)
     each = read.each.detach().requires_grad_(learns)
-    model.set_memory(read._replace(each=each))
-    return each
+    reading = model.reading(read._replace(each=each), watched)
+    assert isinstance(reading, NarrowReading)
+    return reading
 
 
-def passed(model: MemoryPI05, inputs: dict[str, Any], actions: Tensor) -> Tensor:
+def passed(model: MemoryPI05, seen: Observation, actions: Tensor, reading: NarrowReading) -> Tensor:
     """Return the losses of a training's pass at time 1, from zero noise to these actions."""
-    losses: Tensor = model.forward(**inputs, actions=actions, noise=torch.zeros_like(actions), time=torch.ones(B))
-    return losses
+    return model.forward(seen, actions, torch.zeros_like(actions), torch.ones(B), reading)
 
 
-def planned(model: MemoryPI05, inputs: dict[str, Any]) -> Tensor:
+def planned(model: MemoryPI05, seen: Observation, reading: NarrowReading) -> Tensor:
     """Return the chunk of one step of denoising from zero noise."""
-    actions: Tensor = model.sample_actions(**inputs, noise=torch.zeros(B, CHUNK, model.config.max_action_dim))
-    return actions
+    return model.sample_actions(seen, torch.zeros(B, CHUNK, model.config.max_action_dim), reading)
 
 
-@contextmanager
-def text_alone(channel: NarrowChannel) -> Iterator[None]:
-    """Let the text attend to itself alone, so that its states are the same whatever stands before it."""
-    attention = channel.attention
+def attend_to_text_alone(patch: pytest.MonkeyPatch) -> None:
+    """Let the text attend to itself alone, so that its states are the same after any prefix."""
+    attends = NarrowReading.attends
 
-    def narrowed(prefix: Prefix, unread: int, copies: int) -> Tensor:
-        seen = attention(prefix, unread, copies).clone()
+    def narrowed(reading: NarrowReading, prefix: Prefix, unread: int, copies: int) -> Tensor:
+        seen = attends(reading, prefix, unread, copies).clone()
         seen[:, unread:, :unread] = False
         return seen
 
-    channel.attention = narrowed  # type: ignore[method-assign]
-    yield
-    del channel.attention
-
-
-def channel_of(model: MemoryPI05) -> NarrowChannel:
-    assert isinstance(model.fusion, NarrowChannel)
-    return model.fusion
+    patch.setattr(NarrowReading, "attends", narrowed)
 
 
 def test_actions_read_the_text_alone(model: MemoryPI05) -> None:
     """Another observation, instruction or history, of which the text's states are told nothing, changes no action."""
     actions = torch.randn(B, CHUNK, model.config.max_action_dim)
-    state = inputs_of(model)["images"][1:]  # none where it is no token
+    state = inputs_of(model).images[1:]  # none where it is no token
 
     def both(seed: int, text: list[int], state: list[Tensor]) -> Tensor:
-        inputs = inputs_of(model, seed)
-        inputs["images"] = [inputs["images"][0], *state]
-        remember(model, seed, text)
+        seen = inputs_of(model, seed)
+        seen = seen._replace(images=[seen.images[0], *state])
         with torch.no_grad():
-            return torch.stack([passed(model, inputs, actions), planned(model, inputs)])
+            losses = passed(model, seen, actions, remember(model, seed, text))
+            return torch.stack([losses, planned(model, seen, remember(model, seed, text))])
 
-    with text_alone(channel_of(model)):
+    with pytest.MonkeyPatch.context() as patch:
+        attend_to_text_alone(patch)
         found = both(1, [0, 2], state)
         assert torch.equal(found, both(5, [0, 2], state))
         assert (found != both(1, [1, 2], state))[:, 0].any(-1).all(), "another text, of another row"
@@ -136,18 +132,23 @@ def test_actions_read_the_text_alone(model: MemoryPI05) -> None:
 def test_gradients_flow_through_the_text_alone(model: MemoryPI05) -> None:
     model.train()
     actions = torch.randn(B, CHUNK, model.config.max_action_dim)
-    history = remember(model, subgoal=[0, -1], learns=True)
-    passed(model, inputs_of(model), actions).mean().backward()
+
+    def learned() -> tuple[NarrowReading, Tensor, Tensor]:
+        reading = remember(model, subgoal=[0, -1], learns=True)
+        return reading, reading.memory.each, passed(model, inputs_of(model), actions, reading)
+
+    _, history, losses = learned()
+    losses.mean().backward()
     assert history.grad is not None
     assert history.grad.abs().sum(dim=(1, 2)).all()
-    with text_alone(channel_of(model)):
-        history = remember(model, subgoal=[0, -1], learns=True)
-        passed(model, inputs_of(model), actions).mean().backward()
+    with pytest.MonkeyPatch.context() as patch:
+        attend_to_text_alone(patch)
+        _, history, losses = learned()
+        losses.mean().backward()
     assert history.grad is None or not history.grad.any()
-    history = remember(model, subgoal=[0, -1], learns=True)
-    passed(model, inputs_of(model), actions)
+    reading, history, _ = learned()
     assert model.memory is not None
-    loss = model.memory.losses(channel_of(model).outputs() | {SUBGOAL: torch.tensor([0, -1])})["subgoal"]
+    loss = model.memory.losses(reading.outputs | {SUBGOAL: torch.tensor([0, -1])})["subgoal"]
     assert loss[1] == 0, "a frame without a text teaches none"
     loss.sum().backward()
     assert history.grad is not None
@@ -157,22 +158,19 @@ def test_gradients_flow_through_the_text_alone(model: MemoryPI05) -> None:
 def test_what_nobody_reads_is_left_out(model: MemoryPI05) -> None:
     """Of the prefix's last states one is made; loss, scores and gradients are those of a pass that makes every one."""
     model.train()
-    channel, made = channel_of(model), list[int]()
+    made = list[int]()
     last: Any = model.paligemma_with_expert.paligemma.model.language_model.layers[-1]
     last.mlp.register_forward_pre_hook(lambda _, inputs: made.append(inputs[0].shape[1]))
     actions, inputs = torch.randn(B, CHUNK, model.config.max_action_dim), inputs_of(model)
 
-    def learned() -> list[Tensor | None]:
+    def learned(watched: bool) -> list[Tensor | None]:
         model.zero_grad()
-        history = remember(model, subgoal=[0, 2], learns=True)
-        losses = passed(model, inputs, actions)
-        scores = channel.outputs()[SCORES]
+        reading = remember(model, subgoal=[0, 2], learns=True, watched=watched)
+        losses, scores = passed(model, inputs, actions, reading), reading.outputs[SCORES]
         (losses.mean() + torch.nn.functional.cross_entropy(scores, torch.tensor([0, 2]))).backward()
-        return [losses, scores, history.grad, *(parameter.grad for parameter in model.parameters())]
+        return [losses, scores, reading.memory.each.grad, *(parameter.grad for parameter in model.parameters())]
 
-    narrowed = learned()
-    with model.paligemma_with_expert.watched():
-        whole = learned()
+    narrowed, whole = learned(watched=False), learned(watched=True)
     for ours, all_made in zip(narrowed, whole, strict=True):
         torch.testing.assert_close(ours, all_made, rtol=1e-4, atol=1e-5)
     assert made[0] == 1
@@ -181,42 +179,38 @@ def test_what_nobody_reads_is_left_out(model: MemoryPI05) -> None:
 
 def test_both_paths_are_the_same(model: MemoryPI05) -> None:
     """One step of denoising over cached keys ends where a training's pass of the same text has no error."""
-    remember(model)
-    actions = planned(model, inputs_of(model))
-    said = channel_of(model).said
-    assert said is not None
-    remember(model, subgoal=said.tolist())
-    assert passed(model, inputs_of(model), actions).max() < 1e-8
+    reading = remember(model)
+    actions = planned(model, inputs_of(model), reading)
+    assert reading.said is not None
+    true = remember(model, subgoal=reading.said.tolist())
+    assert passed(model, inputs_of(model), actions, true).max() < 1e-8
 
 
 def test_it_tells_how_much_the_text_attends_to_each_token_of_memory(model: MemoryPI05) -> None:
-    remember(model)
-    with channel_of(model).watched() as layers:
-        planned(model, inputs_of(model))
-    assert len(layers) == model.config.dimensions.vlm.depth
-    shares = torch.stack(layers)
-    assert shares.shape[1:] == channel_of(model).memory.mask.shape  # type: ignore[union-attr]
+    reading = remember(model, watched=True)
+    planned(model, inputs_of(model), reading)
+    shares = torch.stack(reading.shares())
+    assert shares.shape == (model.config.dimensions.vlm.depth, *reading.memory.mask.shape)
     assert (shares.sum(dim=-1) < 1).all()
-    assert torch.equal(shares > 0, channel_of(model).memory.mask.expand_as(shares))  # type: ignore[union-attr]
+    assert torch.equal(shares > 0, reading.memory.mask.expand_as(shares))
 
 
 def test_it_says_one_of_its_tasks_texts_and_is_not_told_which(model: MemoryPI05) -> None:
-    channel, inputs, scores = channel_of(model), inputs_of(model), []
+    inputs, scores = inputs_of(model), []
     for subgoal in ([0, 2], [1, 1], [-1, -1]):
-        remember(model, subgoal=subgoal)
+        reading = remember(model, subgoal=subgoal)
         with torch.no_grad():
-            passed(model, inputs, torch.zeros(B, CHUNK, model.config.max_action_dim))
-        assert channel.said is not None
-        assert channel.said.tolist() == [TEXTS if text < 0 else text for text in subgoal]
-        scores.append(channel._scores)
-    remember(model)
-    planned(model, inputs)
-    assert channel.said is not None
-    assert channel._scores is not None
+            passed(model, inputs, torch.zeros(B, CHUNK, model.config.max_action_dim), reading)
+        assert reading.said is not None
+        assert reading.said.tolist() == [TEXTS if text < 0 else text for text in subgoal]
+        scores.append(reading.outputs[SCORES])
+    reading = remember(model)
+    planned(model, inputs, reading)
+    assert reading.said is not None
     for other in scores:
-        torch.testing.assert_close(other, channel._scores)
-    first, second = channel._scores.argmax(dim=1).tolist()
-    assert channel.said.tolist() == [first, second]
+        torch.testing.assert_close(other, reading.outputs[SCORES])
+    first, second = reading.outputs[SCORES].argmax(dim=1).tolist()
+    assert reading.said.tolist() == [first, second]
     assert first in (0, 1)
     assert second in (1, 2)
 

@@ -1,4 +1,4 @@
-"""LeRobot's own passes over the weights of our model, which ours are compared with."""
+"""LeRobot's own passes over the weights of our model, with which ours are compared."""
 
 from __future__ import annotations
 
@@ -10,57 +10,63 @@ import torch
 from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import ModulatedNorm
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.fusion import ModulatedNorm, ModulatedReading, Prefix, Reading
+from lerobot_memobench.policies.memobench_mem.layers import rms_norm
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 
 
 class Passes(PI05Pytorch):
-    """pi0.5 as LeRobot computes it, with what a fusion adds to its tokens and conditions."""
+    """pi0.5 as LeRobot computes it, with the tokens and conditions that a reading adds."""
 
-    def __init__(self, ours: MemoryPI05) -> None:
+    def __init__(self, ours: MemoryPI05, memory: MemoryTokens | None) -> None:
         nn.Module.__init__(self)
         self.__dict__.update(vars(ours))
-        self._ours = [ours]
+        self._ours, self._memory = [ours], memory
+        self.reading: Reading = Reading()
+        self.seen: Prefix | None = None
 
     def embed_prefix(self, *observed: Any) -> tuple[Tensor, Tensor, Tensor]:
-        prefix = self._ours[0].embed_prefix(*observed)
+        self.reading = self._ours[0].reading(self._memory)
+        prefix = self.seen = self._ours[0].embed(Observation(*observed), self.reading)
         return prefix.tokens, prefix.real, torch.zeros_like(prefix.real)
 
     def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        ours, (tokens, _, blocks, condition) = self._ours[0], super().embed_suffix(noisy_actions, timestep)
-        if ours.instruction is not None:
-            condition = condition + ours.instruction()
-        if ours.fusion is not None:
-            tokens, condition = ours.fusion.actions(tokens), ours.fusion.condition(condition)
+        tokens, _, blocks, condition = super().embed_suffix(noisy_actions, timestep)
+        assert self.seen is not None
+        if self.seen.instruction is not None:
+            condition = condition + self.seen.instruction
+        tokens, condition = self.reading.actions(tokens), self.reading.condition(condition)
         real = torch.ones(tokens.shape[:2], dtype=torch.bool)
         blocks = torch.cat([blocks, torch.zeros_like(real).to(blocks)], dim=1)
         return tokens, real, blocks[:, : real.shape[1]], condition
 
 
 class Norm(nn.Module):
-    """LeRobot's norm before a feed-forward, and the memory's modulation behind it."""
+    """LeRobot's norm before a feed-forward, and the memory's modulation after it."""
 
-    def __init__(self, ours: ModulatedNorm) -> None:
+    def __init__(self, ours: ModulatedNorm, passes: Passes) -> None:
         super().__init__()
-        self.ours, self.modulator = ours, ours.modulator
+        self.norm, self.modulator, self.passes = ours.norm, ours.modulator, [passes]
 
     def forward(self, x: Tensor, cond: Tensor) -> tuple[Tensor, Tensor]:
-        normed, gate = self.ours.norm(x, cond=cond)
-        assert self.ours.state.memory is not None
-        scale, shift = self.ours.modulator(x, self.ours.state.memory)
+        normed, gate = self.norm(x, cond=cond)
+        reading = self.passes[0].reading
+        assert isinstance(reading, ModulatedReading)
+        scale, shift = self.modulator(rms_norm(x), reading.memory, self.modulator.keys(reading.memory))
         return normed * (1.0 + scale) + shift, gate
 
 
 @contextmanager
-def lerobots_passes(ours: MemoryPI05) -> Iterator[PI05Pytorch]:
+def lerobots_passes(ours: MemoryPI05, memory: MemoryTokens | None) -> Iterator[PI05Pytorch]:
     """Yield a model that computes with the very parameters of ours, by LeRobot's passes, while this lasts."""
     layers: Any = ours.paligemma_with_expert.gemma_expert.model.layers
-    norms = [layer.post_attention_layernorm for layer in layers]
+    norms, passes = [layer.post_attention_layernorm for layer in layers], Passes(ours, memory)
     for layer, norm in zip(layers, norms, strict=True):
         if isinstance(norm, ModulatedNorm):
-            layer.post_attention_layernorm = Norm(norm)
+            layer.post_attention_layernorm = Norm(norm, passes)
     try:
-        yield Passes(ours)
+        yield passes
     finally:
         for layer, norm in zip(layers, norms, strict=True):
             layer.post_attention_layernorm = norm

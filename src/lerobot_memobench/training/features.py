@@ -34,6 +34,7 @@ from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.perception.visual_encoder import GRID, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.checkpoint import undamaged
+from lerobot_memobench.policies.memobench_mem.backbone import make_backbone
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -46,7 +47,6 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     thumbnails,
 )
 from lerobot_memobench.policies.memobench_mem.losses import rank_of_world
-from lerobot_memobench.policies.memobench_mem.network import SizedPaliGemmaWithExpert
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS, ObjectsFromPictures
 from lerobot_memobench.sim.object_layout import SIZE
 
@@ -326,7 +326,7 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
             "dataset's columns; leave this command out, or name a detector."
         )
     with torch.device("meta"):
-        model = SizedPaliGemmaWithExpert(config).paligemma.model
+        model = make_backbone(config).paligemma.model
     towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
     tower, projector = (part.to(torch.float32).eval().requires_grad_(False) for part in towers)
     for part, name in ((tower, "vision_tower."), (projector, "multi_modal_projector.")):

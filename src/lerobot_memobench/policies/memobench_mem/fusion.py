@@ -1,7 +1,7 @@
-"""How actions read memory tokens: the interface `MemoryFusion`, and its two kinds.
+"""Ways in which actions read memory tokens: `MemoryFusion`, `Reading`, and the two general ones.
 
-`Modulation` scales and shifts what every layer of the action expert feeds forward (RoboMME's modulator); `Context` puts
-memory into the prefix. Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
+`Modulation` scales and shifts the input of every feed-forward of the action expert (RoboMME's modulator); `Context`
+appends memory to the prefix. Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
 """
 
 from __future__ import annotations
@@ -9,9 +9,7 @@ from __future__ import annotations
 import functools
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, cast
 
 import torch
@@ -23,49 +21,46 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryToke
 
 
 class Prefix(NamedTuple):
-    """What actions are planned from.
+    """The tokens from which actions are planned.
 
     Attributes:
-        tokens: (B, N, D). real: (B, N), which of them are no padding.
-        attends: (B, N, N) bool, which (last) of them each (first) attends to; None: all to all that are real.
-        unread: how many of the first ones actions do not attend to.
-        asked: the tokens whose last states are asked for by `MemoryFusion.read_out`; None: of none.
+        tokens: (B, N, D). real: (B, N) bool, False for padding.
+        instruction: (B, W), added to the condition of the expert's norms; None: nothing is added.
+        attends: (B, N, N) bool, whether a token (first N) attends to another (last N); None: to all real ones.
+        unread: number of leading tokens to which actions do not attend.
+        asked: the tokens whose last states `Reading.read_out` takes; None: none.
     """
 
     tokens: Tensor
     real: Tensor
+    instruction: Tensor | None = None
     attends: Tensor | None = None
     unread: int = 0
     asked: slice | None = None
 
     def joined(self, tokens: Tensor, real: Tensor) -> Prefix:
-        """Return it with more tokens behind, as all attend to."""
+        """Append tokens to which all attend."""
         more = tokens.to(self.tokens.dtype)
-        return Prefix(torch.cat([self.tokens, more], dim=1), torch.cat([self.real, real], dim=1))
+        return Prefix(torch.cat([self.tokens, more], dim=1), torch.cat([self.real, real], dim=1), self.instruction)
 
 
-class MemoryFusion(ABC):
-    """A way by which actions read memory tokens; made once for a model, to which it may add parameters.
+class Reading:
+    """One memory as one pass of the model reads it. This base class is plain pi0.5, which reads none.
 
     Attributes:
-        tells_reads: whether `watched` can say how much each token was read.
+        outputs: results of the pass beyond actions, for `MemoryMechanism.losses`.
+        attention: attention weights (B, H, N, M) of each layer, of the prefix and of the actions; None: not collected.
     """
 
-    tells_reads: ClassVar[bool] = False
-
-    @abstractmethod
-    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
-        """Make ``model`` ready: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
-
-    @abstractmethod
-    def hand_over(self, memory: MemoryTokens) -> None:
-        """Take the memory, of width d_m, that the next passes read."""
+    def __init__(self, watched: bool = False) -> None:
+        self.outputs: dict[str, Tensor] = {}
+        self.attention: tuple[list[Tensor], list[Tensor]] | None = ([], []) if watched else None
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
         """Return the model's prefix, given pi0.5's.
 
         Args:
-            state: place of the token of the robot's state; None: there is none.
+            state: index of the token of the robot's state; None: there is none.
         """
         return prefix
 
@@ -77,23 +72,48 @@ class MemoryFusion(ABC):
         """Return the condition (..., B, W) of the expert's norms, given pi0.5's."""
         return condition
 
-    def read_out(self, states: Tensor) -> None:  # noqa: B027 (most need nothing of it)
+    def feed_forward(self, layer: int, normed: Tensor, inputs: Tensor) -> Tensor:
+        """Return the input (B, T, W) of a layer's feed-forward, given pi0.5's.
+
+        Args:
+            normed: (B, T, W), the tokens at a mean square of one, before pi0.5's scale and shift.
+        """
+        return inputs
+
+    def read_out(self, states: Tensor) -> None:
         """Take the last states (B, n, D) of the prefix's tokens that it asked for."""
 
-    def made(self, states: Tensor) -> None:  # noqa: B027
+    def expert_states(self, states: Tensor) -> None:
         """Take the expert's last states (B, T, W)."""
 
-    def outputs(self) -> dict[str, Tensor]:
-        """Return what the last pass made beside actions, for `MemoryMechanism.losses`."""
-        return {}
+    def shares(self) -> list[Tensor]:
+        """Return how much the pass read of each memory token, (B, L) per layer, if it was watched."""
+        return []
 
-    @contextmanager
-    def watched(self) -> Iterator[list[Tensor]]:
-        """Yield a list to which passes add meanwhile how much they read of each token, (B, L) per layer."""
-        yield []
+
+class MemoryFusion(ABC):
+    """A way in which actions read memory tokens; made once for a model, to which it may add parameters.
+
+    Attributes:
+        tells_reads: whether `Reading.shares` of a watched pass are known.
+    """
+
+    tells_reads: ClassVar[bool] = False
+
+    @abstractmethod
+    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+        """Prepare ``model``: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
+
+    @abstractmethod
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+        """Begin a pass over a memory of width ``memory_dim``.
+
+        Args:
+            watched: collect how much of each token is read.
+        """
 
     def owns(self, name: str) -> bool:
-        """Say whether a parameter of the model is this fusion's, and no part of pi0.5."""
+        """Return whether a parameter of the model belongs to this fusion and not to pi0.5."""
         return False
 
     def place_of(self, name: str) -> str:
@@ -160,19 +180,16 @@ class MemoryModulator(nn.Module):
         return rotate_from(key, 0), value
 
     def forward(
-        self, actions: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor] | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Scale and shift, both (B, T, W), for actions (B, T, W) from memory of width W.
-
-        ``keys`` are those of the same memory, if they have been computed before. A row whose memory is all masked
-        reads zeros.
-        """
-        return self.read(rms_norm(actions), memory, self.keys(memory) if keys is None else keys)
-
-    def read(
         self, normed: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor], found: list[Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Do as `forward`, of actions whose mean square is one; add to ``found`` how much is read, (B, L)."""
+        """Return scale and shift, both (B, T, W), for actions (B, T, W) whose mean square is one.
+
+        A row whose memory is all masked reads zeros.
+
+        Args:
+            memory: of width W. keys: those of this memory.
+            found: a list to which the share read of each memory token (B, L) is appended.
+        """
         weights: list[Tensor] | None = None if found is None else []
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
         query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
@@ -185,79 +202,55 @@ class MemoryModulator(nn.Module):
         return scale, shift
 
 
-@dataclass
-class SharedMemory:
-    """What every modulated layer reads during one forward pass: memory at the expert's width.
-
-    It is kept until the next pass replaces it, because gradient checkpointing runs layers again in ``backward``. In a
-    rollout the layers' keys of this memory are kept as well: all denoising steps of a plan read the same memory.
-
-    Attributes:
-        found: takes how much of each token each layer reads, where somebody looks.
-    """
-
-    memory: MemoryTokens | None = None
-    keys: dict[nn.Module, tuple[Tensor, Tensor]] = field(default_factory=dict)
-    found: list[Tensor] | None = None
-
-    def set(self, memory: MemoryTokens, modulators: Iterable[MemoryModulator] = ()) -> None:
-        """Begin a pass over another memory; the keys of these are made once where no gradients are wanted."""
-        self.memory = memory
-        self.keys = {} if torch.is_grad_enabled() else {one: one.keys(memory) for one in modulators}
-
-    def keys_of(self, modulator: MemoryModulator) -> tuple[Tensor, Tensor]:
-        """Keys and values of a layer."""
-        assert self.memory is not None
-        return self.keys[modulator] if modulator in self.keys else modulator.keys(self.memory)
-
-
 class ModulatedNorm(nn.Module):
-    """LeRobot's norm before an expert layer's feed-forward, followed by the memory's modulation.
+    """Parameters of LeRobot's norm before an expert layer's feed-forward, and of the memory's modulation after it."""
 
-    The residual stays outside, so x <- norm(x) * (1 + scale) + shift here touches nothing else.
-    """
-
-    def __init__(self, norm: nn.Module, modulator: MemoryModulator, state: SharedMemory) -> None:
+    def __init__(self, norm: nn.Module, modulator: MemoryModulator) -> None:
         super().__init__()
         self.norm = norm
         self.modulator = modulator
-        self.state = state
 
-    def forward(self, x: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised and modulated x (B, T, W), and the norm's gate (B, 1, W).
 
-        Args:
-            modulation: (B, 1, 3 W), scale, shift and gate of the norm itself.
-        """
-        scale, shift, gate = modulation.float().chunk(3, dim=-1)
-        normed = rms_norm(x)
-        made = torch.addcmul(shift, normed, 1 + scale)
-        if self.state.memory is not None:
-            keys = self.state.keys_of(self.modulator)
-            scale, shift = self.modulator.read(normed, self.state.memory, keys, self.state.found)
-            made = torch.addcmul(shift, made, 1 + scale)
-        return made.to(x.dtype), gate.to(x.dtype)
+class ModulatedReading(Reading):
+    """A pass whose expert is scaled and shifted by memory of the expert's width W."""
+
+    def __init__(self, memory: MemoryTokens, modulators: Sequence[MemoryModulator], watched: bool) -> None:
+        super().__init__()
+        self.memory, self.modulators = memory, modulators
+        self.found: list[Tensor] | None = [] if watched else None
+        # All denoising steps of a plan read the same keys. In training each layer runs once, or twice by checkpointing.
+        self.keys = None if torch.is_grad_enabled() else [modulator.keys(memory) for modulator in modulators]
+
+    def feed_forward(self, layer: int, normed: Tensor, inputs: Tensor) -> Tensor:
+        """Scale and shift pi0.5's input. The residual stays outside."""
+        modulator = self.modulators[layer]
+        keys = modulator.keys(self.memory) if self.keys is None else self.keys[layer]
+        scale, shift = modulator(normed, self.memory, keys, self.found)
+        return torch.addcmul(shift, inputs, 1 + scale)
+
+    def shares(self) -> list[Tensor]:
+        """Return the modulators' attention to each token."""
+        return self.found or []
 
 
 class Modulation(MemoryFusion):
-    """Memory at the expert's width, and a modulated norm in each of the expert's layers.
+    """Memory at the expert's width, and a modulator in each of the expert's layers.
 
-    Wrapped norms are one level deeper than in plain pi0.5.
+    Norms with a modulator are one level deeper than in plain pi0.5.
     """
 
     tells_reads = True
 
     def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        self.model, self.shared = model, SharedMemory()
+        self.model = model
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
         for layer in model.paligemma_with_expert.gemma_expert.model.layers:
-            layer.post_attention_layernorm = ModulatedNorm(
-                layer.post_attention_layernorm, MemoryModulator(expert_dim), self.shared
-            )
+            layer.post_attention_layernorm = ModulatedNorm(layer.post_attention_layernorm, MemoryModulator(expert_dim))
 
-    def hand_over(self, memory: MemoryTokens) -> None:
-        """Begin a pass over this memory in every layer."""
-        self.shared.set(memory.through(cast(nn.Linear, self.model.memory_to_expert)), self.modulators)
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+        """Project the memory to the expert's width."""
+        projected = memory.through(cast(nn.Linear, self.model.memory_to_expert))
+        return ModulatedReading(projected, self.modulators, watched)
 
     @property
     def modulators(self) -> list[MemoryModulator]:
@@ -266,26 +259,16 @@ class Modulation(MemoryFusion):
         return [layer.post_attention_layernorm.modulator for layer in layers]
 
     def open_gate(self) -> None:
-        """Draw what starts at zero, so that memory gets gradients from the first update on."""
+        """Draw the layers that start at zero, so that memory gets gradients from the first update on."""
         for modulator in self.modulators:
             modulator.modulation.reset_parameters()
 
-    @contextmanager
-    def watched(self) -> Iterator[list[Tensor]]:
-        """Yield how much the modulators look at each token."""
-        found: list[Tensor] = []
-        self.shared.found = found
-        try:
-            yield found
-        finally:
-            self.shared.found = None
-
     def owns(self, name: str) -> bool:
-        """Say whether a parameter is the projection's or a modulator's."""
+        """Return whether a parameter is the projection's or a modulator's."""
         return name.startswith("memory_to_expert.") or ".modulator." in name
 
     def place_of(self, name: str) -> str:
-        """Return a wrapped norm's parameters under their name here."""
+        """Return the name here of a parameter of a norm."""
         if ".gemma_expert." not in name:
             return name
         return re.sub(r"post_attention_layernorm\.(dense|weight)", r"post_attention_layernorm.norm.\1", name)
@@ -299,32 +282,33 @@ def plain_name(name: str) -> str:
 # -- context ----------------------------------------------------------------------------------------------------------
 
 
+class ContextReading(Reading):
+    """A pass whose prefix ends with the memory."""
+
+    def __init__(self, memory: MemoryTokens, watched: bool) -> None:
+        super().__init__(watched)
+        self.memory = memory
+
+    def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
+        """Append the memory, which attends and is attended like images and language."""
+        return prefix.joined(self.memory.rows(), self.memory.mask)
+
+    def shares(self) -> list[Tensor]:
+        """Return the share of the actions' attention that each memory token gets."""
+        length = self.memory.mask.shape[1]
+        _, of_actions = self.attention or ([], [])
+        # (B, heads, T, prefix and T), with memory at the prefix's end
+        return [weights[..., -weights.shape[2] - length : -weights.shape[2]].mean(dim=(1, 2)) for weights in of_actions]
+
+
 class Context(MemoryFusion):
     """The whole prefix and the actions attend to memory tokens; nothing is added to the model."""
 
     tells_reads = True
 
     def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        self.model, self.memory = model, cast("MemoryTokens | None", None)
+        pass
 
-    def hand_over(self, memory: MemoryTokens) -> None:
-        """Keep this memory for the next prefix."""
-        self.memory = memory
-
-    def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Append the memory, which attends and is attended like images and language."""
-        if self.memory is None:
-            return prefix
-        return prefix.joined(self.memory.rows(), self.memory.mask)
-
-    @contextmanager
-    def watched(self) -> Iterator[list[Tensor]]:
-        """Yield how much actions attend to each token: a share of all that they attend to."""
-        assert self.memory is not None
-        length = self.memory.mask.shape[1]
-        found: list[Tensor] = []
-        with self.model.paligemma_with_expert.watched() as (_, of_actions):
-            yield found
-        for weights in of_actions:  # (B, heads, T, prefix and T), memory at the prefix's end
-            actions = weights.shape[2]
-            found.append(weights[..., -actions - length : -actions].mean(dim=(1, 2)))
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+        """Begin a pass over this memory."""
+        return ContextReading(memory, watched)

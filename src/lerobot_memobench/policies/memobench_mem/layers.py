@@ -46,10 +46,15 @@ def rms_norm(x: Tensor) -> Tensor:
     return F.rms_norm(x, x.shape[-1:], eps=EPS)
 
 
+def scaled_and_shifted(normed: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
+    """Return normed (B, N, W) scaled and shifted, and the gate (B, 1, W), by scale, shift and gate (B, 1, 3 W)."""
+    scale, shift, gate = modulation.chunk(3, dim=-1)
+    return torch.addcmul(shift.float(), normed, 1 + scale.float()), gate
+
+
 def modulated(x: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
     """Return the adaptive norm of x (B, N, W), given scale, shift and gate (B, 1, 3 W), and the gate (B, 1, W)."""
-    scale, shift, gate = modulation.chunk(3, dim=-1)
-    normed = torch.addcmul(shift.float(), rms_norm(x), 1 + scale.float())
+    normed, gate = scaled_and_shifted(rms_norm(x), modulation)
     return normed.to(x.dtype), gate.to(x.dtype)
 
 

@@ -11,7 +11,7 @@ import copy
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     PrefixParts,
     VisualTokenEncoder,
 )
+from lerobot_memobench.policies.memobench_mem.fusion import Reading
 from lerobot_memobench.policies.memobench_mem.losses import (
     counted_actions,
     losses_of,
@@ -71,8 +72,9 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Precision
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
+from lerobot_memobench.policies.memobench_mem.precision import Precision
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.policies.memory_reads import Chunk, chunk_reads
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
@@ -173,6 +175,11 @@ class MemobenchMemPolicy(PI05Policy):
             parts, masks = [*parts, state], [*masks, torch.ones(len(state), dtype=torch.bool)]
         return [part.to(self._device) for part in parts], [mask.to(self._device) for mask in masks]
 
+    def _seen(self, batch: dict[str, Tensor]) -> Observation:
+        """Return the model's inputs of a batch."""
+        parts, masks = self._preprocess_images(batch)
+        return Observation(parts, masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK])
+
     # -- training --------------------------------------------------------------------------------------------------
 
     def trained_parameters(self) -> dict[str, nn.Parameter]:
@@ -209,8 +216,9 @@ class MemobenchMemPolicy(PI05Policy):
             memory = self.read_memory(batch)
             if measures and self.config.privileged_memory:  # whose losses are of the labels, and actions of its choice
                 memory = self.read_memory(_without_labels(batch))
-            per_sample, total, logged = self._action_loss(batch)
-            for name, loss in self._memory_losses(batch).items():
+            reading = self.model.reading(memory)
+            per_sample, total, logged = self._action_loss(batch, reading)
+            for name, loss in self._memory_losses(batch, reading).items():
                 per_sample, total = per_sample + loss, total + loss.mean()
                 logged[f"memory_{name}_loss"] = loss.mean().item()
             if self.alignment is not None and memory is not None:
@@ -239,18 +247,16 @@ class MemobenchMemPolicy(PI05Policy):
         return {PHASE: batch[OBS_PHASE], **batch} if OBS_PHASE in batch else batch
 
     def read_memory(self, batch: dict[str, Tensor]) -> MemoryTokens | None:
-        """Read what the samples of a batch remember, and hand it to the model; None without a memory."""
+        """Return the memory tokens of the samples of a batch; None without a memory."""
         if self.model.memory is None:
             return None
         parts = batch[FRAMES], batch[STEPS], batch[PLACES], batch.get(SUBGOALS), batch.get(AHEAD), batch.get(EXACT)
         histories = Histories(*parts).to(self._device)
-        memory = self.model.memory.replay(histories, self._query(batch))
-        self.model.set_memory(memory)
-        return memory
+        return self.model.memory.replay(histories, self._query(batch))
 
-    def _memory_losses(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        memory, fusion = self.model.memory, self.model.fusion
-        return {} if memory is None or fusion is None else memory.losses({**batch, **fusion.outputs()})
+    def _memory_losses(self, batch: dict[str, Tensor], reading: Reading) -> dict[str, Tensor]:
+        memory = self.model.memory
+        return {} if memory is None else memory.losses({**batch, **reading.outputs})
 
     def _query(self, batch: dict[str, Tensor], rows: Sequence[int] | None = None, *, writes: bool = False) -> Query:
         """Return the present of some rows of a batch as far as the memory asks for it.
@@ -269,13 +275,11 @@ class MemobenchMemPolicy(PI05Policy):
             query = query._replace(choices=batch[CHOICES][chosen].to(device), subgoal=labels)
         return query
 
-    def _action_loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    def _action_loss(self, batch: dict[str, Tensor], reading: Reading) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Return the loss of the actions per sample (B,), its mean over the actions that count, and numbers to log."""
-        images, image_masks = self._preprocess_images(batch)
-        actions = self.prepare_action(batch)
-        words = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        seen, actions = self._seen(batch), self.prepare_action(batch)
         drawn = noise_and_time(self.config.objective, self.model, actions)
-        squared = self.model.forward(images, image_masks, *words, actions, *drawn)[:, :, : self._action_dim]
+        squared = self.model.forward(seen, actions, *drawn, reading)[:, :, : self._action_dim]
         losses = losses_of(self.config.objective, squared)
         found = mean_losses(losses, counted_actions(batch, losses))
         logged = {"action_loss": found.mean.item(), "loss_per_dim": found.per_dim.cpu().tolist()}
@@ -405,29 +409,25 @@ class MemobenchMemPolicy(PI05Policy):
         """
         inputs = [*self._inputs, *(key for key in batch if key.startswith(ENCODED))]
         part = {key: batch[key][rows] for key in inputs if key in batch}
-        images, image_masks = self._preprocess_images(part)
-        words = part[OBS_LANGUAGE_TOKENS], part[OBS_LANGUAGE_ATTENTION_MASK]
+        seen, memory = self._seen(part), None
         with self.precision.computing(self._device):
             if training:
-                self.read_memory(_without_labels(batch))
+                memory = self.read_memory(_without_labels(batch))
             elif self._remembers:
                 self._require_history(rows)
                 memory = self.remembered(batch, rows)
-                self.model.set_memory(memory)
-            watching = self._watching(rows, memory) if self._watched and not training else contextlib.nullcontext()
-            with watching:
-                noise = noise.to(self._device)
-                actions = self.model.sample_actions(images, image_masks, *words, noise=noise, **kwargs)
+            watched = self._watched and memory is not None and not training
+            reading = self.model.reading(memory, watched)
+            actions = self.model.sample_actions(seen, noise.to(self._device), reading, **kwargs)
+            if watched and memory is not None:
+                self._keep_reads(rows, memory, reading)
         return actions[:, :, : self._action_dim]
 
-    @contextlib.contextmanager
-    def _watching(self, rows: Sequence[int], memory: MemoryTokens) -> Iterator[None]:
-        """Keep how much the chunks of some rows read of their memory, which are planned while this lasts."""
-        assert self.model.fusion is not None
-        with self.model.fusion.watched() as layers:
-            yield
+    def _keep_reads(self, rows: Sequence[int], memory: MemoryTokens, reading: Reading) -> None:
+        """Keep how much the chunks of some rows read of their memory."""
         held = [self.rollout.rows[row] for row in rows]
-        for row, read in zip(held, chunk_reads([row.position for row in held], memory, layers), strict=True):
+        found = chunk_reads([row.position for row in held], memory, reading.shares())
+        for row, read in zip(held, found, strict=True):
             row.reads.append(read)
 
     def watch_memory(self, watched: bool = True) -> None:

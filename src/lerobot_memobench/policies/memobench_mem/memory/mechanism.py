@@ -338,7 +338,7 @@ class MemoryMechanism(nn.Module, ABC):
         actions follow its own choice.
 
         Args:
-            batch: the training batch, and what its fusion made beside actions (`MemoryFusion.outputs`).
+            batch: the training batch, and what its fusion made beside actions (`Reading.outputs`).
         """
         return {}
 

@@ -16,7 +16,7 @@ import torch
 from einops import rearrange, reduce, repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Reading
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     Histories,
     MemoryMechanism,
@@ -55,8 +55,30 @@ class MotionExpert(nn.Module):
         self.decode = nn.Sequential(nn.Linear(width, width), nn.Tanh(), nn.Linear(width, numbers))
 
 
+class ForesightReading(Reading):
+    """A pass with hindsight in the condition of the expert's norms, and motion queries before the actions."""
+
+    def __init__(self, expert: MotionExpert, memory: MemoryTokens) -> None:
+        super().__init__()
+        self.expert, self.hindsight = expert, expert.condition(memory.rows().squeeze(1))
+
+    def actions(self, tokens: Tensor) -> Tensor:
+        """Insert the queries before the actions, to which they attend as actions do."""
+        queries = repeat(self.expert.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
+        return torch.cat([queries, tokens], dim=1)
+
+    def condition(self, condition: Tensor) -> Tensor:
+        """Add hindsight."""
+        hindsight: Tensor = self.hindsight
+        return condition + hindsight
+
+    def expert_states(self, states: Tensor) -> None:
+        """Decode the motion (B, n, C k) that the queries foresee."""
+        self.outputs[FORESEEN] = self.expert.decode(states[:, :FORESIGHT].to(torch.float32))
+
+
 class Foresight(MemoryFusion):
-    """Hindsight is added to the condition of the expert's norms; motion queries stand before the actions.
+    """Hindsight is added to the condition of the expert's norms; motion queries precede the actions.
 
     Queries and actions attend to each other, so the actions' positions are `FORESIGHT` further on than in plain pi0.5.
     """
@@ -65,33 +87,13 @@ class Foresight(MemoryFusion):
         self.model = cast(Any, model)
         pool = self.model.memory.pool
         self.model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
-        self.hindsight: Tensor | None = None
-        self.foreseen: Tensor | None = None
 
-    def hand_over(self, memory: MemoryTokens) -> None:
-        """Make the condition of the next passes."""
-        self.hindsight = self.model.foresight.condition(memory.rows().squeeze(1))
-
-    def actions(self, tokens: Tensor) -> Tensor:
-        """Put the queries before the actions, to which they attend as actions do."""
-        queries = repeat(self.model.foresight.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
-        return tokens if self.hindsight is None else torch.cat([queries, tokens], dim=1)
-
-    def condition(self, condition: Tensor) -> Tensor:
-        """Add what hindsight says."""
-        return condition if self.hindsight is None else condition + self.hindsight
-
-    def made(self, states: Tensor) -> None:
-        """Keep the queries' states."""
-        self.foreseen = states[:, :FORESIGHT]
-
-    def outputs(self) -> dict[str, Tensor]:
-        """Return the motion (B, n, C k) that the last pass foresaw."""
-        foreseen, self.foreseen = self.foreseen, None
-        return {} if foreseen is None else {FORESEEN: self.model.foresight.decode(foreseen.to(torch.float32))}
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+        """Make the condition of this pass."""
+        return ForesightReading(self.model.foresight, memory)
 
     def owns(self, name: str) -> bool:
-        """Say whether a parameter is the queries', the condition's or the decoder's."""
+        """Return whether a parameter is the queries', the condition's or the decoder's."""
         return name.startswith("foresight.")
 
 

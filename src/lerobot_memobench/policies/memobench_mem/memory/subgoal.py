@@ -6,8 +6,7 @@ the tokens of that text follow the prefix, attend to all of it, and are all that
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -15,7 +14,7 @@ import torch.nn.functional as F
 from einops import repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix, Reading
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
@@ -41,8 +40,8 @@ class SubgoalChoice(nn.Module):
         self.texts = CheckpointTexts(texts, width)
 
 
-class NarrowChannel(MemoryFusion):
-    """The prefix holds LeRobot's, the memory, and ``ask``; behind them stand the text said and a copy of the state.
+class NarrowReading(Reading):
+    """A pass whose prefix holds LeRobot's, the memory and ``ask``, then the chosen text and a copy of the state.
 
     | attends to            | prefix, memory, ask | text | copy of the state | actions |
     |-----------------------|---------------------|------|-------------------|---------|
@@ -51,61 +50,47 @@ class NarrowChannel(MemoryFusion):
     | copy of the state     |                     |      | yes               |         |
     | actions               |                     | yes  | yes               | yes     |
 
-    The state's own token attends to the whole prefix, so that its states would be a second channel: hence a copy. Where
-    the state enters as words of the text prompt there is none. Conditions of the expert's norms are told the text and
-    not the instruction.
+    The state's own token attends to the whole prefix, so its states would be a second channel: hence a copy. Where
+    the state enters as words of the text prompt there is none. Conditions of the expert's norms come from the text
+    instead of the instruction.
 
-    In training the text is the true one; otherwise a pass over the prefix chooses it, which does not depend on what
-    stands behind.
+    In training the text is the true one; otherwise a pass over the prefix chooses it, which does not depend on the
+    tokens behind.
 
     Attributes:
-        said: (B,) number of the text of the last prefix; S: none.
+        said: (B,) number of the text of the prefix; S: none.
     """
 
-    tells_reads = True
-
-    def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
-        self.model = model
-        assert model.memory is not None
-        self.count = len(model.memory.spec.subgoals)
-        model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
-        self.memory: MemoryTokens | None = None
+    def __init__(self, model: MemoryPI05, memory: MemoryTokens, watched: bool) -> None:
+        super().__init__(watched)
+        assert memory.query is not None
+        self.model, self.memory, self.query = model, memory, memory.query
+        self.choice = cast(SubgoalChoice, model.subgoal)
         self.said: Tensor | None = None
-        self._scores: Tensor | None = None
-
-    def hand_over(self, memory: MemoryTokens) -> None:
-        """Keep this memory, and what may be said, for the next prefix."""
-        self.memory, self._scores = memory, None
-
-    def owns(self, name: str) -> bool:
-        """Say whether a parameter is of the choice."""
-        return name.startswith("subgoal.")
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
         """Append memory, text and the state's copy."""
-        memory, added = self.memory, cast(SubgoalChoice, self.model.subgoal)
-        assert memory is not None
-        assert memory.query is not None
+        memory, true = self.memory, self.query.subgoal
         own = prefix.tokens[:, : 0 if state is None else state + 1][:, -1:]
-        ask = repeat(added.ask, "1 1 d -> b 1 d", b=len(own))
+        ask = repeat(self.choice.ask, "1 1 d -> b 1 d", b=len(own))
         prefix = prefix.joined(memory.rows(), memory.mask).joined(ask, memory.mask.new_ones(len(own), 1))
-        unread, true = prefix.tokens.shape[1], memory.query.subgoal
+        unread, none = prefix.tokens.shape[1], self.choice.score.out_features
         prefix = prefix._replace(asked=slice(unread - 1, unread))
-        said = self.said = self._chosen(prefix) if true is None else torch.where(true < 0, self.count, true)
-        text, of_text = added.texts(said)
+        said = self.said = self._chosen(prefix) if true is None else torch.where(true < 0, none, true)
+        text, of_text = self.choice.texts(said)
         if self.model.instruction is not None:
-            self.model.instruction.read(text, of_text)
+            prefix = prefix._replace(instruction=self.model.instruction(text, of_text))
         whole = prefix.joined(text, of_text).joined(own, of_text.new_ones(own.shape[:2]))
-        return whole._replace(attends=self.attention(whole, unread, own.shape[1]), unread=unread, asked=prefix.asked)
+        return whole._replace(attends=self.attends(whole, unread, own.shape[1]), unread=unread, asked=prefix.asked)
 
-    def attention(self, prefix: Prefix, unread: int, copies: int) -> Tensor:
+    def attends(self, prefix: Prefix, unread: int, copies: int) -> Tensor:
         """Return which tokens attend to which, (B, N, N) bool: see the table.
 
         Args:
-            unread: how many of the first ones actions do not read. copies: 1 where the last is the state's copy.
+            unread: number of leading tokens that actions do not read. copies: 1 where the last is the state's copy.
         """
         places = torch.arange(prefix.tokens.shape[1], device=prefix.tokens.device)
-        part = (places >= unread).int() + (places >= len(places) - copies).int()  # 0: what is before, 1: text, 2: copy
+        part = (places >= unread).int() + (places >= len(places) - copies).int()  # 0: before the text, 1: text, 2: copy
         of_query, of_key = part[:, None], part
         seen = torch.where(of_query == 2, of_key == 2, of_key <= of_query)
         return seen.expand(len(prefix.tokens), -1, -1)
@@ -113,36 +98,46 @@ class NarrowChannel(MemoryFusion):
     @torch.no_grad()
     def _chosen(self, prefix: Prefix) -> Tensor:
         """Return the texts (B,) that a pass over this prefix chooses."""
-        self.model.read_prefix(prefix)
-        assert self._scores is not None
-        return self._scores.argmax(dim=1)
+        self.model.read_prefix(prefix, self)
+        return self.outputs[SCORES].argmax(dim=1)
 
     def read_out(self, states: Tensor) -> None:
-        """Score the texts by the last state of ``ask``."""
-        added, memory = cast(SubgoalChoice, self.model.subgoal), self.memory
-        assert memory is not None
-        assert memory.query is not None
-        assert memory.query.choices is not None
-        self._scores = scored(added.score(states[:, 0].to(added.score.weight.dtype)), memory.query.choices)
+        """Score the texts by the last state of ``ask``: (B, S + 1)."""
+        assert self.query.choices is not None
+        score = self.choice.score
+        self.outputs[SCORES] = scored(score(states[:, 0].to(score.weight.dtype)), self.query.choices)
 
-    @contextmanager
-    def watched(self) -> Iterator[list[Tensor]]:
-        """Yield how much the text said attends to each of the memory's tokens: a share of all that it attends to."""
-        found: list[Tensor] = []
-        with self.model.paligemma_with_expert.watched() as (of_prefix, _):
-            yield found
-        assert self.memory is not None
+    def shares(self) -> list[Tensor]:
+        """Return the share of the chosen text's attention that each memory token gets."""
         assert self.said is not None
-        _, real = cast(SubgoalChoice, self.model.subgoal).texts(self.said)
+        _, real = self.choice.texts(self.said)
         words, length = real.shape[1], self.memory.mask.shape[1]
+        of_prefix, _ = self.attention or ([], [])
+        found = []
         for weights in of_prefix[len(of_prefix) // 2 :]:  # (B, heads, N, N), after the pass that chooses
             unread = weights.shape[2] - words - (self.model.state_token is not None)
             read = weights[:, :, unread : unread + words, unread - 1 - length : unread - 1].mean(dim=1)
             found.append((read * real.unsqueeze(-1)).sum(dim=1) / real.sum(dim=1, keepdim=True))
+        return found
 
-    def outputs(self) -> dict[str, Tensor]:
-        """Return the scores (B, S + 1) of the texts."""
-        return {} if self._scores is None else {SCORES: self._scores}
+
+class NarrowChannel(MemoryFusion):
+    """Choose a text by prefix and memory; actions read that text alone (`NarrowReading`)."""
+
+    tells_reads = True
+
+    def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
+        self.model = model
+        assert model.memory is not None
+        model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
+
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+        """Begin a pass over this memory, whose ``query`` holds the texts to choose from."""
+        return NarrowReading(self.model, memory, watched)
+
+    def owns(self, name: str) -> bool:
+        """Return whether a parameter is of the choice."""
+        return name.startswith("subgoal.")
 
 
 class Subgoal(Frames):
