@@ -169,7 +169,7 @@ def test_another_study_in_the_same_folder_is_refused(work: Study, twice_root: Pa
 def test_a_dataset_of_nobody_knows_what_is_refused(twice_root: Path, tmp_path: Path) -> None:
     from tests.support.object_dataset import make_object_dataset
 
-    with pytest.raises(MemobenchError, match=r"of the episode 0 of .*, it tells neither task nor seed"):
+    with pytest.raises(MemobenchError, match=r"of the episode 0 of .*, it has neither task nor seed"):
         Study(make_object_dataset(tmp_path / "strange"), tmp_path / "out", SETTINGS)
     assert not (tmp_path / "out").exists()
 

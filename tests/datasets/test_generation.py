@@ -17,6 +17,7 @@ import pytest
 from lerobot_memobench.datasets import generation, recording
 from lerobot_memobench.datasets.generation import generate, slurm_of
 from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_dataset
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.slurm import run_part
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
@@ -50,8 +51,8 @@ def recorded(make_demo, monkeypatch):
 
     def episode(task, settings):
         progress = SimpleNamespace(index=1, steps=1200)
-        told = {"prompt_shown": None, "horizon": 1200, "referent": "fixed", "lost": False, "fault": None}
-        return SimpleNamespace(task=task, progress=progress, **told)
+        state = {"prompt_shown": None, "referent": "fixed", "lost": False, "fault": None}
+        return SimpleNamespace(task=task, progress=progress, settings=EnvSettings(), **state)
 
     monkeypatch.setattr(recording, "compiled_episode", episode)
     monkeypatch.setattr(recording, "record", record)

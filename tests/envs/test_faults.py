@@ -181,7 +181,7 @@ def test_a_task_that_cannot_be_run_is_counted_as_not_run(folder: Path, tmp_path:
     log = tmp_path / "log"
     env = vector(log, 2, use_async, task_dir=str(folder), expert_action=True, horizon=4)
     _, info = env.reset(seed=SEEDS[:2], options={"lerobot_new_rollout": True})
-    assert all("the expert puts things into drawers only" in why for why in info["fault"])
+    assert all("the expert places objects into drawers only" in why for why in info["fault"])
     *_, terminated, truncated, info = env.step(np.tile(REST, (2, 1)))
     assert truncated.all()
     assert not terminated.any()
@@ -206,7 +206,7 @@ def test_a_task_that_cannot_be_run_is_counted_as_not_run(folder: Path, tmp_path:
     assert report.run.summary.rollouts == 1
     note, nobodys = report.run.notes
     assert nobodys == f"{tmp_path / 'merged'} does not say whose episodes it holds: no part of it did"
-    assert note.startswith("a_shelf was not run, and the figures are without that: the expert puts things")
+    assert note.startswith("a_shelf was not run, and the figures are without that: the expert places objects")
     for _ in range(2):  # and again from the merged file
         assert write_report(tmp_path / "merged").notes == [note]
         assert json.loads((tmp_path / "merged" / "report.json").read_text())["not_run"] == {"a_shelf": 2}
@@ -228,7 +228,7 @@ def test_a_folder_with_a_task_that_cannot_be_run_is_evaluated(
     for more in ((), ("resume=true",)):
         assert main(["eval", *words, "eval.use_async_envs=false", f"output_dir={tmp_path / 'out'}", *more]) == 0
         told = " ".join(capsys.readouterr().out.split())
-        assert "note: a_shelf was not run, and the figures are without that: the expert puts things" in told
+        assert "note: a_shelf was not run, and the figures are without that: the expert places objects" in told
         assert [record["task"] for record in read_episodes(tmp_path / "out")] == [STOVE]
         assert json.loads((tmp_path / "out" / "report.json").read_text())["not_run"] == {"a_shelf": 1}
     named = json.loads((tmp_path / "out" / "evaluation.json").read_text())["episodes"]
@@ -237,7 +237,7 @@ def test_a_folder_with_a_task_that_cannot_be_run_is_evaluated(
 
 def test_without_a_log_a_task_that_cannot_be_run_is_an_error(folder: Path) -> None:
     env = MemobenchEnv(str(folder), obs_type=OBJECTS, expert_action=True)
-    said = "drawers only, and 'shelf_1_top_region' is none; the scene has no drawer, let a policy of your own"
+    said = "into drawers only, and 'shelf_1_top_region' is not a drawer"
     with pytest.raises(MemobenchError, match=said):
         env.reset(seed=20_000)
 

@@ -105,7 +105,7 @@ def acted(name: str, asked: int, answered: int, horizon: int = 1200) -> dict[str
     expert = Expert(base.variant(answered), episode.sim, np.random.default_rng(3))
     while not (episode.done or expert.done):
         episode.step(expert.act())
-    return episode_record(episode, episode.seed - 20_000, replan_steps=None, wall_s=0.0)
+    return episode_record(episode, episode.seed - 20_000, wall_s=0.0)
 
 
 PROCEDURES = task_names("procedural")

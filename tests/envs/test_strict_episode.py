@@ -139,7 +139,7 @@ def test_the_stove_as_often_as_asked_for(asked: int, done: int) -> None:
             break
         episode.step(action)
     assert (episode.success, episode.lost) == (asked == done, asked != done)
-    assert episode.exec_steps < episode.horizon
+    assert episode.exec_steps < episode.settings.horizon
 
 
 def test_a_published_episode_goes_on_though_nothing_can_be_mended() -> None:
@@ -199,10 +199,10 @@ def test_a_configuration_knows_its_suites_tasks(tmp_path: Path) -> None:
     assert len(MemobenchEnvConfig().selected()) == 30
     with pytest.raises(MemobenchError, match=r"suite is 'strikt'"):
         MemobenchEnvConfig(suite="strikt")
-    with pytest.raises(MemobenchError, match="say suite=strict, or --suite strict"):
+    with pytest.raises(MemobenchError, match="set suite=strict, or --suite strict"):
         MemobenchEnvConfig(tasks=STOVE).selected()
     folder = str(get_task(STOVE).folder)
-    with pytest.raises(MemobenchError, match=r"task of the strict suite and env\.suite is published; say suite=strict"):
+    with pytest.raises(MemobenchError, match=r"task of the strict suite and env\.suite is published; set suite=strict"):
         MemobenchEnvConfig(task_dir=folder).selected()
     assert len(MemobenchEnvConfig(task_dir=folder, suite=STRICT).selected()) == 1
 

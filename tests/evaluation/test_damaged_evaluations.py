@@ -115,7 +115,7 @@ def check(tmp_path: Path, files: str, count: int) -> tuple[int, int]:
 KINDS = {
     "log": "episodes.jsonl episodes.jsonl episodes/one.1.jsonl",
     "protocol": "protocol.json",
-    "card": "card.json",
+    "card": "evaluation.json",
 }
 
 
@@ -129,7 +129,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_evaluations(tmp_path: Path, kind: str) -> None:
     results, refused = check(tmp_path, KINDS[kind], 30)
-    assert results > 8
+    assert results > 4
     assert refused > 2
 
 

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes, write_episodes
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.evaluation.headline import headline
@@ -110,12 +111,13 @@ def test_markdown_has_intervals_and_dashes(tmp_path: Path) -> None:
 def prompted(folder: Path, policy: dict[str, Any], checkpoint: dict[str, Any] | None = None, **changes: Any) -> Path:
     """An evaluation whose prompt was seen by ``policy``, with a card where there is a ``checkpoint``."""
     settings = {**logs.SETTINGS, "replan_steps": 5, "prompt_in": "steps", "policy": policy, **changes}
-    log = EpisodeLog(folder, settings)
+    write_protocol(folder, settings)
+    log = EpisodeLog(folder)
     for k in range(2):
         log.append(record("first", "object", k, True, prompt_steps=30, inputs="pixels", suite="strict"))
     if checkpoint is not None:
-        card = {"protocol": {"episodes": 2}, "policy": policy, "checkpoint": checkpoint}
-        (folder / "card.json").write_text(json.dumps(card))
+        card = {"protocol": {**settings, "episodes": 2}, "policy": policy, "checkpoint": checkpoint}
+        (folder / EVALUATION_FILE).write_text(json.dumps(card))
     return folder
 
 
@@ -158,13 +160,13 @@ def test_the_first_line_of_several(tmp_path: Path) -> None:
 
 
 def kept(folder: Path) -> Path:
-    """Compress an evaluation as ``gzip -9n episodes.jsonl card.json`` does, and leave nothing else."""
+    """Compress an evaluation as ``gzip -9n episodes.jsonl evaluation.json`` does, and leave nothing else."""
     write_report(prompted(folder, {"type": "act"}, {"path": "user/mine"}))
-    for name in ("episodes.jsonl", "card.json"):
+    for name in ("episodes.jsonl", EVALUATION_FILE):
         (folder / f"{name}.gz").write_bytes(gzip.compress((folder / name).read_bytes()))
         (folder / name).unlink()
     shutil.rmtree(folder / "episodes")
-    for name in ("protocol.json", "report.json", "report.md"):
+    for name in ("report.json", "report.md"):
         (folder / name).unlink()
     return folder
 
@@ -206,5 +208,5 @@ def test_a_damaged_archive_is_one_sentence(
 
 def test_what_grows_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lerobot_memobench.io.LARGEST_UNPACKED", 100)
-    with pytest.raises(MemobenchError, match=r"episodes.jsonl.gz cannot be read \(it becomes larger than"):
+    with pytest.raises(MemobenchError, match=r"cannot be read \(it becomes larger than"):
         read_runs([kept(tmp_path)])

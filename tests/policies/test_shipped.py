@@ -14,7 +14,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies import checkpoint
 from lerobot_memobench.policies.checkpoint import SHIPPED
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.run import demo
 from lerobot_memobench.run.arguments import checkpoint_of
 from lerobot_memobench.run.card import encoded
 from lerobot_memobench.tasks.catalogue import BOWL, task_names
@@ -47,13 +46,6 @@ def test_a_policy_is_found_by_its_name(shipped: Path, tmp_path: Path, monkeypatc
     assert checkpoint_of("memobench_small", {"act"}) == str(folder), "a known name, wherever the command is run"
     assert checkpoint_of("./memobench_small", {"act"}) == "memobench_small", "a folder is named by a path"
     assert checkpoint.local_folder("memobench_small") == folder
-
-
-def test_the_demo_compares_only_what_is_there(shipped: Path) -> None:
-    assert not demo.has_policies()
-    (shipped / "memobench_small_memoryless").mkdir()
-    (shipped / "memobench_small_memoryless" / "config.json").write_text("{}")
-    assert demo.has_policies()
 
 
 def test_a_name_that_is_nearly_one_is_told(shipped: Path) -> None:

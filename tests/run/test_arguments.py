@@ -250,7 +250,7 @@ def test_tasks_of_the_suite_are_known(words: list[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["env=memobench", f"tasks={STRICT}"], "task of the strict suite; say suite=strict"),
+        (["env=memobench", f"tasks={STRICT}"], "task of the strict suite; set suite=strict"),
         (["env=memobench", "suite=strict", f"tasks={PUBLISHED}"], "task of the published suite"),
         (["env=memobench", "suite=strikt"], "suite is 'strikt'; did you mean 'strict'"),
     ],

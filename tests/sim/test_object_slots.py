@@ -152,9 +152,9 @@ def test_batches_of_points_equal_all_points(monkeypatch: pytest.MonkeyPatch) -> 
             episode.step(episode.expert_action())
         in_turn = slots.observe()
         with monkeypatch.context() as patch:
-            patch.setattr(object_slots, "TURNS", (slice(0, POINTS_PER_THING),))
+            patch.setattr(object_slots, "POINT_BATCHES", (slice(0, POINTS_PER_THING),))
             np.testing.assert_array_equal(in_turn, slots.observe())
-            patch.setattr(object_slots, "TURNS", (slice(0, 3),))
+            patch.setattr(object_slots, "POINT_BATCHES", (slice(0, 3),))
             partly += not np.array_equal(in_turn, slots.observe())
     assert partly, "three points suffice; the scenes are too easy"
 

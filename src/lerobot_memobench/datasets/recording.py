@@ -81,6 +81,7 @@ def compiled_episode(task: Task, settings: RecordingSettings) -> Episode:
     """
     return Episode(
         task,
+        suite=task.suite,
         referent=settings.referent,
         demonstration_prompt=settings.demonstration_prompt,
         render=replace(RenderSettings(), width=settings.image_size, height=settings.image_size),

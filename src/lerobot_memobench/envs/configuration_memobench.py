@@ -109,7 +109,7 @@ class MemobenchEnvConfig(_WithSettings):
             for task in loaded:
                 if task.suite != self.suite:
                     raise MemobenchError(
-                        f"{task.folder} holds a task of the {task.suite} suite and env.suite is {self.suite}; say "
+                        f"{task.folder} holds a task of the {task.suite} suite and env.suite is {self.suite}; set "
                         f"suite={task.suite} for folders of such tasks"
                     )
             tasks = [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]

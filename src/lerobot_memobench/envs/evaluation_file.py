@@ -283,7 +283,7 @@ def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
         MemobenchError: it is missing or has another form.
     """
     schema = WholeCard if whole else Card
-    file = place if is_there(place) else place / EVALUATION_FILE
+    file = place / EVALUATION_FILE if place.is_dir() or not is_there(place) else place
     if not is_there(file) and (not whole or is_there(place / EARLIER_CARD)):
         return _earlier(place, schema)
     advice = "expected an evaluation's file as `lerobot eval` writes it"

@@ -17,6 +17,7 @@ from typing import Any
 from rich.console import RenderableType
 
 from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, not_run, read_log, write_episodes
+from lerobot_memobench.envs.evaluation_file import EARLIER_CARD
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.comparison import Comparison, comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.controls import granularity_data, granularity_section
@@ -49,7 +50,7 @@ from lerobot_memobench.evaluation.report_tables import (
     tasks_table,
 )
 from lerobot_memobench.evaluation.tables import WRITERS, Report, Section, csv_tables, csv_text, markdown, terminal_table
-from lerobot_memobench.io import file_bytes, packed, write_file
+from lerobot_memobench.io import file_bytes, is_there, packed, write_file
 from lerobot_memobench.paper import PublishedRow, published_rows
 
 REPORT_JSON = "report.json"
@@ -124,7 +125,8 @@ def keep_log(folder: Path, kept: Path) -> None:
     """
     write_report(folder)  # merges the workers' files
     kept.mkdir(parents=True, exist_ok=True)
-    for file in (MERGED_FILE, CARD_FILE):
+    card = CARD_FILE if is_there(folder / CARD_FILE) else EARLIER_CARD
+    for file in (MERGED_FILE, card):
         write_file(packed(kept / file), gzip.compress(file_bytes(folder / file), mtime=0))
 
 

@@ -43,7 +43,7 @@ def test_shape_that_is_not_drawn() -> None:
     spec = mujoco.MjSpec()
     spec.add_hfield(name="hills", size=[1, 1, 1, 0.1], nrow=2, ncol=2, userdata=[0.0, 1.0, 1.0, 0.0])
     spec.worldbody.add_geom(name="land", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="hills", group=1)
-    with pytest.raises(MemobenchError, match="'land' is a hfield, which is not drawn"):
+    with pytest.raises(MemobenchError, match="'land' has the type hfield, which is not drawn"):
         build_draw_list(spec.compile())
 
 
