@@ -165,7 +165,7 @@ def test_shuffled_subgoals_tell_nothing_of_what_is_seen_in_any_task(level: str) 
 
 def test_one_subgoal_alone_cannot_be_shuffled() -> None:
     cache: Any = SimpleNamespace(
-        texts=["put it down"], text_rows=lambda _: np.zeros(5, int), episodes=np.array([0, 5]), folder="here"
+        texts=["put it down"], text_rows=lambda _: np.zeros(5, int), episodes=np.array([0, 5]), root="here"
     )
     with pytest.raises(MemobenchError, match=r"one coarse subgoal.*several tasks"):
         text_rows(cache, "coarse", "semantic", 7)

@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.processor import TokenizerProcessorStep
@@ -30,8 +31,9 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     make_vocabulary,
     make_word_tokenizer,
 )
+from lerobot_memobench.training.average import TRAINING_FILE, begin_average
 from tests.support.memory import remembered, trained_on
-from tests.support.small_policy import CHUNK, batch_of, made_for_training, small_config
+from tests.support.small_policy import CHUNK, batch_of, made_for_training, open_small_training, small_config
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +139,7 @@ def test_training_moves_memory_expert_and_vlm_and_not_the_tower(trained: Any, da
 def test_a_batch_without_memory_is_refused(trained: Any) -> None:
     policy, before, _, dataset, _, _ = trained
     batch = {key: value for key, value in before(batch_of(dataset, [3])).items() if not key.startswith("memory.")}
-    with pytest.raises(MemobenchError, match="base_weights"):
+    with pytest.raises(MemobenchError, match=r"has no 'memory\.frames'"):
         policy.forward(batch)
 
 
@@ -336,10 +338,12 @@ def test_what_a_checkpoint_holds_is_not_drawn_first(trained: Any, monkeypatch: p
 
 def test_resuming_rebuilds_the_pipeline_and_finds_the_cache(trained: Any) -> None:
     _, before, _, dataset, folder, _ = trained
-    policy = MemobenchMemPolicy.from_pretrained(folder, dataset_meta=dataset.meta)
-    again, _ = make_pre_post_processors(policy.config, pretrained_path=str(folder))
-    step = next(step for step in again.steps if isinstance(step, GatherMemoryProcessorStep))
-    assert (step.frames, step.align, step.cache) == (8, "contrastive", None)
+    config = begun_with(folder)
+    training = open_small_training(dataset.root, config)
+    again, acting = training.processors[0], make_pre_post_processors(config, pretrained_path=str(folder))[0]
+    for pipeline, lookup in ((again, training.lookup), (acting, None)):
+        step = next(step for step in pipeline.steps if isinstance(step, GatherMemoryProcessorStep))
+        assert (step.frames, step.align, step.lookup) == (8, "contrastive", lookup)
     raw = batch_of(dataset, [3, 50])
     first, second = before(copy.deepcopy(raw)), again(copy.deepcopy(raw))
     for key in ("memory.frames", "memory.text", "observation.language.tokens", "action"):
@@ -399,17 +403,35 @@ def test_weights_that_do_not_fit_are_refused(trained: Any, tmp_path: Path) -> No
         MemobenchMemPolicy.from_pretrained(broken)
 
 
-@pytest.mark.parametrize("name", ["model.safetensors", "training_weights.safetensors"])
-def test_weights_that_are_cut_off_are_named(trained: Any, tmp_path: Path, name: str) -> None:
-    dataset, folder = trained[3], trained[4]
-    path = _copy(folder, tmp_path / "a") / name
+def begun_with(folder: Path) -> PreTrainedConfig:
+    """Return the configuration of a training that begins with a checkpoint."""
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    return config
+
+
+def test_weights_that_are_cut_off_are_named(trained: Any, tmp_path: Path) -> None:
+    path = cut_off(_copy(trained[4], tmp_path / "a") / "model.safetensors")
+    with pytest.raises(MemobenchError, match=rf"{path.name} cannot be read \(SafetensorError: .*; copy or train"):
+        MemobenchMemPolicy.from_pretrained(path.parent)
+    with pytest.raises(MemobenchError, match=rf"{path.name} cannot be read"):
+        made_for_training(trained[3].root, base_weights=str(path.parent))
+
+
+def test_trained_weights_that_are_cut_off_are_named(trained: Any, tmp_path: Path) -> None:
+    folder = _copy(trained[4], tmp_path / "a")
+    begin_average(trained[0]).save(folder)
+    training = open_small_training(trained[3].root, begun_with(folder))
+    assert begin_average(training.policy) is not None
+    path = cut_off(folder / TRAINING_FILE)
+    with pytest.raises(MemobenchError, match=rf"{path.name} cannot be read \(SafetensorError: .*; copy or train"):
+        begin_average(training.policy)
+
+
+def cut_off(path: Path) -> Path:
+    """Keep the first half of a file."""
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    meta = None if name == "model.safetensors" else dataset.meta
-    with pytest.raises(MemobenchError, match=rf"{name} cannot be read \(SafetensorError: .*; copy or train"):
-        MemobenchMemPolicy.from_pretrained(path.parent, dataset_meta=meta)
-    if meta is None:
-        with pytest.raises(MemobenchError, match=rf"{name} cannot be read"):
-            made_for_training(dataset.root, base_weights=str(path.parent))
+    return path
 
 
 def test_pi05_weights_as_a_start(trained: Any, tmp_path: Path) -> None:

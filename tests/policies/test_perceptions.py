@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
@@ -166,12 +165,16 @@ def test_an_observation_without_its_input_is_refused(case: Case) -> None:
 
 
 @pytest.mark.parametrize("case", ["visual encoder", "detections"], indirect=True)
-def test_pictures_in_a_batch_are_refused(case: Case) -> None:
-    """As LeRobot's loader processes make them, which know nothing of features."""
+def test_pictures_in_a_batch_change_nothing(case: Case) -> None:
+    """LeRobot's own samples have them; the features of their frames count."""
     policy, before, _, dataset = case.shared
-    batch = before(torch.utils.data.default_collate([DatasetReader.get_item.__wrapped__(dataset.reader, 45)]))
-    with pytest.raises(MemobenchError, match=r"has pictures, which this policy does not read.*--num_workers=0"):
-        policy.train().forward(batch)
+    decoded = torch.utils.data.default_collate([dataset.reader.get_item(45)])
+    assert set(CAMERAS) <= decoded.keys()
+    losses = []
+    for batch in (decoded, {**decoded, **{name: 1 - decoded[name] for name in CAMERAS}}, batch_of(dataset, [45])):
+        torch.manual_seed(0)
+        losses.append(policy.train().forward(before(batch))[0].item())
+    assert losses == [losses[0]] * 3
 
 
 def test_a_checkpoint_acts_as_its_policy(case: Case, tmp_path: Path) -> None:

@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets.dataset_reader import DatasetReader
-from lerobot.policies import make_policy, make_pre_post_processors
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
@@ -24,7 +22,8 @@ from lerobot_memobench.training.features import FOLDER, cache_dataset
 from tests.support.picture_rollouts import (
     CAMERAS,
 )
-from tests.support.small_policy import batch_of, made_for_training, small_config
+from tests.support.small_policy import batch_of, made_for_training, open_small_training, small_config
+from tests.support.synthetic_dataset import LENGTHS
 
 FRAME_BYTES = 2 * GRID**2 * WIDTH
 ROUNDED = 2**-7
@@ -140,8 +139,8 @@ def test_a_cache_that_was_killed_is_finished(
             cache_dataset(killed, small_config(**encoder_fields), batch_size=40)
     for where in (killed, root):
         cache_dataset(where, small_config(**encoder_fields), batch_size=40)
-    made = [path.relative_to(killed) for path in killed.glob(f"{FOLDER}/*/tokens.bin")]
-    assert len(made) == 3
+    made = [path.relative_to(killed) for path in killed.glob(f"{FOLDER}/*/*.safetensors")]
+    assert len(made) == 3 * len(LENGTHS)
     assert all((killed / path).read_bytes() == (root / path).read_bytes() for path in made)
 
 
@@ -150,7 +149,7 @@ def test_a_cache_that_was_killed_is_finished(
 
 def test_a_sample_has_tokens_in_the_place_of_pictures(root: Path, encoder_fields: dict[str, Any]) -> None:
     policy, before, _, dataset = made_for_training(root, **encoder_fields)
-    sample, lerobots = dataset[45], DatasetReader.get_item.__wrapped__(dataset.reader, 45)
+    sample, lerobots = dataset[45], dataset.reader.get_item(45)
     assert not set(CAMERAS) & sample.keys()
     assert set(policy.config.image_features) == set(CAMERAS)
     for key in sample.keys() & lerobots.keys():
@@ -200,12 +199,10 @@ def saved(
 def test_training_resumes_with_the_encoder_of_the_checkpoint(
     saved: tuple[Any, ...], root: Path, encoded: list[int]
 ) -> None:
-    _, _, dataset, folder = saved
-    config = PreTrainedConfig.from_pretrained(folder)
-    config.pretrained_path = folder
-    again = make_policy(config, ds_meta=dataset.meta)
-    pre, _ = make_pre_post_processors(config, pretrained_path=str(folder))
-    again.train().forward(pre(batch_of(dataset, [10, 60])))[0].backward()
+    config = PreTrainedConfig.from_pretrained(saved[3])
+    config.pretrained_path = saved[3]
+    again = open_small_training(root, config)
+    again.policy.train().forward(again.processors[0](batch_of(again.samples(), [10, 60])))[0].backward()
     assert encoded == [], "its caches are found by its tower"
 
 
