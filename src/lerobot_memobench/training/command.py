@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, naming_damage
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, INFO_FILE, check_whole, naming_damage
 from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -98,7 +98,10 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
             return 0
         from lerobot_memobench.training.view import viewed
 
-        return run_lerobot(viewed(arguments, prompt_frames, obs_type, tell).for_parser)
+        status = run_lerobot(viewed(arguments, prompt_frames, obs_type, tell).for_parser)
+        if status and root and (Path(root) / INFO_FILE).is_file() and not arguments.has("dataset.episodes"):
+            check_whole(Path(root))  # its error, in the other process, does not name the file
+        return status
 
 
 def run_lerobot(flags: Sequence[str]) -> int:
