@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from lerobot_memobench.conformance.streams import TASK
 from lerobot_memobench.conformance.subject import load_subject
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.evaluation_file import protocol_of
+from lerobot_memobench.training import command
 from tests.conformance.conftest import EXAMPLE
 
 ROOT = Path(__file__).parents[2]
@@ -42,8 +45,19 @@ def checkpoint(example: Path, objects: Path, tmp_path_factory: pytest.TempPathFa
     words = [*TRAIN, f"dataset={objects}", "steps=4", "batch_size=16", "num_workers=0", f"output_dir={run}"]
     with pytest.MonkeyPatch.context() as patch:
         watch(patch, load_subject([*TRAIN, f"dataset={objects}"], run.parent).policy)
+        patch.setattr(command, "run_lerobot", run_in_this_process)
         assert main(["train", *words]) == 0
     return run / "checkpoints" / "last" / "pretrained_model"
+
+
+def run_in_this_process(flags: Sequence[str]) -> int:
+    """Run LeRobot's trainer where the policy is watched, not in a process of its own."""
+    from lerobot.scripts import lerobot_train
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["lerobot-train", *flags])
+        lerobot_train.main()
+    return 0
 
 
 BATCHES: list[dict[str, Any]] = []
