@@ -168,7 +168,7 @@ def test_one_subgoal_alone_cannot_be_shuffled() -> None:
         texts=["put it down"], text_rows=lambda _: np.zeros(5, int), episodes=np.array([0, 5]), root="here"
     )
     with pytest.raises(MemobenchError, match=r"one coarse subgoal.*several tasks"):
-        text_rows(cache, "coarse", "semantic", 7)
+        text_rows(cache, "coarse", "semantic", True)
 
 
 @pytest.mark.parametrize("align", ["contrastive", "framewise"])
