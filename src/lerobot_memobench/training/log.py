@@ -10,11 +10,11 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator
+from huggingface_hub.utils import tqdm
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from lerobot.utils.utils import inside_slurm
-from tqdm import tqdm
 
 logger = logging.getLogger(__name__)
 
