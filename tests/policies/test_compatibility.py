@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.policies import make_pre_post_processors
@@ -27,7 +28,6 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.subject import load_subject
-from lerobot_memobench.envs.command_line import read_rename_map
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_weights, shipped_policies
@@ -138,7 +138,7 @@ def test_what_the_sentence_says_to_do_is_enough(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="--rename_map=") as error:
         check_features(str(other), PreTrainedConfig.from_pretrained(other), SHOWN, {})
     told = str(error.value).partition("--rename_map='")[2].rstrip("'")
-    check_features(str(other), PreTrainedConfig.from_pretrained(other), SHOWN, read_rename_map(told))
+    check_features(str(other), PreTrainedConfig.from_pretrained(other), SHOWN, yaml.safe_load(told))
     with pytest.raises(MemobenchError, match=r"sees observation.images.front"):  # the other's name for what is there
         check_features(str(other), config(cameras=("front", "wrist")), SHOWN, {IMAGES + "image": IMAGES + "wrist"})
 

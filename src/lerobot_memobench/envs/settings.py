@@ -46,18 +46,6 @@ SLOWEST = 10
 IDLE, GOALS, STRICT_GOALS = "idle", "goals", 2
 """Keys of strict tasks in a protocol: control steps that the robot idles at most before the execution, and the revision
 of the goals. Revision 1 could be reached without a memory, by notes in the scene and a clock."""
-
-UPSTREAM_DIFFERENCES = (
-    "no demonstration prompt",
-    "the published referents alone",
-    "an episode also ends when all memory checkpoints have held, in whatever order, before a goal of Then is reached",
-    f"at most {UPSTREAM_HORIZON} execution steps",
-    "two evaluations of the goal per control step: each part of Then holds for 5 of them, not 10",
-    "the goal is evaluated in the 10 stabilisation steps too",
-)
-"""How the authors' evaluation, ``protocol=upstream``, differs from the paper's text. Its behaviour was read in
-``src/eval.py`` and ``bddl_base_domain.py`` of the repository Collab-Gen/MEMOBench; this is written from that
-behaviour."""
 UPSTREAM_ONLY = {
     **{"suite": PUBLISHED, "referent": REFERENTS[0], "oracle_memory": False},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False},

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from lerobot_memobench.datasets.frames import TextEncoder, read_frame_table
-from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, without_pattern
+from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, read_info, without_pattern
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
 from lerobot_memobench.datasets.lookup import FrameLookup, read_recorded
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
@@ -186,7 +186,7 @@ def open_lookup(
         table, remember = read_frame_table(root), None
         if config.memory != "none":
             remembered = encoder.memory_input
-            camera = in_data.get(remembered, remembered) or next(iter(cameras_of(root)), "")
+            camera = in_data.get(remembered, remembered) or next(iter(cameras_of(read_info(root)["features"])), "")
             how = {"progress": partial(logger.info, "feature cache: %d of %d episodes")}
             remember = remembered_features(root, config, encoder, camera, **how).tokens
         return FrameLookup(root, table, stride=stride, texts=text_encoder(config), remember=remember)
@@ -194,7 +194,7 @@ def open_lookup(
     columns, table = read_recorded(root, names)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     if isinstance(encoder, VisualTokenEncoder):
-        cameras = dict.fromkeys(encoder.cameras or [*cameras_of(root), encoder.memory_input])
+        cameras = dict.fromkeys(encoder.cameras or [*cameras_of(read_info(root)["features"]), encoder.memory_input])
         names_in_data = {name: in_data.get(name, name) for name in cameras}
         how = {"progress": partial(logger.info, "pictures encoded: %d of %d episodes")}
         memory, present = picture_tokens(root, config, encoder, names_in_data, **how)

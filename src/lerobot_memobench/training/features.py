@@ -12,7 +12,7 @@ import functools
 import hashlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -223,10 +223,9 @@ def dataset_fingerprint(root: Path, camera: str) -> str:
     return digest.hexdigest()
 
 
-def cameras_of(root: Path) -> list[str]:
-    """Return the cameras of a dataset, in its order."""
-    features = read_info(root)["features"].items()
-    return [name for name, feature in features if feature.get("dtype") in ("video", "image")]
+def cameras_of(features: Mapping[str, Any]) -> list[str]:
+    """Return the cameras among a dataset's features, in its order."""
+    return [name for name, feature in features.items() if feature.get("dtype") in ("video", "image")]
 
 
 # -- features of each kind of policy -----------------------------------------------------------------------------------
@@ -366,7 +365,7 @@ def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path
     Raises:
         MemobenchError: the dataset lacks a camera, the disk has no room, or the policy needs no cache.
     """
-    cameras = cameras_of(root)
+    cameras = cameras_of(read_info(root)["features"])
     config.memory_camera = config.memory_camera or next(iter(cameras), None)
     if config.detector is not None:
         detect = ObjectsFromPictures(load_detector(config.detector))

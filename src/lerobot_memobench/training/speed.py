@@ -30,7 +30,7 @@ def quick_products() -> Iterator[None]:
     """Inside the block, round the factors of products to bfloat16, if that is faster on this CPU.
 
     Weights, gradients, sums and everything but products stay float32. The fused attention kernel, whose many small
-    products suffer, is disabled; code that asks for it (`network.attend_fused`) computes exact products.
+    products suffer, is disabled; code that asks for it (`layers.attend`) computes exact products.
     """
     if not quicker_in_bfloat16():
         yield

@@ -46,6 +46,7 @@ from lerobot_memobench.run.arguments import LerobotArguments
 from lerobot_memobench.training.checks import check_environment
 from lerobot_memobench.training.configuration import read_config
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
+from lerobot_memobench.training.features import cameras_of
 
 OURS = {*CLOCK, "simple_subgoal"}
 """Columns of a dataset of the benchmark; a phase alone may have another meaning."""
@@ -85,11 +86,6 @@ class Choice:
             dropped |= {OBJECTS_COLUMN}
         renamed = {PRIVILEGED: OBJECTS_COLUMN} if self.obs_type in (OBJECTS, BOTH) else {}
         return {name: renamed.get(name, name) for name in features if name not in dropped}
-
-
-def cameras_of(features: Mapping[str, Any]) -> list[str]:
-    """Return the cameras among a dataset's features."""
-    return [name for name, one in features.items() if one["dtype"] in ("video", "image")]
 
 
 # -- for a training ----------------------------------------------------------------------------------------------------
