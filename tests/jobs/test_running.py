@@ -80,6 +80,7 @@ def test_the_submitted_command_is_a_program(jobs: list[Note], tmp_path: Path, mo
     ((*_, wrapped),) = sbatch.calls
     command = wrapped.removeprefix("--wrap=")
     monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "0")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))  # of the pickled job's class
     subprocess.run(command, shell=True, check=True, cwd="/")
     assert [job.runs for job in jobs] == [1, 1, 1, 1], "neighbours are one member's"
 
