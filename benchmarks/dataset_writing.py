@@ -1,19 +1,17 @@
-"""How fast demonstrations become a LeRobotDataset, beside LeRobot's own recording loop on the same frames.
+"""Compare the writing of LeRobot datasets with LeRobot's own recording loop on the same frames.
 
     python benchmarks/dataset_writing.py [--episodes 2] [--repeats 3] [--ways write convert generate] [--workers 1]
 
-Episodes of the benchmark are recorded once, with images. Three ways to a dataset are timed, each in turn with
-LeRobot's plain loop (``create``, ``add_frame`` per frame, ``save_episode``, ``finalize``; its default encoder):
+Episodes are recorded once, with images. Three ways to write a dataset are timed, each in turns with LeRobot's
+loop (``create``, ``add_frame`` per frame, ``save_episode``, ``finalize``; its default encoder):
 
-- ``write``: from memory, this package's staging and assembly;
-- ``convert``: from an HDF5 file in the published layout, proprioception and checks included; the loop reads its frames
-  from the same file;
-- ``generate``: the scripted expert, the simulator and the renderer as well; the loop's time is added to that of
-  recording the same episodes. With ``--workers 2`` in as many processes, their start included, so ask for more
-  episodes; the loop has one process and its encoder's threads.
+- ``write``: staging and assembly of demonstrations in memory;
+- ``convert``: an HDF5 file in the published layout, with proprioception and checks; the loop reads the same file;
+- ``generate``: expert, simulator and renderer too; the time of recording the same episodes is added to the loop's.
+  ``--workers 2`` includes the start of the processes, so give more episodes.
 
-Prints one JSON line: the ratios of the best times (above 1: faster than the loop), and for both the image quality
-(PSNR of decoded frames against rendered ones, dB) and the video bytes per frame.
+Prints one JSON line: ratios of the best times (above 1: faster than LeRobot's loop), and for both sides image quality
+(PSNR of decoded frames, dB) and the video bytes per frame.
 """
 
 from __future__ import annotations
@@ -61,15 +59,15 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
     parser.add_argument("--workers", type=int, default=1, help="processes that generate")
-    asked = parser.parse_args()
-    import lerobot.datasets  # noqa: F401  (its import is nobody's time)
+    args = parser.parse_args()
+    import lerobot.datasets  # noqa: F401  (do not time the import)
 
     task = get_task(TASK)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         record_demonstration(task, DEMONSTRATION_SEED, images=True)  # compiles the scene and opens the renderer
         started = time.perf_counter()
-        demos = [record_demonstration(task, DEMONSTRATION_SEED + i, images=True) for i in range(asked.episodes)]
+        demos = [record_demonstration(task, DEMONSTRATION_SEED + i, images=True) for i in range(args.episodes)]
         recording = time.perf_counter() - started
         source = write_published(folder / "task.hdf5", demos)
 
@@ -85,16 +83,16 @@ def main() -> None:
             ),
             "convert": (lambda out: convert(source, out), loop_from_file, 0.0),
             "generate": (
-                lambda out: generate([task], asked.episodes, out, workers=asked.workers),
+                lambda out: generate([task], args.episodes, out, workers=args.workers),
                 lambda out: plain_loop(((demo, frames(demo)) for demo in demos), out),
                 recording,
             ),
         }
         result: dict[str, Any] = {"benchmark": "dataset_writing", "frames": sum(map(len, demos))}
-        for way in asked.ways:
+        for way in args.ways:
             ours, theirs, added = ways[way]
             best = {"ours": np.inf, "lerobot": np.inf}
-            for _ in range(asked.repeats):
+            for _ in range(args.repeats):
                 for side, run in (("ours", ours), ("lerobot", theirs)):
                     shutil.rmtree(folder / side, ignore_errors=True)
                     started = time.perf_counter()
@@ -105,7 +103,7 @@ def main() -> None:
             result[way] |= {f"{side}_s": round(seconds, 3) for side, seconds in best.items()}
         for side in ("ours", "lerobot"):
             result[side] = quality(folder / side, demos)
-        result["ratio"] = min(result[way]["ratio"] for way in asked.ways)
+        result["ratio"] = min(result[way]["ratio"] for way in args.ways)
     print(json.dumps(result))
 
 
@@ -117,15 +115,15 @@ def frames(demo: Demonstration) -> Iterator[dict[str, np.ndarray]]:
 
 
 def plain_loop(episodes: Iterable[tuple[Demonstration, Iterable[dict[str, np.ndarray]]]], out: Path) -> None:
-    """Write pictures, state, action and labels with LeRobot's own recording loop (it writes no language rows)."""
+    """Write images, state, action and labels with LeRobot's recording loop, which writes no language rows."""
     from lerobot.datasets import LeRobotDataset
 
-    others = ("language_persistent", EPISODE_INFO, EXECUTED_ACTION, PRIVILEGED)
-    features = {key: value for key, value in dataset_features((256, 256)).items() if key not in others}
+    omitted = ("language_persistent", EPISODE_INFO, EXECUTED_ACTION, PRIVILEGED)
+    features = {key: value for key, value in dataset_features((256, 256)).items() if key not in omitted}
     dataset = LeRobotDataset.create("local/plain", fps=CONTROL_HZ, features=features, root=out, use_videos=True)
-    for demo, pictures in episodes:
+    for demo, images_of_steps in episodes:
         columns = {"observation.state": demo.proprio, "action": demo.actions, **labels(demo).columns()}
-        for t, images in enumerate(pictures):
+        for t, images in enumerate(images_of_steps):
             frame: dict[str, Any] = {image_key(camera): image for camera, image in images.items()}
             for key, column in columns.items():
                 value = column[t]
@@ -136,20 +134,20 @@ def plain_loop(episodes: Iterable[tuple[Demonstration, Iterable[dict[str, np.nda
 
 
 def quality(folder: Path, demos: list[Demonstration]) -> dict[str, Any]:
-    """Return PSNR per camera, dB, and the video bytes per frame of both cameras together."""
-    found: dict[str, Any] = {}
+    """Return PSNR per camera, dB, and video bytes per frame, both cameras together."""
+    result: dict[str, Any] = {}
     for camera in CAMERAS:
-        shown = np.concatenate([(demo.images or {})[camera] for demo in demos])
+        rendered = np.concatenate([(demo.images or {})[camera] for demo in demos])
         errors = []
         for path in sorted((folder / "videos" / image_key(camera)).rglob("*.mp4")):
             with av.open(str(path)) as container:
                 for picture in container.decode(video=0):
-                    seen = picture.to_ndarray(format="rgb24").astype(np.float32)
-                    errors.append(float(((seen - shown[len(errors)]) ** 2).mean()))
-        assert len(errors) == len(shown), (len(errors), len(shown))
-        found[f"psnr_{camera}"] = round(10 * np.log10(255**2 / float(np.mean(errors))), 2)
+                    decoded = picture.to_ndarray(format="rgb24").astype(np.float32)
+                    errors.append(float(((decoded - rendered[len(errors)]) ** 2).mean()))
+        assert len(errors) == len(rendered), (len(errors), len(rendered))
+        result[f"psnr_{camera}"] = round(10 * np.log10(255**2 / float(np.mean(errors))), 2)
     size = sum(path.stat().st_size for path in (folder / "videos").rglob("*.mp4"))
-    return found | {"video_bytes_per_frame": round(size / sum(map(len, demos)))}
+    return result | {"video_bytes_per_frame": round(size / sum(map(len, demos)))}
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""What the policy at full size takes of a GPU, part by part; run it first where one is lent.
+"""Measure time and memory of the full-size policy on a GPU, part by part.
 
     python benchmarks/gpu.py --out outputs/gpu.jsonl            # one 80 GB card, under eight minutes
-    python benchmarks/gpu.py --size tiny --device cpu --out …   # the same parts, to try the script
+    python benchmarks/gpu.py --size tiny --device cpu --out …   # a trial of the script
 
-Needs no weights, dataset or network: pi0.5 with its memory has random weights, and batches are random, of the shapes
-that the preprocessor makes: two cameras, 32 remembered frames, prompts of 200 tokens, chunks of 50 actions. Each part
-adds a JSON line to ``--out``; parts that are there already are left out, so the script goes on where it ended. A part
-that fails says why, and the next one begins. Prints a table of all lines at the end.
+Needs no weights, dataset or network. Weights and batches are random; the batches have the preprocessor's shapes: two
+cameras, 32 memory frames, prompts of 200 tokens, chunks of 50 actions. Each part appends a JSON line to ``--out``, and
+parts with a line are skipped, so an interrupted run can be repeated. A failed part logs its error, and the next part
+starts. Prints a table of all lines.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from policies import config, observation, training_batch
+from policies import MEMORY_FRAMES, config, observation, training_batch
 from random_weights import random_policy
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
@@ -34,99 +34,101 @@ Part = Callable[[str, str, int], dict[str, Any]]
 
 
 def main() -> None:
-    """Measure what is not measured yet, and print."""
+    """Measure the missing parts and print all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", default="pi05")
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--out", type=Path, default=Path("outputs/gpu.jsonl"))
     parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=list(PARTS))
-    parser.add_argument("--steps", type=int, default=10, help="timed plans, or updates, of each part")
-    parser.add_argument("--minutes", type=float, default=8.0, help="no part begins later")
-    asked = parser.parse_args()
+    parser.add_argument("--steps", type=int, default=10, help="timed plans or updates per part")
+    parser.add_argument("--minutes", type=float, default=8.0, help="start no part after this time")
+    args = parser.parse_args()
     torch.backends.cuda.matmul.allow_tf32 = True  # as LeRobot trains and evaluates
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    where = {"size": asked.size, "device": asked.device, "torch": torch.__version__}
-    where["card"] = torch.cuda.get_device_name() if asked.device == "cuda" else "CPU"
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    context = {"size": args.size, "device": args.device, "torch": torch.__version__}
+    context["card"] = torch.cuda.get_device_name() if args.device == "cuda" else "CPU"
     began = time.monotonic()
-    for part in asked.parts:
-        done = [line["part"] for line in lines(asked.out) if line["size"] == asked.size and "error" not in line]
-        if part in done or time.monotonic() - began > 60 * asked.minutes:
+    for part in args.parts:
+        done = [line["part"] for line in lines(args.out) if line["size"] == args.size and "error" not in line]
+        if part in done or time.monotonic() - began > 60 * args.minutes:
             continue
         started = time.monotonic()
         try:
-            found = PARTS[part](asked.size, asked.device, asked.steps)
-        except Exception as error:  # the next part may work
-            found = {"error": f"{type(error).__name__}: {str(error)[:300]}"}
-        line = {"part": part, **where, **found, "took_s": round(time.monotonic() - started, 1)}
-        with asked.out.open("a", encoding="utf-8") as file:
+            result = PARTS[part](args.size, args.device, args.steps)
+        except Exception as error:  # the next part may succeed
+            result = {"error": f"{type(error).__name__}: {str(error)[:300]}"}
+        line = {"part": part, **context, **result, "took_s": round(time.monotonic() - started, 1)}
+        with args.out.open("a", encoding="utf-8") as file:
             print(json.dumps(line), file=file)
         print(json.dumps(line), flush=True)
         gc.collect()
         if torch.cuda.is_available():
             torch.cuda.empty_cache()
-    table([line for line in lines(asked.out) if line["size"] == asked.size])
+    table([line for line in lines(args.out) if line["size"] == args.size])
 
 
 def lines(file: Path) -> list[dict[str, Any]]:
-    """Return what was measured before; a line that was cut off is measured again."""
-    found = []
+    """Return the lines of earlier runs, without a truncated last line."""
+    parsed = []
     for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else []:
         try:
-            found.append(json.loads(line))
+            parsed.append(json.loads(line))
         except ValueError:
             continue
-    return found
+    return parsed
 
 
 # -- parts ------------------------------------------------------------------------------------------------------------
 
 
 def equal(size: str, device: str, steps: int) -> dict[str, Any]:
-    """Return how far loss and actions of a tiny policy on the device are from those on the CPU, in float32."""
-    found = []
+    """Compare loss and actions of a tiny policy on the device and on the CPU, in float32."""
+    results = []
     for place in ("cpu", device):
         torch.manual_seed(0)
-        policy = random_policy(config("tiny", device="cpu", open_gate=True))
+        policy = random_policy(config("tiny", device="cpu"))
+        for modulator in policy.model.fusion.modulators:
+            modulator.modulation.reset_parameters()  # not zero, so that actions depend on the memory
         policy.config.device = place
         policy = policy.to(place).eval()
         batch = {key: value.to(place) for key, value in training_batch(policy.config, 2).items()}
         noise = torch.randn(2, policy.config.chunk_size, 32, generator=torch.Generator().manual_seed(1))
         actions = policy.predict_action_chunk(batch, noise=noise).float().cpu()
         torch.manual_seed(2)
-        policy.model.sample_noise = on_the_cpu  # a GPU draws other numbers
+        policy.model.sample_noise = cpu_noise  # a GPU generates different random numbers
         loss, _ = policy.forward(batch)
-        found.append((actions, loss.item()))
-    (ours, loss), (other, loss_there) = found
+        results.append((actions, loss.item()))
+    (actions, loss), (device_actions, device_loss) = results
     return {
-        "largest_difference": float((ours - other).abs().max()),
-        "largest_action": float(ours.abs().max()),
-        "loss_difference": abs(loss - loss_there),
+        "largest_difference": float((actions - device_actions).abs().max()),
+        "largest_action": float(actions.abs().max()),
+        "loss_difference": abs(loss - device_loss),
     }
 
 
-def on_the_cpu(shape: tuple[int, ...], device: torch.device) -> Tensor:
+def cpu_noise(shape: tuple[int, ...], device: torch.device) -> Tensor:
     """Return noise that does not depend on the device."""
     return torch.randn(shape).to(device)
 
 
 def planning(rows: int, **fields: Any) -> Part:
-    """Return the part that fills the memories of so many environments, takes in frames, and plans."""
+    """Return the part that fills the memories of ``rows`` environments, then times frames and plans."""
 
     def part(size: str, device: str, steps: int) -> dict[str, Any]:
         policy = random_policy(config(size, device=device, dtype="bfloat16", **fields)).eval()
-        seen = {key: value.to(device) for key, value in observation(policy.config, rows).items()}
+        batch = {key: value.to(device) for key, value in observation(policy.config, rows).items()}
         policy.reset()
         started = time.perf_counter()
-        for _ in range(policy.config.memory_frames):
-            policy.observe(seen)
-        policy.predict_action_chunk(seen)
+        for _ in range(MEMORY_FRAMES):
+            policy.observe(batch)
+        policy.predict_action_chunk(batch)
         first, _ = time.perf_counter() - started, peak()
         frames, plans = [], []
         for turn in range(steps + WARM_UP):
-            taken = timed(policy.observe, seen), timed(policy.predict_action_chunk, seen)
+            frame, plan = timed(policy.observe, batch), timed(policy.predict_action_chunk, batch)
             if turn >= WARM_UP:
-                frames.append(taken[0])
-                plans.append(taken[1])
+                frames.append(frame)
+                plans.append(plan)
         return {
             "plan_ms": round(1e3 * statistics.median(plans), 1),
             "frame_ms": round(1e3 * statistics.median(frames), 2),
@@ -138,35 +140,35 @@ def planning(rows: int, **fields: Any) -> Part:
 
 
 def updating(ddp: bool, **fields: Any) -> Part:
-    """Return the part that updates a policy on batches of 16, as `config=train_paper` does."""
+    """Return the part that times updates on batches of 16, as in `config=train_paper`."""
 
     def part(size: str, device: str, steps: int) -> dict[str, Any]:
         settings = config(size, device=device, dtype="bfloat16", gradient_checkpointing=True, **fields)
         policy = random_policy(settings).train()
         optimizer = settings.get_optimizer_preset().build(policy.get_optim_params())
-        learner: Any = policy
+        module: Any = policy
         if ddp:
             backend = "nccl" if device == "cuda" else "gloo"
             place = "tcp://127.0.0.1:29511"
             torch.distributed.init_process_group(backend, init_method=place, rank=0, world_size=1)
-            learner = DistributedDataParallel(policy, find_unused_parameters=True)
+            module = DistributedDataParallel(policy, find_unused_parameters=True)
         batch = {key: value.to(device) for key, value in training_batch(settings, BATCH).items()}
         try:
             average = WeightAverage(policy.trained_parameters(), policy.config.ema_decay)
-            taken = [timed(update, learner, policy, optimizer, average, batch) for _ in range(steps + WARM_UP)]
+            seconds = [timed(update, module, policy, optimizer, average, batch) for _ in range(steps + WARM_UP)]
         finally:
             if ddp:
                 torch.distributed.destroy_process_group()
-        return {"update_s": round(statistics.median(taken[WARM_UP:]), 3), "peak_gib": peak()}
+        return {"update_s": round(statistics.median(seconds[WARM_UP:]), 3), "peak_gib": peak()}
 
     return part
 
 
 def update(
-    learner: Any, policy: MemobenchMemPolicy, optimizer: Any, average: WeightAverage, batch: Mapping[str, Tensor]
+    module: Any, policy: MemobenchMemPolicy, optimizer: Any, average: WeightAverage, batch: Mapping[str, Tensor]
 ) -> None:
-    """Update once, as training does."""
-    loss, _ = learner(batch)
+    """Make one update, as training does."""
+    loss, _ = module(batch)
     loss.backward()
     torch.nn.utils.clip_grad_norm_(policy.parameters(), policy.config.optimizer_grad_clip_norm)
     optimizer.step()
@@ -189,11 +191,11 @@ PARTS: dict[str, Part] = {
 # -- measuring --------------------------------------------------------------------------------------------------------
 
 
-def timed(work: Callable[..., Any], *given: Any) -> float:
-    """Return the seconds that work takes, on the GPU too."""
+def timed(function: Callable[..., Any], *args: Any) -> float:
+    """Return the seconds of a call, with its work on the GPU."""
     synchronise()
     started = time.perf_counter()
-    work(*given)
+    function(*args)
     synchronise()
     return time.perf_counter() - started
 
@@ -205,12 +207,12 @@ def synchronise() -> None:
 
 
 def peak() -> float:
-    """Return the GiB that were allocated at most since the last call."""
+    """Return the peak allocated GPU memory since the last call, GiB."""
     synchronise()
-    found = torch.cuda.max_memory_allocated() / 2**30
+    gib = torch.cuda.max_memory_allocated() / 2**30
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
-    return round(found, 2)
+    return round(gib, 2)
 
 
 def table(measured: list[dict[str, Any]]) -> None:

@@ -1,7 +1,7 @@
-"""A policy of random weights, at any size, in no more memory than its weights take: for tests and benchmarks.
+"""Make a policy with random weights at any size, for tests and benchmarks, without more memory than the weights need.
 
-Constructors would make every weight in float32 and cast it afterwards: at full size 17 GB that end as 10. Here the
-policy is built without weights (on torch's meta device), and each weight is then made once, where and as it stays.
+The constructor would allocate all weights in float32 and cast them later: 17 GB instead of 10 at full size. Here the
+policy is built on torch's meta device; each weight is then allocated once, on its device and in its precision.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import Memo
 
 
 def random_policy(config: MemobenchMemConfig, seed: int = 0) -> MemobenchMemPolicy:
-    """Return a policy of random weights on ``config.device``; its modulation is zero, as a new policy's is."""
+    """Return a policy with random weights on ``config.device``; its modulation is zero, as in a new policy."""
     device = torch.device(config.device or "cpu")
     config.device = "meta"
     with torch.device("meta"):
         policy = MemobenchMemPolicy(config, load_base=False)
     config.device = str(device)
     materialise(policy, device, seed)
-    seeing = policy.model.paligemma_with_expert.paligemma.model
-    for part in (seeing.vision_tower, seeing.multi_modal_projector):
+    vlm = policy.model.paligemma_with_expert.paligemma.model
+    for part in (vlm.vision_tower, vlm.multi_modal_projector):
         seed_parameters(part, VISION_SEED)
     return policy
 
 
 def materialise(model: nn.Module, device: torch.device, seed: int) -> None:
-    """Make the weights of a model on the meta device, module by module, in place and in the precision they have there.
+    """Allocate the weights of a meta-device model in place, each in its own precision.
 
-    Matrices get entries of variance 1/fan_in, vectors and modulations zero.
+    Entries of matrices have variance 1/fan_in; vectors and modulations are zero.
     """
     generator = torch.Generator(device).manual_seed(seed)
     for name, module in model.named_modules():
         for parameter in module.parameters(recurse=False):
-            made = torch.zeros_like(parameter, device=device, requires_grad=False)
-            if made.ndim > 1 and not name.endswith(".modulation"):
-                bound = (3 / made[0].numel()) ** 0.5
-                made.uniform_(-bound, bound, generator=generator)
-            # The same object as before, because optimisers and averages tell parameters apart by it.
-            torch.utils.swap_tensors(parameter, nn.Parameter(made, parameter.requires_grad))
+            values = torch.zeros_like(parameter, device=device, requires_grad=False)
+            if values.ndim > 1 and not name.endswith(".modulation"):
+                bound = (3 / values[0].numel()) ** 0.5
+                values.uniform_(-bound, bound, generator=generator)
+            # Keep the object: optimisers and averages identify a parameter by it.
+            torch.utils.swap_tensors(parameter, nn.Parameter(values, parameter.requires_grad))
     fill_buffers(model, device)
 
 
 def fill_buffers(model: nn.Module, device: torch.device) -> None:
-    """Give the buffers of a model on the meta device what their modules put there."""
+    """Fill the buffers of a meta-device model with the values that their modules compute."""
     for module in model.modules():
         for key, buffer in module.named_buffers(recurse=False):
             content = _buffer(module, key) if buffer.is_meta else buffer
@@ -56,7 +56,7 @@ def fill_buffers(model: nn.Module, device: torch.device) -> None:
 
 
 def _buffer(module: Any, name: str) -> Tensor:
-    """Return the content that one of pi0.5's modules gives to a buffer of its own."""
+    """Return the values of a buffer of one of pi0.5's modules."""
     if name in ("inv_freq", "original_inv_freq"):
         fresh: Tensor = type(module)(config=module.config).inv_freq
         return fresh

@@ -1,6 +1,8 @@
-"""Hours that 1,500 rollouts with images take here, replanning every 5 steps, from a sample of all tasks: one JSON line.
+"""Estimate the hours of all 1,500 rollouts with images on this machine, from short rollouts of each task.
 
-python benchmarks/rollouts_total.py [tasks]
+    python benchmarks/rollouts_total.py [TASKS]
+
+Actions are replanned every 5 steps. Prints one JSON line.
 """
 
 import json

@@ -1,9 +1,9 @@
-"""A control step that sees the visible objects, beside one that sees both cameras' pictures and one that sees nothing.
+"""Compare control steps that observe objects, render both cameras' images, or do neither.
 
     python benchmarks/step_with_objects.py [--steps 60] [--repeats 9] [--tasks 4]
 
-Actions are the expert's; the observation is made at every step. Seconds are of the CPU, all threads. Prints one JSON
-line: milliseconds per step, and ratios of the pictures' step and of the objects' to the others.
+The scripted expert acts; the observation is computed at each step. Prints one JSON line: CPU milliseconds per step (all
+threads), ``ratio`` of images to objects, and ``over_none`` of objects to no observation.
 """
 
 from __future__ import annotations
@@ -28,44 +28,43 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--tasks", type=int, default=4)
-    asked = parser.parse_args()
+    args = parser.parse_args()
     names = task_names()
-    looks: dict[str, Callable[[Episode], object]] = {
+    observe: dict[str, Callable[[Episode], object]] = {
         "none": lambda episode: None,
         "objects": Episode.objects,
-        "pictures": Episode.images,
+        "images": Episode.images,
     }
-    seconds = dict.fromkeys(looks, 0.0)
-    for name in names[:: max(1, len(names) // asked.tasks)][: asked.tasks]:
-        episodes = {look: Episode(get_task(name), demonstration_prompt=False) for look in looks}
-        sides = {look: stepper(episodes[look], see, asked.steps) for look, see in looks.items()}
-        for look, taken in medians(sides, asked.repeats).items():
-            seconds[look] += 1000 * taken / asked.steps / asked.tasks
-    print(
-        json.dumps(
-            {
-                "benchmark": "step_with_objects",
-                "tasks": asked.tasks,
-                **{f"{look}_ms": round(taken, 3) for look, taken in seconds.items()},
-                "ratio": round(seconds["pictures"] / seconds["objects"], 2),
-                "over_none": round(seconds["objects"] / seconds["none"], 2),
-            }
-        )
-    )
+    milliseconds = dict.fromkeys(observe, 0.0)
+    for name in names[:: max(1, len(names) // args.tasks)][: args.tasks]:
+        steps = {
+            kind: stepper(Episode(get_task(name), demonstration_prompt=False), function, args.steps)
+            for kind, function in observe.items()
+        }
+        for kind, seconds in medians(steps, args.repeats).items():
+            milliseconds[kind] += 1000 * seconds / args.steps / args.tasks
+    result = {
+        "benchmark": "step_with_objects",
+        "tasks": args.tasks,
+        **{f"{kind}_ms": round(value, 3) for kind, value in milliseconds.items()},
+        "ratio": round(milliseconds["images"] / milliseconds["objects"], 2),
+        "over_none": round(milliseconds["objects"] / milliseconds["none"], 2),
+    }
+    print(json.dumps(result))
 
 
-def stepper(episode: Episode, see: Callable[[Episode], object], steps: int) -> Callable[[], None]:
-    """Return a function that takes some steps of an episode, looking at each; a new one begins where it ended."""
+def stepper(episode: Episode, observe: Callable[[Episode], object], steps: int) -> Callable[[], None]:
+    """Return a function that takes some observed steps; each call continues the episode, or starts the next one."""
     episode.reset(VALIDATION_SEED)
 
-    def take() -> None:
+    def take_steps() -> None:
         for _ in range(steps):
             if episode.done:
                 episode.reset(VALIDATION_SEED)
-            see(episode)
+            observe(episode)
             episode.step(episode.expert_action())
 
-    return take
+    return take_steps
 
 
 if __name__ == "__main__":

@@ -1,51 +1,63 @@
-"""Two sides of a comparison taking turns on a machine that may be busy with other things."""
+"""Compare alternatives fairly on a machine that may be busy: run them in turns, and report medians."""
 
 from __future__ import annotations
 
+import json
+import os
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-Side = Callable[[], object]
+PREFIX = "result "
+"""Start of a worker's answer; libraries print other lines to stdout."""
 
 
-def medians(
-    sides: Mapping[str, Side], repeats: int, warm_up: int = 1, clock: Callable[[], float] = time.process_time
-) -> dict[str, float]:
-    """Return the median seconds of each side; they take turns, in alternating order, so that load hits both.
+def medians(alternatives: Mapping[str, Callable[[], object]], repeats: int, warm_up: int = 1) -> dict[str, float]:
+    """Return the median CPU seconds of each alternative.
 
-    The clock counts this process's CPU seconds, all its threads together, because on a busy machine elapsed time says
-    more about the others. Give ``time.perf_counter`` where the work is done elsewhere, as on a GPU.
+    The order alternates from turn to turn, so that other load affects all alternatives. CPU seconds count all threads
+    of this process; on a busy machine, elapsed time would mostly measure the other processes.
     """
-    seconds: dict[str, list[float]] = {name: [] for name in sides}
-    names = list(sides)
+    seconds: dict[str, list[float]] = {name: [] for name in alternatives}
+    names = list(alternatives)
     for turn in range(repeats + warm_up):
         for name in names if turn % 2 else reversed(names):
-            started = clock()
-            sides[name]()
+            started = time.process_time()
+            alternatives[name]()
             if turn >= warm_up:
-                seconds[name].append(clock() - started)
+                seconds[name].append(time.process_time() - started)
     return {name: statistics.median(values) for name, values in seconds.items()}
 
 
-def resident() -> int:
-    """Return the resident bytes of this process now."""
-    return _status("VmRSS")
+class Worker:
+    """A process that runs ``script --serve ARGUMENTS`` with the package of a given source folder."""
+
+    def __init__(self, script: str, source: Path, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-W", "ignore", script, "--serve", *arguments],
+            env={**os.environ, "PYTHONPATH": f"{source}{os.pathsep}{source.parent}"},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    def ask(self, request: str = "") -> list[float]:
+        """Send a request and return the measured values."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        print(request, file=self.process.stdin, flush=True)
+        for line in self.process.stdout:
+            if line.startswith(PREFIX):
+                return list(json.loads(line.removeprefix(PREFIX)))
+        raise SystemExit("a worker process failed; its error is printed above")
+
+    def close(self) -> None:
+        """Wait for the end of the process."""
+        self.process.communicate()
 
 
-def reset_peak() -> None:
-    """Let the peak begin again at what is resident now (Linux)."""
-    Path("/proc/self/clear_refs").write_text("5")
-
-
-def peak() -> int:
-    """Return the largest number of resident bytes since `reset_peak`."""
-    return _status("VmHWM")
-
-
-def _status(key: str) -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(f"{key}:"):
-            return int(line.split()[1]) * 1024
-    raise KeyError(key)
+def answer_requests(measure: Callable[[str], list[float]]) -> None:
+    """Answer each request on stdin with measured values: the loop of a worker process."""
+    for line in sys.stdin:
+        print(PREFIX + json.dumps(measure(line.strip())), flush=True)
