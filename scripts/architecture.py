@@ -1,7 +1,8 @@
-"""The architecture as imports make it: read from source, held to the order in docs/develop.md, drawn into the docs.
+"""Read the imports among packages from the source, and draw docs/figures/architecture.svg.
 
-``python scripts/architecture.py`` draws docs/figures/architecture.svg anew; tests/test_architecture.py holds
-what docs/develop.md promises.
+    python scripts/architecture.py
+
+tests/test_architecture.py compares the imports with the order in docs/develop.md.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ PLAN = ROOT / "docs" / "develop.md"
 PICTURE = ROOT / "docs" / "figures" / "architecture.svg"
 
 Imports = Mapping[str, set[str]]
-"""Module -> the modules of this project that it imports, dotted names, wherever in the file the import stands."""
+"""Module -> imported modules of this project, as dotted names; includes imports inside functions."""
 
 
 def modules() -> dict[str, Path]:
-    """Return dotted name -> file of every module of the package; a folder's own name is its ``__init__.py``."""
+    """Return dotted name -> file of each module; a package's name maps to its ``__init__.py``."""
     found = {}
     for path in sorted((SOURCE / PACKAGE).rglob("*.py")):
         parts = path.relative_to(SOURCE).with_suffix("").parts
@@ -33,7 +34,7 @@ def modules() -> dict[str, Path]:
 
 
 def imported(tree: ast.AST) -> Iterator[tuple[str, str | None]]:
-    """Yield (module, name taken from it) of every absolute import in a file; None where the module itself is taken."""
+    """Yield (module, imported name) of each absolute import; the name is None for ``import module``."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name, None) for alias in node.names)
@@ -42,21 +43,21 @@ def imported(tree: ast.AST) -> Iterator[tuple[str, str | None]]:
 
 
 def read_imports() -> dict[str, set[str]]:
-    """Return the imports among the package's modules, as their source has them."""
+    """Return the imports among the package's modules."""
     known = modules()
     found: dict[str, set[str]] = {}
     for module, path in known.items():
-        mine = found.setdefault(module, set())
+        targets = found.setdefault(module, set())
         for source, name in imported(ast.parse(path.read_text())):
-            whole = f"{source}.{name}"
-            target = whole if whole in known else source
+            submodule = f"{source}.{name}"
+            target = submodule if submodule in known else source
             if target in known and target != module:
-                mine.add(target)
+                targets.add(target)
     return found
 
 
 def circle(imports: Imports) -> list[str]:
-    """Return modules that import each other in a ring, [] where there is none."""
+    """Return the modules of a circular import, [] if there is none."""
     try:
         TopologicalSorter(imports).prepare()
     except CycleError as error:
@@ -65,28 +66,26 @@ def circle(imports: Imports) -> list[str]:
 
 
 def package_of(module: str) -> str:
-    """Return the part of a dotted name that docs/develop.md lists: ``lerobot_memobench.sim.world`` -> ``sim``."""
+    """Return the package as named in docs/develop.md: ``lerobot_memobench.sim.world`` -> ``sim``."""
     return module.removeprefix(PACKAGE).lstrip(".").partition(".")[0]
 
 
 def plan() -> dict[str, str]:
-    """Return package -> its question, lowest first, from the table in docs/develop.md."""
-    rows = re.findall(r"^\| `(\w+)` \| (.+?) \|$", PLAN.read_text(), flags=re.MULTILINE)
-    return dict(rows)
+    """Return package -> responsibility, lowest first, from the table in docs/develop.md."""
+    return dict(re.findall(r"^\| `(\w+)` \| (.+?) \|$", PLAN.read_text(), flags=re.MULTILINE))
 
 
 def arrows(imports: Imports) -> dict[str, set[str]]:
-    """Return package -> the packages that its modules import."""
+    """Return package -> packages that its modules import."""
     found: dict[str, set[str]] = {package_of(module): set() for module in imports if package_of(module)}
     for module, targets in imports.items():
-        here = package_of(module)
-        if here:
+        if here := package_of(module):
             found[here] |= {package_of(target) for target in targets} - {here, ""}
     return found
 
 
 def direct(found: Mapping[str, set[str]]) -> dict[str, set[str]]:
-    """Return the arrows that do not follow from others: a -> c goes where a -> b -> c stands."""
+    """Return the arrows without those that follow from others: no a -> c if a -> b -> c."""
 
     def reach(start: str) -> set[str]:
         return set().union(*({target} | reach(target) for target in found[start]))
@@ -97,68 +96,53 @@ def direct(found: Mapping[str, set[str]]) -> dict[str, set[str]]:
     }
 
 
-def floors(found: Mapping[str, set[str]]) -> list[list[str]]:
-    """Return the packages by floor, the ground first: each stands one above the highest that it imports."""
+def layers(found: Mapping[str, set[str]]) -> list[list[str]]:
+    """Return the packages in layers, lowest first; a package is one layer above the highest that it imports."""
     level: dict[str, int] = {}
     for package in TopologicalSorter(found).static_order():
         level[package] = 1 + max((level[target] for target in found[package]), default=-1)
     order = list(plan())
-    return [
-        sorted((package for package in found if level[package] == floor), key=order.index)
-        for floor in range(max(level.values()) + 1)
-    ]
+    return [sorted((p for p in level if level[p] == k), key=order.index) for k in range(max(level.values()) + 1)]
 
 
-def contents(package: str) -> tuple[int, int]:
+def size_of(package: str) -> tuple[int, int]:
     """Return files and lines of a package."""
     base = SOURCE / PACKAGE / package
     files = sorted(base.rglob("*.py")) if base.is_dir() else [base.with_suffix(".py")]
     return len(files), sum(len(path.read_text().splitlines()) for path in files)
 
 
-WIDTH, HEIGHT, BESIDE, BETWEEN = 1.55, 0.52, 0.2, 0.36
-"""Size of a package's box and what is left beside it and between floors, inches: five boxes are as wide as a page."""
-
-INK, DARK, PALE = "#35506b", "#1b2733", "#4d5f70"
-
-
-def places(storeys: list[list[str]]) -> dict[str, tuple[float, float]]:
-    """Return package -> centre of its box, inches; neighbouring floors are shifted so that arrows pass between."""
-    found = {}
-    for floor, packages in enumerate(storeys):
-        shift = 0.16 if floor % 2 else -0.16
-        for k, package in enumerate(packages):
-            x = (k - (len(packages) - 1) / 2) * (WIDTH + BESIDE) + shift
-            found[package] = x, floor * (HEIGHT + BETWEEN)
-    return found
+WIDTH, HEIGHT, GAP_X, GAP_Y, SHIFT = 1.55, 0.52, 0.2, 0.36, 0.16
+"""Size of a box, gaps between boxes and between layers, and the alternating shift of layers, inches."""
+EDGE, TITLE, SUBTITLE, FILL = "#35506b", "#1b2733", "#4d5f70", "#eef3f8"
 
 
 def draw_package(axis: Any, package: str, x: float, y: float) -> None:
-    """Draw a box with the package's name and size; its question stands in the table of docs/develop.md."""
+    """Draw a box with a package's name and size."""
     from matplotlib.patches import FancyBboxPatch
 
-    count, lines = contents(package)
+    count, lines = size_of(package)
     corner, style = (x - WIDTH / 2, y - HEIGHT / 2), "round,pad=0,rounding_size=0.06"
-    axis.add_patch(FancyBboxPatch(corner, WIDTH, HEIGHT, boxstyle=style, facecolor="#eef3f8", edgecolor=INK, zorder=2))
-    axis.text(x, y + 0.1, package, weight="bold", fontsize=11.5, color=DARK, va="center", ha="center", zorder=3)
+    axis.add_patch(FancyBboxPatch(corner, WIDTH, HEIGHT, boxstyle=style, facecolor=FILL, edgecolor=EDGE, zorder=2))
+    axis.text(x, y + 0.1, package, weight="bold", fontsize=11.5, color=TITLE, va="center", ha="center", zorder=3)
     size = f"{count} file{'s' * (count > 1)}, {lines:,} lines"
-    axis.text(x, y - 0.12, size, fontsize=8.5, color=PALE, va="center", ha="center", zorder=3)
+    axis.text(x, y - 0.12, size, fontsize=8.5, color=SUBTITLE, va="center", ha="center", zorder=3)
 
 
 def draw_arrow(axis: Any, name: str, start: tuple[float, float], end: tuple[float, float]) -> None:
-    """Draw an arrow from the bottom of a box to the top of another; its id in the picture is its name."""
+    """Draw an arrow from the bottom of a box to the top of another; ``name`` becomes its id in the SVG."""
     from matplotlib.patches import FancyArrowPatch
 
     (x0, y0), (x1, y1) = start, end
     lean = max(-WIDTH / 3, min(WIDTH / 3, 0.3 * (x1 - x0)))
     ends = (x0 + lean, y0 - HEIGHT / 2), (x1 - lean, y1 + HEIGHT / 2)
-    arrow = FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=11, color=INK, shrinkA=0, shrinkB=0, zorder=1)
+    arrow = FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=11, color=EDGE, shrinkA=0, shrinkB=0, zorder=1)
     arrow.set_gid(name)
     axis.add_patch(arrow)
 
 
 def draw(picture: Path = PICTURE) -> None:
-    """Draw packages as boxes on floors, and what they import as arrows."""
+    """Draw packages as boxes and direct imports as arrows."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -166,7 +150,10 @@ def draw(picture: Path = PICTURE) -> None:
     from matplotlib import pyplot as plt
 
     found = arrows(read_imports())
-    centres = places(floors(found))
+    centres = {}
+    for k, packages in enumerate(layers(found)):
+        left = -(len(packages) - 1) / 2 * (WIDTH + GAP_X) + (SHIFT if k % 2 else -SHIFT)
+        centres |= {p: (left + i * (WIDTH + GAP_X), k * (HEIGHT + GAP_Y)) for i, p in enumerate(packages)}
     xs, ys = zip(*centres.values(), strict=True)
     left, right = min(xs) - WIDTH / 2 - 0.05, max(xs) + WIDTH / 2 + 0.05
     bottom, top = -HEIGHT / 2 - 0.1, max(ys) + HEIGHT / 2 + 0.1
@@ -178,12 +165,12 @@ def draw(picture: Path = PICTURE) -> None:
     for here, targets in sorted(direct(found).items()):
         for target in sorted(targets):
             draw_arrow(axis, f"{here}-{target}", centres[here], centres[target])
-    figure.savefig(picture, metadata={"Date": None} if picture.suffix == ".svg" else None, dpi=100)
+    figure.savefig(picture, metadata={"Date": None})
     plt.close(figure)
 
 
 def drawn(picture: Path = PICTURE) -> dict[str, set[str]]:
-    """Return the arrows of the picture, by their ids."""
+    """Return the arrows of the SVG, from their ids."""
     found: dict[str, set[str]] = {}
     for here, target in re.findall(r'id="(\w+)-(\w+)"', picture.read_text()):
         found.setdefault(here, set()).add(target)

@@ -1,8 +1,7 @@
-"""Import, once and with bytecode on, what the source in some folders imports, late imports included; draw a picture.
+"""Write bytecode for everything that the source in some folders imports, and fill numba's cache of rendering functions.
 
-Where PYTHONDONTWRITEBYTECODE is set, as in many containers, every process would compile all of it anew. The functions
-that draw are compiled by numba at their first call and kept. Whatever is not installed here or does not import is left
-alone: this only saves time.
+Saves seconds per command where PYTHONDONTWRITEBYTECODE is set, as in many containers. Modules that cannot be imported
+are skipped.
 
     python scripts/compile_imports.py src
 """
@@ -17,11 +16,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 COMMANDS = ("lerobot.scripts.lerobot_eval", "lerobot.scripts.lerobot_train")
-"""What is imported by a name that is put together while a command runs."""
+"""Modules that commands import by a computed name."""
 
 
 def imported(folder: Path) -> set[str]:
-    """Return the modules that the Python files below a folder import anywhere, by their absolute names."""
+    """Return the absolute names of all modules imported anywhere in the Python files below a folder."""
     nodes = (node for path in folder.rglob("*.py") for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
     return {name for node in nodes for name in _names(node)}
 
@@ -34,16 +33,15 @@ def _names(node: ast.AST) -> Iterator[str]:
 
 
 def compile_imports(folders: Iterable[Path]) -> None:
-    """Import it all; what has no compiled file yet gets one where this interpreter looks for it."""
+    """Import all modules with bytecode writing enabled."""
     sys.dont_write_bytecode = False
     for name in [*COMMANDS, *sorted(set().union(*map(imported, folders)))]:
-        # Another system's module, or a package that users may leave out, is no reason to stop.
-        with contextlib.suppress(Exception, SystemExit):
+        with contextlib.suppress(Exception, SystemExit):  # optional packages, modules of other systems
             importlib.import_module(name)
 
 
-def draw() -> None:
-    """Take a control step and draw both cameras, so that numba keeps what it compiles for it."""
+def render() -> None:
+    """Step and render a simulation, which makes numba compile and cache its functions."""
     with contextlib.suppress(Exception):
         from lerobot_memobench.sim.rendering import RenderSettings
         from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
@@ -60,4 +58,4 @@ def draw() -> None:
 
 if __name__ == "__main__":
     compile_imports([Path(folder) for folder in sys.argv[1:]])
-    draw()
+    render()

@@ -1,8 +1,7 @@
-"""The pages of the site that are made from the code, and links that leave ``docs``: a hook of MkDocs (`mkdocs.yml`).
+"""Generate reference pages and task cards of the site, and adapt links that leave ``docs``: a hook of MkDocs.
 
-Nothing of it is kept in git. ``python scripts/docs_reference.py FOLDER`` writes the pages down for a look.
-
-Cheap: no simulator is opened. Configurations are read from their source, so torch is not imported.
+The pages are not committed. ``python scripts/docs_reference.py FOLDER`` writes them to a folder. Policy configurations
+are read from their source, without importing torch.
 """
 
 from __future__ import annotations
@@ -12,13 +11,15 @@ import dataclasses
 import html
 import inspect
 import io
+import posixpath
 import re
 import runpy
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, NotRequired, get_args, get_origin, get_type_hints, is_typeddict
+from types import NoneType, UnionType
+from typing import Any, Literal, NotRequired, Union, get_args, get_origin, get_type_hints
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "lerobot_memobench"
@@ -29,7 +30,7 @@ NECESSITY = {
 }
 """Notes whose tables say what a policy without a memory reaches."""
 SHEET = DOCS / "figures" / "tasks.png"
-"""Initial scenes of the published tasks, drawn by `scripts/gallery.py`."""
+"""Initial scenes of all published tasks, from `scripts/gallery.py`."""
 SHEET_SIDE = 256
 
 COPIES = {
@@ -59,16 +60,16 @@ PUBLIC = {
     "Errors": ("errors", "MemobenchError"),
     "Constants": ("protocol", ""),
 }
-"""Public modules and what of them is shown; "" for everything."""
+"""Heading -> public module and its documented names; "" for all names."""
 
 
 # --- parts of pages ---
 
 
 def cell(text: object) -> str:
-    """Return text as it may stand in a table's cell: one line, its bars and angles escaped."""
+    """Return text as a table cell: one line with escaped bars and angle brackets."""
     line = " ".join(str(text).split()).replace("|", "\\|")
-    return re.sub(r"(`[^`]*`)|<", lambda found: found[1] or "&lt;", line)
+    return re.sub(r"(`[^`]*`)|<", lambda match: match[1] or "&lt;", line)
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
@@ -78,12 +79,12 @@ def table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def code(text: object) -> str:
-    """Return text as code, "" for none."""
+    """Return text as inline code; "" if empty."""
     return f"`{text}`" if str(text) else ""
 
 
 def plain(docstring: str | None) -> str:
-    """Return a docstring's words in Markdown: double backquotes are single ones there."""
+    """Return a docstring as one line of Markdown, with single backquotes."""
     return " ".join((docstring or "").replace("``", "`").split())
 
 
@@ -91,12 +92,12 @@ def plain(docstring: str | None) -> str:
 
 
 def short_forms(command: str) -> list[list[str]]:
-    """Return the rows of ``lerobot <command> --help``: short form, what it sets, default."""
+    """Return the rows of ``lerobot <command> --help``: short form, meaning, default."""
     text = (SOURCE / "cli" / f"lerobot_{command}.txt").read_text()
     rows = []
     for typed, lines in re.findall(r"^  (\S.*)\n((?: {8}.*\n)+)", text, re.MULTILINE):
-        words, default = re.fullmatch(r"(.*?)(?: \(default: (.*)\))?", " ".join(lines.split())).groups("")
-        rows.append([typed, words, default])
+        meaning, default = re.fullmatch(r"(.*?)(?: \(default: (.*)\))?", " ".join(lines.split())).groups("")
+        rows.append([typed, meaning, default])
     return rows
 
 
@@ -104,21 +105,21 @@ def lerobot_page() -> str:
     """Return the page of `lerobot eval` and `lerobot train`."""
     parts = [
         "# lerobot eval, lerobot train",
-        "Short forms of LeRobot's own flags. Any other setting goes by LeRobot's full name, as `key=value` or "
-        "`--key=value`: `env.render=fast`, `policy.num_inference_steps=5`. An unknown name is refused with the nearest "
-        "known one before anything starts.",
+        "Short forms of LeRobot's flags. Give any other setting by its full name, as `key=value` or `--key=value`: "
+        "`env.render=fast`, `policy.num_inference_steps=5`. An unknown name is an error that suggests the nearest "
+        "known name.",
     ]
     for command, example in (
         ("eval", "lerobot eval env=memobench policy=CHECKPOINT tasks=object episodes=10"),
         ("train", "lerobot train policy=memobench_mem align=contrastive dataset=FOLDER"),
     ):
         rows = [
-            [" ".join(code(word.strip(",")) for word in typed.split()), html.escape(words, quote=False), default]
-            for typed, words, default in short_forms(command)
+            [" ".join(code(word.strip(",")) for word in typed.split()), html.escape(meaning, quote=False), default]
+            for typed, meaning, default in short_forms(command)
         ]
         parts += [f"## lerobot {command}", f"```text\n{example}\n```", table(["short form", "sets", "default"], rows)]
-    fields = [[code(f"env.{name}"), code(default), says] for name, default, says in environment_fields()]
-    parts += ["## Environment settings", table(["setting", "default", "meaning"], fields)]
+    rows = [[code(f"env.{name}"), code(default), meaning] for name, default, meaning in environment_fields()]
+    parts += ["## Environment settings", table(["setting", "default", "meaning"], rows)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -126,29 +127,29 @@ def environment_fields() -> Iterator[tuple[str, str, str]]:
     """Yield name, default and meaning of the environment's settings."""
     from lerobot_memobench.envs.settings import EnvSettings
 
-    for each in dataclasses.fields(EnvSettings):
-        values = f" ({', '.join(code(value) for value in each.metadata['values'])})" if each.metadata["values"] else ""
-        yield each.name, repr(each.default), f"{each.metadata['meaning']}{values}"
+    for field in dataclasses.fields(EnvSettings):
+        values = ", ".join(code(value) for value in field.metadata["values"] or ())
+        yield field.name, repr(field.default), f"{field.metadata['meaning']}{f' ({values})' if values else ''}"
     tree = class_of(SOURCE / "envs" / "configuration_memobench.py", "MemobenchEnvConfig")
-    says = arguments(ast.get_docstring(tree) or "")
+    meaning = arguments(ast.get_docstring(tree) or "")
     for node in tree.body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id in says:
-            yield node.target.id, ast.unparse(node.value) if node.value else "", says[node.target.id]
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id in meaning:
+            yield node.target.id, ast.unparse(node.value) if node.value else "", meaning[node.target.id]
 
 
 def arguments(docstring: str) -> dict[str, str]:
-    """Return name -> meaning of a docstring's ``Args`` or ``Attributes``; names that share a line share a meaning."""
-    found: dict[str, str] = {}
+    """Return name -> meaning from a docstring's ``Args`` or ``Attributes``; ``a, b: text`` describes both names."""
+    meanings_by_name: dict[str, str] = {}
     block = re.search(r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", docstring, re.MULTILINE)
-    for names, says in re.findall(
+    for names, meaning in re.findall(
         r"^ {4}([\w, ]+): ((?:.|\n(?! {4}\w[\w, ]*: ))*)", block[1] if block else "", re.MULTILINE
     ):
-        found |= dict.fromkeys((name.strip() for name in names.split(",")), plain(says))
-    return found
+        meanings_by_name |= dict.fromkeys((name.strip() for name in names.split(",")), plain(meaning))
+    return meanings_by_name
 
 
 def memobench_page() -> str:
-    """Return the page of `memobench`, from its own help."""
+    """Return the page of `memobench`, from its help."""
     import typer
 
     from lerobot_memobench.cli import memobench
@@ -167,14 +168,15 @@ def memobench_page() -> str:
 
 
 def command_parts(path: str, command: Any) -> Iterator[str]:
-    """Yield heading, help and options of a command, then of the commands below it."""
+    """Yield heading, help and options of a command, then of its subcommands."""
     yield f"### {path}"
     yield plain(command.help)
     rows = []
     for part in command.params:
         if part.name == "help" or getattr(part, "hidden", False):
             continue
-        names = " ".join(code(name) for name in (*part.opts, *part.secondary_opts)) if option(part) else code(part.name)
+        is_option = part.opts[0].startswith("-")
+        names = " ".join(map(code, (*part.opts, *part.secondary_opts) if is_option else (part.name,)))
         default = part.default
         shown = "" if default is None or default is False or callable(default) else code(default)
         rows.append([names, plain(getattr(part, "help", "")), "required" if part.required else shown])
@@ -184,12 +186,7 @@ def command_parts(path: str, command: Any) -> Iterator[str]:
         yield from command_parts(f"{path} {name}", below)
 
 
-def option(part: Any) -> bool:
-    """Whether a parameter of a command is an option, not an argument."""
-    return bool(part.opts[0].startswith("-"))
-
-
-# --- what is observed and written ---
+# --- observations, datasets and logs ---
 
 
 def spaces_page() -> str:
@@ -201,30 +198,30 @@ def spaces_page() -> str:
     from lerobot_memobench.envs.settings import BOTH, EnvSettings
     from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS
 
-    asked = EnvSettings(obs_type=BOTH, expert_action=True, blind_action=True)
-    space = observations.observation_space(asked, longest(asked))
+    settings = EnvSettings(obs_type=BOTH, expert_action=True, blind_action=True)
+    space = observations.observation_space(settings, longest(settings))
     units = {
         "pixels/image": "third-person camera, RGB, upright",
         "pixels/wrist_image": "wrist camera, RGB, upright",
         "agent_pos": "end-effector position 3 (m), axis-angle 3 (rad), fingers 2 (m)",
-        "phase": "0 demonstration prompt, or the robot idles; 1 execution",
-        "step": "control steps since the phase began; of strict tasks since the episode began",
+        "phase": "0 demonstration prompt or idling, 1 execution",
+        "step": "control steps since the start of the phase; in strict tasks since the start of the episode",
         "environment_state": f"{SLOTS} object slots, with `env.obs_type` of that name or `both`",
-        "expert_action": "the scripted expert's; with `env.expert_action=true`",
-        "blind_action": "the published routine's; with `env.blind_action=true`",
+        "expert_action": "action of the scripted expert; with `env.expert_action=true`",
+        "blind_action": "action of the published routine; with `env.blind_action=true`",
     }
     at_policy = observations.policy_names(BOTH)
     rows = []
     for name, part in sorted(flat(space), key=lambda leaf: [*units].index(leaf[0])):
-        there = at_policy.get(name, f"observation.{name}")
-        rows.append([code(name), code(there), str(part.shape), str(part.dtype), units[name]])
+        policy_name = at_policy.get(name, f"observation.{name}")
+        rows.append([code(name), code(policy_name), str(part.shape), str(part.dtype), units[name]])
     slots = {
-        "present": "1; 0 for an empty slot, all zeros",
-        "class": "index of the class, `memobench objects` lists them",
-        "position": "origin in the world, m; of LIBERO's drawers and knob the handle's",
+        "present": "1; 0 in an empty slot, which is all zeros",
+        "class": "index of the class; `memobench objects` lists the classes",
+        "position": "origin in the world, m; the handle's for LIBERO's drawers and knob",
         "rotation": "first two columns of the rotation matrix",
-        "joint": "drawer m, door and knob rad, else 0",
-        "highlighted": "1 while it stands in the prompt's highlight",
+        "joint": "position: drawer m, door and knob rad, otherwise 0",
+        "highlighted": "1 while the prompt highlights the object's place",
     }
     bounds = dict.fromkeys("xyz", "m, ±1 is ±0.05") | {"gripper": "−1 opens, +1 closes"}
     parts = [
@@ -232,18 +229,18 @@ def spaces_page() -> str:
         f"{protocol.CONTROL_HZ} control steps per second. Horizon {protocol.HORIZON:,} execution steps.",
         "## Observations",
         table(["environment", "policy", "shape", "type", "content"], rows),
-        "The instruction is text, `task`.",
+        "The instruction is the text `task`.",
         "### State",
         table(["index", "name"], [[str(k), code(name)] for k, name in enumerate(PROPRIO_NAMES)]),
         "### Object slots",
-        f"`observation.environment_state` holds {SLOTS} slots, {SIZE} numbers in all. Slots are in the order of class "
-        "and place. They hold what a camera could show at this step: no identity, no goal, no history.",
+        f"`observation.environment_state` has {SLOTS} slots, {SIZE} numbers in total, sorted by class and place. Slots "
+        "contain only information that is visible at this step: no identity, no goal, no history.",
         table(
             ["field", "starts at", "numbers", "content"],
             [[code(name), str(STARTS[name]), str(size), slots[name]] for name, size in FIELDS.items()],
         ),
         "## Actions",
-        f"Shape ({protocol.ACTION_DIM},), float32, each in [−1, 1]: a pose delta of the end effector and the gripper.",
+        f"Shape ({protocol.ACTION_DIM},), float32, in [−1, 1]: pose delta of the end effector, and gripper.",
         table(
             ["index", "name", "unit"],
             [[str(k), code(name), bounds.get(name, "rad, ±1 is ±0.5")] for k, name in enumerate(ACTION_NAMES)],
@@ -253,7 +250,7 @@ def spaces_page() -> str:
 
 
 def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield name and space of every leaf of a dictionary of spaces."""
+    """Yield name and space of each leaf of a nested dictionary of spaces."""
     for name, part in space.items():
         if hasattr(part, "spaces"):
             yield from flat(part, f"{above}{name}/")
@@ -269,8 +266,8 @@ def dataset_page() -> str:
 
     features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}
     rows = [
-        [code(name), f"{one['dtype']} {tuple(one['shape'])}", COLUMNS[name]]
-        for name, one in features.items()
+        [code(name), f"{feature['dtype']} {tuple(feature['shape'])}", COLUMNS[name]]
+        for name, feature in features.items()
         if name in COLUMNS
     ]
     parts = [
@@ -278,17 +275,16 @@ def dataset_page() -> str:
         "`memobench generate` writes a LeRobotDataset v3.0.",
         "## Frames",
         table(["column", "type", "meaning"], rows),
-        "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
-        "`task_index`.",
+        "LeRobot adds `task`, `timestamp`, `frame_index`, `episode_index`, `index` and `task_index`.",
         "## Episodes",
         "In `meta/episodes`, and as JSON in `episode_info` of an episode's first frame.",
-        table(["column", "meaning"], [[code(name), says] for name, says in EPISODE_COLUMNS.items()]),
+        table(["column", "meaning"], [[code(name), meaning] for name, meaning in EPISODE_COLUMNS.items()]),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def schemas_page() -> str:
-    """Return the page of log, protocol and card, from the types by which they are read."""
+    """Return the page of log, protocol and card, from the types that validate them."""
     from lerobot_memobench.envs import episode_log, evaluation_file
 
     wanted = [
@@ -305,8 +301,8 @@ def schemas_page() -> str:
     ]
     parts = [
         "# Log and card schemas",
-        "Files are checked against these types where they are read. Unknown fields pass. `null` is allowed where the "
-        "type says `None`.",
+        "Files are validated against these types when they are read. Unknown fields are allowed. `null` is allowed if "
+        "the type includes `None`.",
     ]
     for heading, kind in wanted:
         summary = plain((kind.__doc__ or "").partition("\n\n")[0])
@@ -315,64 +311,62 @@ def schemas_page() -> str:
 
 
 def typed_rows(kind: Any) -> list[list[str]]:
-    """Return name, meaning and type of each field of a `TypedDict`, and by the type whether it is required."""
-    hints, says = get_type_hints(kind), meanings(kind)
+    """Return name, meaning and type of each field of a `TypedDict`; the type includes ``required``."""
+    hints, meaning = get_type_hints(kind), meanings(kind)
     marked = get_type_hints(kind, include_extras=True)  # `__required_keys__` does not see NotRequired in strings
     optional = {name for name, hint in marked.items() if get_origin(hint) is NotRequired}
     required = kind.__required_keys__ - optional
     return [
-        [code(name), says.get(name, "").rstrip("."), code(type_name(hint)) + ", required" * (name in required)]
+        [code(name), meaning.get(name, "").rstrip("."), code(type_name(hint)) + ", required" * (name in required)]
         for name, hint in hints.items()
     ]
 
 
-OF_A_PROTOCOL = {
-    "idle": "control steps that the robot of a strict task idles at most before the execution",
+PROTOCOL_ONLY = {
+    "idle": "maximum control steps of idling before the execution of a strict task",
     "goals": "revision of the goals of strict tasks",
-    "inputs": "of the policy",
+    "inputs": "inputs of the policy",
 }
-"""Keys of a protocol besides the environment's settings."""
+"""Keys of a protocol in addition to the environment's settings."""
 
 
 def meanings(kind: Any) -> dict[str, str]:
-    """Return field -> meaning from the docstrings of a `TypedDict` and of those that it extends."""
-    found: dict[str, str] = {}
+    """Return field -> meaning from the docstrings of a `TypedDict` and its bases."""
+    meaning: dict[str, str] = {}
     for base in getattr(kind, "__orig_bases__", ()):
-        found |= meanings(base)
+        meaning |= meanings(base)
     if "horizon" in kind.__annotations__:
         from lerobot_memobench.envs.settings import EnvSettings
 
-        found |= {each.name: each.metadata["meaning"] for each in dataclasses.fields(EnvSettings)} | OF_A_PROTOCOL
-    return found | arguments(inspect.getdoc(kind) or "")
+        meaning |= {field.name: field.metadata["meaning"] for field in dataclasses.fields(EnvSettings)}
+        meaning |= PROTOCOL_ONLY
+    return meaning | arguments(inspect.getdoc(kind) or "")
 
 
 def type_name(hint: Any) -> str:
-    """Return a type as it is written, without modules and bounds."""
-    if hint is type(None):
-        return "None"
-    if is_typeddict(hint) or (isinstance(hint, type) and not get_args(hint)):
-        return hint.__name__
-    if get_origin(hint) is not None and str(get_origin(hint)) in ("typing.Literal",):
-        return " or ".join(repr(value) for value in get_args(hint))
-    if get_args(hint):
-        origin = getattr(get_origin(hint), "__name__", "")
-        inner = [type_name(part) for part in get_args(hint)]
-        return " or ".join(inner) if origin in ("Union", "UnionType", "Optional") else f"{origin}[{', '.join(inner)}]"
-    return str(hint).replace("typing.", "")
+    """Return a type without module names."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return " or ".join(map(repr, parts))
+    if origin in (Union, UnionType):
+        return " or ".join(map(type_name, parts))
+    if origin is not None:
+        return f"{origin.__name__}[{', '.join(map(type_name, parts))}]"
+    return "None" if hint is NoneType else str(hint.__name__)
 
 
 # --- configurations ---
 
 
 def class_of(path: Path, name: str) -> ast.ClassDef:
-    """Return the source of a class."""
+    """Return the syntax tree of a class."""
     tree = ast.parse(path.read_text())
     return next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
 
 
 def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
-    """Yield name, type, default and the string behind it of a dataclass's fields."""
-    says = arguments(ast.get_docstring(tree) or "")
+    """Yield name, type, default and meaning of a dataclass's fields."""
+    meaning = arguments(ast.get_docstring(tree) or "")
     for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
         if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)) or "ClassVar" in ast.unparse(
             node
@@ -380,15 +374,15 @@ def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
             continue
         text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
         default = "" if node.value is None else ast.unparse(node.value)
-        found = re.fullmatch(r"field\(default_factory=(.*)\)", default)
+        factory = re.fullmatch(r"field\(default_factory=(.*)\)", default)
         default = {"FROM_SIZE": "by size", "BY_DIALECT": "by dialect", "dict": "{}", "tuple": "()", "list": "[]"}.get(
-            found[1] if found else default, default
+            factory[1] if factory else default, default
         )
         yield (
             node.target.id,
             ast.unparse(node.annotation),
             default.strip("'\""),
-            plain(text) or says.get(node.target.id, ""),
+            plain(text) or meaning.get(node.target.id, ""),
         )
 
 
@@ -402,36 +396,23 @@ def policies_page() -> str:
     """Return the page of policy configurations, from their source."""
     parts = [
         "# Policy configuration",
-        "As `policy.<field>=` of `lerobot eval` and `lerobot train`. `memobench_mem` has LeRobot's fields of `pi05` "
-        "beside these. *by size*: the value follows from `policy.size` and `policy.perception`.",
+        "Arguments `policy.<field>=` of `lerobot eval` and `lerobot train`. `memobench_mem` also has the fields of "
+        "LeRobot's `pi05`. *by size*: the value depends on `policy.size` and `policy.perception`.",
     ]
     for name, (path, kind) in POLICIES.items():
-        if not (SOURCE / path).is_file():
-            path, kind = found_configuration(SOURCE / Path(path).parent)
         tree = class_of(SOURCE / path, kind)
         rows = [
-            [code(one), code(default), f"{says} *{hint.replace(' | ', ' or ')}*".strip()]
-            for one, hint, default, says in fields(tree)
+            [code(field), code(default), f"{meaning} *{hint.replace(' | ', ' or ')}*".strip()]
+            for field, hint, default, meaning in fields(tree)
         ]
         summary = plain((ast.get_docstring(tree) or "").split("\n\n")[0])
         parts += [f"## {name}", summary, table(["field", "default", "meaning, type"], rows)]
     return "\n\n".join(parts) + "\n"
 
 
-def found_configuration(folder: Path) -> tuple[str, str]:
-    """Return file and class of the configuration that is registered in a folder."""
-    for path in sorted(folder.glob("configuration_*.py")):
-        for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.ClassDef) and any(
-                "register_subclass" in ast.unparse(one) for one in node.decorator_list
-            ):
-                return str(path.relative_to(SOURCE)), node.name
-    raise FileNotFoundError(f"{folder} holds no configuration")
-
-
 def python_page() -> str:
-    """Return the page of the Python API: mkdocstrings fills it in."""
-    parts = ["# Python API", "Public modules. Everything else may change from one version to the next."]
+    """Return the page of the Python API, which mkdocstrings completes."""
+    parts = ["# Python API", "Public modules. All others may change between versions."]
     for heading, (module, names) in PUBLIC.items():
         parts.append(f"## {heading}")
         parts += [f"::: lerobot_memobench.{module}.{name}" for name in names.split()] or [
@@ -455,16 +436,16 @@ def needs(suite: str) -> dict[str, dict[str, tuple[str, str]]]:
 
 
 VERDICTS = {
-    "no": "no: the picture decides every step",
-    "order": "no: in another order that the goal accepts too, the picture decides every step",
-    "yes": "yes: no policy from pictures alone was found",
+    "no": "no: the current image determines each action",
+    "order": "no: the goal also accepts another order, in which the current image determines each action",
+    "yes": "yes: no policy that uses only the current images was found to succeed",
 }
 PROMPTS = {
-    "routine": "the routine is carried out",
-    "pick": "the referent is picked up",
-    "point": "the referent is pointed at",
-    "highlight": "the referent's place is highlighted",
-    "hide": "objects are hidden in drawers",
+    "routine": "shows the procedure",
+    "pick": "picks up the referent",
+    "point": "points at the referent",
+    "highlight": "highlights the place of the referent",
+    "hide": "hides objects in drawers",
 }
 
 
@@ -482,8 +463,8 @@ def tasks_page(suite: str) -> str:
     ]
     if suite == "strict":
         parts.append(
-            "The robot [idles](protocol.md#idling) before each execution. [What this suite does not "
-            "show](suites.md#what-the-strict-suite-does-not-show)."
+            "The robot [idles](protocol.md#idling) before each execution. [Limitations of this "
+            "suite](suites.md#what-the-strict-suite-does-not-show)."
         )
     kind = None
     for number, name in enumerate(task_names(suite=suite), 1):
@@ -500,7 +481,7 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
     from lerobot_memobench.evaluation.tables import OPERATION_NAMES
     from lerobot_memobench.tasks.catalogue import task_number
 
-    drawn = task.suite == "strict"  # the instruction is one of several
+    drawn = task.suite == "strict"  # the seed draws the instruction
     title = task.name.replace("_", " ") if drawn else task.language
     yield f"### {number}. {title.capitalize()} {{ #{slug(task.name)} }}"
     yield f"`{task.name}`"
@@ -508,14 +489,14 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
     yield f"![Initial scene](../figures/tasks/{scene_of:02}.png){{ width=256 loading=lazy }}"
     rows = [
         ["memory type, family", f"{task.memory_type}, {task.family.replace('_', ' ')}"],
-        ["instruction", f"{task.language}{' (one of those drawn)' if drawn else ''}"],
+        ["instruction", f"{task.language}{' (one of several)' if drawn else ''}"],
         ["demonstration prompt", PROMPTS[task.prompt.kind] if task.prompt else "none"],
         ["objects", ", ".join(sorted(set(task.objects.values())))],
         ["fixtures", ", ".join(sorted(set(task.fixtures.values()) - {"kitchen_table"})) or "table only"],
         ["admissible goals", str(len(task.random_variants))],
     ]
     if task.derived_from:
-        rows.append(["in the scene of", f"[`{task.derived_from}`](tasks_published.md#{slug(task.derived_from)})"])
+        rows.append(["scene of", f"[`{task.derived_from}`](tasks_published.md#{slug(task.derived_from)})"])
     for referent, (rate, verdict) in known.items():
         where = "" if referent in ("both", "drawn") else f", referent {referent}"
         rows += [
@@ -525,7 +506,7 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
     yield table(["", ""], rows)
     yield table(
         ["checkpoint", "operation", "text (intermediate)"],
-        [[str(k), OPERATION_NAMES[one.operation], one.language[1]] for k, one in enumerate(task.checkpoints, 1)],
+        [[str(k), OPERATION_NAMES[c.operation], c.language[1]] for k, c in enumerate(task.checkpoints, 1)],
     )
 
 
@@ -536,22 +517,22 @@ def slug(name: str) -> str:
 
 @cache
 def task_places() -> dict[str, tuple[int, int]]:
-    """Return where each task's picture is in the sheet of all, name -> (left, top), pixels."""
-    found: dict[str, tuple[int, int]] = runpy.run_path(str(ROOT / "scripts" / "gallery.py"))["task_places"]()
-    return found
+    """Return the position of each task's picture in the sheet, name -> (left, top), pixels."""
+    places: dict[str, tuple[int, int]] = runpy.run_path(str(ROOT / "scripts" / "gallery.py"))["task_places"]()
+    return places
 
 
 def scene(number: int) -> bytes:
-    """Return the picture of a published task's initial scene, cut out of the sheet of all."""
+    """Return the picture of a published task's initial scene, cropped from the sheet."""
     from PIL import Image
 
     from lerobot_memobench.tasks.catalogue import task_names
 
     left, top = task_places()[task_names()[number - 1]]
-    kept = io.BytesIO()
+    content = io.BytesIO()
     with Image.open(SHEET) as sheet:
-        sheet.crop((left, top, left + SHEET_SIDE, top + SHEET_SIDE)).save(kept, "PNG")
-    return kept.getvalue()
+        sheet.crop((left, top, left + SHEET_SIDE, top + SHEET_SIDE)).save(content, "PNG")
+    return content.getvalue()
 
 
 # --- the site ---
@@ -567,45 +548,41 @@ PAGES: dict[str, Callable[[], str]] = {
     "benchmark/tasks_published.md": lambda: tasks_page("published"),
     "benchmark/tasks_strict.md": lambda: tasks_page("strict"),
 }
-"""Page of the site -> what makes it."""
+"""Generated page of the site -> function that returns its text."""
+
+
+LINK = re.compile(r"(?<!!)\[([^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*)\]\(([^()\s]+)\)")
+
+
+def relink(markdown: str, source: str, page: str) -> str:
+    """Return Markdown of the repository's file ``source`` with its links adapted to the site's page ``page``.
+
+    Links to files outside the site become the path as code.
+    """
+    folder = posixpath.dirname(page) or "."
+
+    def adapt(match: re.Match[str]) -> str:
+        text, link = match[1], match[2]
+        path, mark, anchor = link.partition("#")
+        if not path or ":" in path:
+            return match[0]
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
+        if target.startswith("docs/") or target in COPIES:
+            place = COPIES.get(target) or target.removeprefix("docs/")
+            return f"[{text}]({posixpath.relpath(place, folder)}{mark}{anchor})"
+        return text if text.strip("`") == target else f"{text} (`{target}`)"
+
+    return LINK.sub(adapt, markdown)
 
 
 def copy_of(source: str) -> str:
-    """Return a page that lies elsewhere in the repository, its links as they are from its place in the site."""
-    import posixpath
-
-    def moved(found: re.Match[str]) -> str:
-        path, mark, anchor = found[1].partition("#")
-        if not path or ":" in path:
-            return found[0]
-        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), path))
-        return f"]({posixpath.relpath(target, posixpath.dirname('docs/' + COPIES[source]))}{mark}{anchor})"
-
+    """Return a page from outside ``docs``, without front matter and with adapted links."""
     text = re.sub(r"\A---\n.*?\n---\n", "", (ROOT / source).read_text(), flags=re.DOTALL)
-    return re.sub(r"\]\(([^()\s]+)\)", moved, text)
-
-
-def at_home(markdown: str, page: str) -> str:
-    """Return a page's Markdown with links that leave ``docs`` turned: to the site's copy, or to the path as code."""
-    import posixpath
-
-    def turned(found: re.Match[str]) -> str:
-        text, link = found[1], found[2]
-        path, mark, anchor = link.partition("#")
-        if not path or re.match(r"[a-z]+:", path):
-            return found[0]
-        target = posixpath.normpath(posixpath.join(posixpath.dirname("docs/" + page), path))
-        if target.startswith("docs/"):
-            return found[0]
-        if target in COPIES:
-            return f"[{text}]({posixpath.relpath(COPIES[target], posixpath.dirname(page) or '.')}{mark}{anchor})"
-        return text if text.strip("`") == target else f"{text} (`{target}`)"
-
-    return re.sub(r"(?<!!)\[([^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*)\]\(([^()\s]+)\)", turned, markdown)
+    return relink(text, source, COPIES[source])
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages that are made (MkDocs calls this)."""
+    """Add the generated pages (called by MkDocs)."""
     from mkdocs.structure.files import File
 
     sys.path.insert(0, str(ROOT / "src"))
@@ -619,29 +596,29 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Turn the links of a page that leave the site (MkDocs calls this)."""
-    return at_home(markdown, page.file.src_uri)
+    """Adapt the links of a page that leave ``docs`` (called by MkDocs)."""
+    return relink(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
 
 
 def breakable(page: str) -> str:
-    """Return a page's HTML in which tables fit: names may break behind ``_``, ``.``, ``/`` and ``=``, intervals not."""
+    """Allow line breaks in table cells after ``_``, ``.``, ``/`` and ``=`` of names, and prevent them in intervals."""
 
-    def in_cell(found: re.Match[str]) -> str:
-        parts = re.split(r"(<[^>]*>)", found[2])
+    def break_cell(match: re.Match[str]) -> str:
+        parts = re.split(r"(<[^>]*>)", match[2])
         parts[::2] = [re.sub(r"(?<=[A-Za-z])([_./=])(?=[A-Za-z])", r"\1<wbr>", part) for part in parts[::2]]
         cell = re.sub(r"\[[\d.]+–[\d.]+\]", r'<span class="interval">\g<0></span>', "".join(parts))
-        return found[1] + cell + found[3]
+        return match[1] + cell + match[3]
 
-    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", in_cell, page, flags=re.DOTALL)
+    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", break_cell, page, flags=re.DOTALL)
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Let tables fit (MkDocs calls this)."""
+    """Let wide tables fit (called by MkDocs)."""
     return breakable(content)
 
 
 def main() -> None:
-    """Write the pages that are made into the folder that is named."""
+    """Write the generated pages into the given folder."""
     out = Path(sys.argv[1])
     for path, make in PAGES.items():
         (out / path).parent.mkdir(parents=True, exist_ok=True)

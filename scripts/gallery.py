@@ -1,7 +1,7 @@
-"""Pictures of the benchmark: initial scenes of tasks, objects from all sides, fixtures open and closed.
+"""Draw initial scenes of tasks, objects from four sides, and fixtures open and closed.
 
-python scripts/gallery.py --out outputs/gallery          # tasks.png, objects.png, fixtures.png
-python scripts/gallery.py --only tasks --out docs/figures  # the picture of README
+python scripts/gallery.py --out outputs/gallery            # tasks.png, objects.png, fixtures.png
+python scripts/gallery.py --only tasks --out docs/figures  # the picture in README
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
 Pixels = NDArray[np.uint8]
 
 LARGEST_FILE = 400_000
-"""Bytes a figure may have: it is kept in the repository."""
+"""Maximum size of a figure, bytes; figures are committed."""
 SEED = 7
 FOVY = 30.0
 """Field of view of the turntable's cameras, degrees."""
 FRONTS = {"flat_stove": 0.0, "microwave": -90.0, "wooden_cabinet": -90.0, "wooden_two_layer_shelf": -90.0}
-"""Azimuth of the side with handles or openings, degrees."""
+"""Azimuth of a fixture's front, degrees."""
 BACKGROUND, INK = (250, 250, 248), (30, 30, 34)
 GROUND = (0.80, 0.79, 0.77, 1.0)
-"""Plain: the grain of the table would cost more bytes than the things on it."""
+"""Uniform colour: a table's wood grain takes more bytes than the objects on it."""
 
 
 class View(NamedTuple):
-    """A camera's place: degrees, azimuth 0 from the agentview's side; distance in sizes of the thing."""
+    """Position of a camera: angles in degrees, azimuth 0 on the agentview's side; distance in object sizes."""
 
     azimuth: float
     elevation: float = 32.0
@@ -54,25 +54,25 @@ FRONT, SIDE = View(20.0, 30.0, 5.6), View(-40.0, 42.0, 5.6)
 
 
 def main() -> None:
-    """Write the pictures."""
+    """Write the selected figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("outputs/gallery"), help="folder of the pictures")
-    parser.add_argument("--suite", choices=(PUBLISHED, STRICT), default=PUBLISHED, help="of the tasks")
-    parser.add_argument("--only", choices=("tasks", "objects", "fixtures"), help="one of the pictures")
-    parser.add_argument("--classes", nargs="+", help="object classes to draw instead of the catalogue's")
-    chosen = parser.parse_args()
-    pictures = {
-        "tasks": lambda: draw_tasks(task_names(suite=chosen.suite)),
-        "objects": lambda: draw_objects(chosen.classes),
+    parser.add_argument("--out", type=Path, default=Path("outputs/gallery"), help="output folder")
+    parser.add_argument("--suite", choices=(PUBLISHED, STRICT), default=PUBLISHED, help="suite of the tasks")
+    parser.add_argument("--only", choices=("tasks", "objects", "fixtures"), help="draw one figure")
+    parser.add_argument("--classes", nargs="+", help="object classes; default: all of the catalogue")
+    args = parser.parse_args()
+    figures = {
+        "tasks": lambda: draw_tasks(task_names(suite=args.suite)),
+        "objects": lambda: draw_objects(args.classes),
         "fixtures": draw_fixtures,
     }
-    for name, draw in pictures.items():
-        if chosen.only in (None, name):
-            print(save(draw(), chosen.out / f"{name}.png"))
+    for name, draw in figures.items():
+        if args.only in (None, name):
+            print(save(draw(), args.out / f"{name}.png"))
 
 
 def draw_tasks(names: Sequence[str] | None = None, size: int = 256) -> Image.Image:
-    """Return the initial scenes of tasks by memory type, as the agentview camera sees them; by default of all."""
+    """Return the initial scenes of tasks (default: all published) by memory type, from the agentview camera."""
     sheets = []
     for memory_type, tasks in _by_type(names).items():
         cells = []
@@ -85,15 +85,15 @@ def draw_tasks(names: Sequence[str] | None = None, size: int = 256) -> Image.Ima
 
 
 def task_places(names: Sequence[str] | None = None, size: int = 256) -> dict[str, tuple[int, int]]:
-    """Return where in `draw_tasks` each task's picture stands, name -> (left, top), pixels."""
-    found: dict[str, tuple[int, int]] = {}
+    """Return the position of each task's picture in `draw_tasks`, name -> (left, top), pixels."""
+    places: dict[str, tuple[int, int]] = {}
     top = 0
     for memory_type, tasks in _by_type(names).items():
         titles = [task.title for task in tasks]
-        there = layout(titles, (size, size), *_columns_and_label(names, size), memory_type)
-        found |= {task.name: (x, top + y) for task, (x, y) in zip(tasks, there.places, strict=True)}
-        top += there.height
-    return found
+        sheet = layout(titles, (size, size), *_columns_and_label(names, size), memory_type)
+        places |= {task.name: (x, top + y) for task, (x, y) in zip(tasks, sheet.places, strict=True)}
+        top += sheet.height
+    return places
 
 
 def _by_type(names: Sequence[str] | None) -> dict[str, list[Task]]:
@@ -108,13 +108,13 @@ def _columns_and_label(names: Sequence[str] | None, size: int) -> tuple[int, int
 
 
 def draw_objects(classes: Sequence[str] | None = None, size: int = 112) -> Image.Image:
-    """Return each class from four sides, all object classes of the catalogue by default."""
+    """Return each object class (default: all of the catalogue) from four sides."""
     cells = [_cells(name, TURNTABLE, size)[0] for name in classes or catalogue_classes("objects")]
     return grid(cells, min(3, len(cells)), label=20)
 
 
 def draw_fixtures(classes: Sequence[str] | None = None, size: int = 224) -> Image.Image:
-    """Return each fixture from two sides, closed or off and then open or on."""
+    """Return each fixture from two sides, closed or off, then open or on."""
     cells = []
     for name in classes or catalogue_classes("fixtures"):
         cells += _cells(name, [v._replace(azimuth=v.azimuth + FRONTS.get(name, 0.0)) for v in (FRONT, SIDE)], size)
@@ -122,14 +122,14 @@ def draw_fixtures(classes: Sequence[str] | None = None, size: int = 224) -> Imag
 
 
 def catalogue_classes(kind: Literal["objects", "fixtures"]) -> list[str]:
-    """Return the classes of the published tasks' objects or fixtures, without the table, sorted."""
-    found = {name for task in task_names() for name in getattr(get_task(task), kind).values()}
-    return sorted(found - {"kitchen_table"})
+    """Return the sorted classes of the published tasks' objects or fixtures, without the table."""
+    classes = {name for task in task_names() for name in getattr(get_task(task), kind).values()}
+    return sorted(classes - {"kitchen_table"})
 
 
 def _cells(class_name: str, views: Sequence[View], size: int) -> list[tuple[str, Pixels]]:
-    """Return labels and pictures of an instance on plain ground: closed or off, and open or on where it moves."""
-    spec = _plain_ground()
+    """Return labels and pictures of an instance: one, or two (closed or off, open or on) if it has joints."""
+    spec = _plain_scene()
     asset = build_asset(spec, "thing", class_name)
     spec.body("thing").pos = [0.0, 0.0, TABLE_TOP - asset.bottom]
     low, high = np.array(asset.low), np.array(asset.high)
@@ -139,17 +139,17 @@ def _cells(class_name: str, views: Sequence[View], size: int) -> list[tuple[str,
         _add_camera(spec, camera, middle, view, view.distance * float(np.linalg.norm(high - low)) / 2)
     model = spec.compile()
     data, renderer = mujoco.MjData(model), make_renderer(model, RenderSettings(size, size, "high"))
-    words = ("off", "on") if asset.glow else ("closed", "open")
-    labels = [f"{class_name}, {word}" for word in words] if asset.articulations else [class_name]
+    states = ("off", "on") if asset.glow else ("closed", "open")
+    labels = [f"{class_name}, {state}" for state in states] if asset.articulations else [class_name]
     cells = []
     for label, opened in zip(labels, (False, True), strict=False):
-        _open(asset, model, data, opened)
+        _set_open(asset, model, data, opened)
         cells.append((label, np.hstack([renderer.draw(model, data, camera) for camera in cameras])))
     return cells
 
 
-def _open(asset: Asset, model: mujoco.MjModel, data: mujoco.MjData, opened: bool) -> None:
-    """Open or close everything that can be, and switch on or off."""
+def _set_open(asset: Asset, model: mujoco.MjModel, data: mujoco.MjData, opened: bool) -> None:
+    """Open or close all joints, and switch the burner on or off."""
     for articulation in asset.articulations.values():
         data.joint(articulation.joint).qpos[0] = articulation.open_q if opened else articulation.closed_q
     for geom in asset.glow:
@@ -157,8 +157,8 @@ def _open(asset: Asset, model: mujoco.MjModel, data: mujoco.MjData, opened: bool
     mujoco.mj_forward(model, data)
 
 
-def _plain_ground() -> mujoco.MjSpec:
-    """Return the kitchen with its room and table out of sight and plain ground at the table's height."""
+def _plain_scene() -> mujoco.MjSpec:
+    """Return the kitchen's lights and cameras over uniform ground at table height; room and table are hidden."""
     spec = mujoco.MjSpec()
     build_kitchen(spec)
     for geom in [*spec.body("room").geoms, *spec.body("kitchen_table").geoms]:
@@ -187,7 +187,7 @@ GAP = 6
 
 
 class Layout(NamedTuple):
-    """Where the pictures of a grid stand: lines of their labels, (left, top) of each, and the whole's size, pixels."""
+    """Lines of each label, (left, top) of each picture, and the size of the sheet, pixels."""
 
     labels: list[list[str]]
     places: list[tuple[int, int]]
@@ -196,7 +196,7 @@ class Layout(NamedTuple):
 
 
 def layout(names: Sequence[str], picture: tuple[int, int], columns: int, label: int, heading: str) -> Layout:
-    """Return how `grid` places pictures of one width and height, each row as high as its labels need."""
+    """Return the layout of `grid` for pictures of equal size; the longest label of a row sets its height."""
     width, height = picture
     font = ImageFont.load_default(label)
     labels = [_wrapped(name, font, width) for name in names]
@@ -209,13 +209,13 @@ def layout(names: Sequence[str], picture: tuple[int, int], columns: int, label: 
 
 
 def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, heading: str = "") -> Image.Image:
-    """Return pictures of one size in rows, each above its label, under a heading where there is one."""
+    """Return pictures of equal size in rows, each above its label, below an optional heading."""
     height, width = cells[0][1].shape[:2]
-    there = layout([name for name, _ in cells], (width, height), columns, label, heading)
-    sheet = Image.new("RGB", (there.width, there.height), BACKGROUND)
+    placed = layout([name for name, _ in cells], (width, height), columns, label, heading)
+    sheet = Image.new("RGB", (placed.width, placed.height), BACKGROUND)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(label)
     draw.text((GAP, GAP), heading, fill=INK, font=ImageFont.load_default(round(1.3 * label)))
-    for (_, picture), lines, (x, y) in zip(cells, there.labels, there.places, strict=True):
+    for (_, picture), lines, (x, y) in zip(cells, placed.labels, placed.places, strict=True):
         sheet.paste(Image.fromarray(picture), (x, y))
         for number, words in enumerate(lines):
             draw.text((x + 1, y + height + 2 + number * (label + 3)), words, fill=INK, font=font)
@@ -223,7 +223,7 @@ def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, hea
 
 
 def _wrapped(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> list[str]:
-    """Return a text in lines that are no wider than so many pixels, where its words allow it."""
+    """Break a text between words into lines of at most ``width`` pixels."""
     lines: list[str] = []
     for word in text.split():
         if lines and font.getlength(f"{lines[-1]} {word}") <= width:
@@ -234,17 +234,19 @@ def _wrapped(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, widt
 
 
 def stack(sheets: Sequence[Image.Image]) -> Image.Image:
-    """Return sheets one under the other."""
-    whole = Image.new("RGB", (max(one.width for one in sheets), sum(one.height for one in sheets)), BACKGROUND)
+    """Return sheets stacked vertically."""
+    stacked = Image.new(
+        "RGB", (max(sheet.width for sheet in sheets), sum(sheet.height for sheet in sheets)), BACKGROUND
+    )
     top = 0
-    for one in sheets:
-        whole.paste(one, (0, top))
-        top += one.height
-    return whole
+    for sheet in sheets:
+        stacked.paste(sheet, (0, top))
+        top += sheet.height
+    return stacked
 
 
 def save(sheet: Image.Image, path: Path) -> Path:
-    """Write a figure as a PNG of at most `LARGEST_FILE` bytes: fewer colours first, then fewer pixels."""
+    """Write a PNG of at most `LARGEST_FILE` bytes: reduce colours first, then size."""
     content = _png(sheet)
     while len(content) > LARGEST_FILE:
         sheet = sheet.resize((sheet.width * 9 // 10, sheet.height * 9 // 10), Image.Resampling.LANCZOS)
@@ -254,10 +256,10 @@ def save(sheet: Image.Image, path: Path) -> Path:
 
 
 def _png(sheet: Image.Image) -> bytes:
-    """Return a picture as PNG, with as many colours as fit into `LARGEST_FILE`, or the fewest."""
+    """Return a PNG with as many colours as fit into `LARGEST_FILE`, or the minimum."""
     for colours in (256, 160, 96):
         buffer = io.BytesIO()
-        # Median cut alone greys what is small and bright, such as a tomato on a table.
+        # Median cut alone turns small bright objects grey, such as a tomato on a table.
         reduced = sheet.quantize(colours, Image.Quantize.MEDIANCUT, kmeans=4, dither=Image.Dither.NONE)
         reduced.save(buffer, "PNG", optimize=True)
         if buffer.tell() <= LARGEST_FILE:

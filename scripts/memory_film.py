@@ -1,9 +1,9 @@
-"""Make the README's moving picture: the expert and two policies in one scene, in step.
+"""Make README's animation: the expert and two policies in the same scene, side by side.
 
-    python scripts/memory_film.py            # docs/figures/memory.webp; some minutes on one core
+    python scripts/memory_film.py            # docs/figures/memory.webp; minutes on one core
 
-Each is evaluated on the first evaluation seeds, with a demonstration prompt whose referent the seed draws. Shown is the
-first seed at which they do not end alike. Its actions are then played again in a scene that is drawn at quality high.
+Evaluates all three on the first evaluation seeds, with a demonstration prompt whose referent depends on the seed, and
+selects the first seed with different outcomes. Its actions are replayed in a scene rendered at quality high.
 """
 
 from __future__ import annotations
@@ -32,152 +32,150 @@ from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import BOWL, get_task
 
+TASK = BOWL
 POLICIES = {
     "expert": (),
     "with memory": ("policy=memobench_small",),
     "without memory": ("policy=memobench_small_memoryless",),
 }
-"""Name in the picture -> arguments of `lerobot eval` that choose who acts."""
+"""Column title -> arguments of `lerobot eval` that select the policy."""
 EPISODES, HORIZON = 6, 400
-"""Evaluation seeds that are tried; steps of an episode."""
+"""Evaluated seeds, and steps per episode."""
 STRIDE, SPEED = 4, 2.0
-"""Control steps from picture to picture, and how much faster than real they are shown."""
-SIDE, GAP = 272, 6
-"""Of a scene, pixels: three of them are as wide as GitHub shows a README."""
+"""Control steps per frame, and playback speed relative to real time."""
+LAST_SECONDS = 2.0
+"""Duration of the last frame."""
+SIDE, MARGIN = 272, 6
+"""Size of a scene and margin between scenes, pixels; three scenes are as wide as a README on GitHub."""
 HEADER, TITLE, FOOTER = 48, 40, 42
-"""Heights of the texts, pixels."""
-LAST = 2.0
-"""Seconds that the last picture stays."""
+"""Heights of the text rows, pixels."""
 LARGE, MEDIUM = 25, 21
-"""Sizes of letters: still read where a phone shows the film at half its width."""
+"""Font sizes; readable at half the width, on a phone."""
 BACKGROUND, INK, FAINT = (24, 26, 30), (240, 240, 240), (165, 170, 180)
 DEMONSTRATION, SOLVED, FAILED = (204, 121, 167), (0, 158, 115), (213, 94, 0)
 QUALITY = 78
-"""Of WebP: what is written in colour keeps its edges, and the file stays below 2 MB."""
+"""WebP quality; keeps the file below 2 MB without artefacts around text."""
 
-Frame = NDArray[np.uint8]
+Rollout = tuple[dict[str, Any], list[NDArray[np.float32]]]
+"""Log record and actions of an episode."""
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One picture of an episode, and what had happened by then."""
+class Frame:
+    """Image and state of one episode at a step; ``reached`` has a value per memory checkpoint."""
 
-    picture: Frame
+    image: NDArray[np.uint8]
     phase: int
     clock: int
-    done: tuple[bool, ...]
+    reached: tuple[bool, ...]
     drifted: bool
     solved: bool
-
-    @property
-    def ended(self) -> bool:
-        """Whether there is nothing more to wait for: it is solved, or the wrong thing was done."""
-        return self.solved or self.drifted
 
 
 @contextmanager
 def recorded_actions() -> Iterator[dict[int, list[NDArray[np.float32]]]]:
-    """Collect the actions of every execution in this process meanwhile, by seed."""
-    taken: dict[int, list[NDArray[np.float32]]] = defaultdict(list)
+    """Record the executed actions of all episodes in this process, by seed."""
+    actions: dict[int, list[NDArray[np.float32]]] = defaultdict(list)
     step = Episode.step
 
-    def recording(episode: Episode, action: ArrayLike) -> None:
+    def recording_step(episode: Episode, action: ArrayLike) -> None:
         executing = episode.phase == EXECUTION
         step(episode, action)
         if executing:
-            taken[episode.seed].append(episode.applied_action)
+            actions[episode.seed].append(episode.applied_action)
 
-    with mock.patch.object(Episode, "step", recording):
-        yield taken
-
-
-Rollout = tuple[dict[str, Any], list[NDArray[np.float32]]]
-"""Line of the log and actions of an episode."""
+    with mock.patch.object(Episode, "step", recording_step):
+        yield actions
 
 
 def evaluate(name: str, folder: Path) -> dict[int, Rollout]:
-    """Evaluate one of `POLICIES` in this process; return line of the log and actions by seed."""
+    """Evaluate one of `POLICIES` in this process; return log record and actions by seed."""
     from lerobot_memobench.run.plan import plan_line
     from lerobot_memobench.run.run import run_evaluation
 
-    words = ["env=memobench", *POLICIES[name], f"tasks={BOWL}", "referent=random", f"horizon={HORIZON}"]
+    words = ["env=memobench", *POLICIES[name], f"tasks={TASK}", "referent=random", f"horizon={HORIZON}"]
     words += [f"obs_type={OBJECTS}", f"episodes={EPISODES}", "videos=0", f"output_dir={folder}"]
     plan = plan_line([*words, "batch_size=1", "eval.use_async_envs=false"])
-    with recorded_actions() as taken:
+    with recorded_actions() as actions:
         run_evaluation(plan, print, print)
-    return {record["seed"]: (record, taken[record["seed"]]) for record in read_episodes(folder)}
+    return {record["seed"]: (record, actions[record["seed"]]) for record in read_episodes(folder)}
 
 
-def first_difference(found: dict[str, dict[int, Rollout]]) -> int:
-    """Return the first seed at which the rollouts do not end alike."""
-    seeds = sorted(next(iter(found.values())))
+def first_difference(rollouts: dict[str, dict[int, Rollout]]) -> int:
+    """Return the first seed with different outcomes.
+
+    Raises:
+        SystemExit: the outcomes are equal on all seeds.
+    """
+    seeds = sorted(next(iter(rollouts.values())))
     for seed in seeds:
-        if len({episodes[seed][0]["success"] for episodes in found.values()}) > 1:
+        if len({episodes[seed][0]["success"] for episodes in rollouts.values()}) > 1:
             return seed
-    raise SystemExit(f"all end alike on seeds {seeds[0]} to {seeds[-1]}; look through more (EPISODES)")
+    raise SystemExit(f"all outcomes are equal on seeds {seeds[0]} to {seeds[-1]}; increase EPISODES")
 
 
-def play(seed: int, record: dict[str, Any], actions: Sequence[NDArray[np.float32]]) -> list[Shot]:
-    """Go through a recorded episode again and draw it; it must end as the evaluation's did."""
-    episode = Episode(
-        get_task(BOWL), referent="random", horizon=HORIZON, render=RenderSettings(2 * SIDE, 2 * SIDE, "high")
-    )
+def replay(seed: int, record: dict[str, Any], actions: Sequence[NDArray[np.float32]]) -> list[Frame]:
+    """Replay an evaluated episode until success, reference drift or its end.
+
+    Raises:
+        SystemExit: scene or outcome differ from the evaluation's.
+    """
+    render = RenderSettings(2 * SIDE, 2 * SIDE, "high")
+    episode = Episode(get_task(TASK), referent="random", horizon=HORIZON, render=render)
     episode.reset(seed)
-    shots = [shot(episode)]
-    left = iter(actions)
-    while not (episode.done or shots[-1].ended):
-        began = episode.exec_start
-        episode.step(next(left) if began is not None else np.zeros(7, np.float32))
-        if episode.step_index % STRIDE == 0 or episode.done or began != episode.exec_start:
-            shots.append(shot(episode))
+    frames, remaining = [frame_of(episode)], iter(actions)
+    while not (episode.done or frames[-1].solved or frames[-1].drifted):
+        start = episode.exec_start
+        episode.step(next(remaining) if start is not None else np.zeros(7, np.float32))
+        if episode.step_index % STRIDE == 0 or episode.done or start != episode.exec_start:
+            frames.append(frame_of(episode))
     if episode.scene_hash != record["scene_hash"] or (episode.done and episode.success != record["success"]):
-        raise SystemExit(f"seed {seed} does not end as in its evaluation")
-    return shots
+        raise SystemExit(f"the replay of seed {seed} differs from its evaluation")
+    return frames
 
 
-def shot(episode: Episode) -> Shot:
-    """Draw the present step."""
-    done = tuple(k < episode.progress.index for k in range(len(episode.task.checkpoints)))
-    picture = Image.fromarray(episode.sim.render()).resize((SIDE, SIDE), Image.Resampling.BOX)
-    return Shot(np.asarray(picture), episode.phase, episode.clock, done, episode.drifted, episode.success)
+def frame_of(episode: Episode) -> Frame:
+    """Render the current step."""
+    reached = tuple(k < episode.progress.index for k in range(len(episode.task.checkpoints)))
+    image = Image.fromarray(episode.sim.render()).resize((SIDE, SIDE), Image.Resampling.BOX)
+    return Frame(np.asarray(image), episode.phase, episode.clock, reached, episode.drifted, episode.success)
 
 
-def frames(takes: dict[str, list[Shot]]) -> Iterator[Image.Image]:
-    """Yield the film: all takes in step, each waiting at its last picture for the others."""
-    for k in range(max(len(shots) for shots in takes.values())):
-        now = {name: shots[min(k, len(shots) - 1)] for name, shots in takes.items()}
-        yield compose(now)
+def animation(columns: dict[str, list[Frame]]) -> Iterator[Image.Image]:
+    """Yield the frames of the animation; a finished column repeats its last frame."""
+    for k in range(max(map(len, columns.values()))):
+        yield compose({name: frames[min(k, len(frames) - 1)] for name, frames in columns.items()})
 
 
-def compose(now: dict[str, Shot]) -> Image.Image:
-    """Return a picture of the film: instruction and phase, and each take between its name and its checkpoints."""
-    task = get_task(BOWL)
-    film = Image.new("RGB", (len(now) * (SIDE + GAP) - GAP, HEADER + TITLE + SIDE + FOOTER), BACKGROUND)
-    draw = ImageDraw.Draw(film)
+def compose(columns: dict[str, Frame]) -> Image.Image:
+    """Return a frame of the animation: instruction and time, then title, scene and checkpoints of each column."""
+    task = get_task(TASK)
+    picture = Image.new("RGB", (len(columns) * (SIDE + MARGIN) - MARGIN, HEADER + TITLE + SIDE + FOOTER), BACKGROUND)
+    draw = ImageDraw.Draw(picture)
     large, medium = (ImageFont.load_default(size=size) for size in (LARGE, MEDIUM))
-    phase = max(one.phase for one in now.values())
-    clock = max(one.clock for one in now.values() if one.phase == phase)
-    words, colour = ("demonstration", DEMONSTRATION) if phase != EXECUTION else ("execution", FAINT)
+    phase = max(frame.phase for frame in columns.values())
+    clock = max(frame.clock for frame in columns.values() if frame.phase == phase)
+    label, colour = ("execution", FAINT) if phase == EXECUTION else ("demonstration", DEMONSTRATION)
     draw.text((8, HEADER // 2), f"“{task.language}”", fill=INK, font=medium, anchor="lm")
-    draw.text((film.width - 8, HEADER // 2), f"{words}  {clock / CONTROL_HZ:4.1f} s", colour, medium, "rm")
-    for column, (name, one) in enumerate(now.items()):
-        x, top = column * (SIDE + GAP), HEADER + TITLE
-        shown = one.phase != EXECUTION
-        if shown:
+    draw.text((picture.width - 8, HEADER // 2), f"{label}  {clock / CONTROL_HZ:4.1f} s", colour, medium, "rm")
+    for column, (name, frame) in enumerate(columns.items()):
+        x, top = column * (SIDE + MARGIN), HEADER + TITLE
+        ink = INK
+        if frame.phase != EXECUTION:
             draw.rectangle((x, HEADER, x + SIDE - 1, top - 1), fill=DEMONSTRATION)
-        ink = BACKGROUND if shown else INK
+            ink = BACKGROUND
         draw.text((x + SIDE // 2, HEADER + TITLE // 2), name, fill=ink, font=large, anchor="mm")
-        film.paste(Image.fromarray(one.picture), (x, top))
-        checkpoints(draw, (x + 8, top + SIDE + 7), one)
-        end, colour = ("solved", SOLVED) if one.solved else ("wrong bowl", FAILED) if one.drifted else ("", INK)
+        picture.paste(Image.fromarray(frame.image), (x, top))
+        draw_checkpoints(draw, (x + 8, top + SIDE + 7), frame.reached)
+        end, colour = ("solved", SOLVED) if frame.solved else ("wrong bowl", FAILED) if frame.drifted else ("", INK)
         draw.text((x + SIDE - 8, top + SIDE + FOOTER // 2), end, fill=colour, font=large, anchor="rm")
-    return film
+    return picture
 
 
-def checkpoints(draw: ImageDraw.ImageDraw, corner: tuple[int, int], one: Shot) -> None:
-    """Draw a box per memory checkpoint, with the letter and name of its operation; a tick once it is reached."""
+def draw_checkpoints(draw: ImageDraw.ImageDraw, corner: tuple[int, int], reached: tuple[bool, ...]) -> None:
+    """Draw a box with the operation of each memory checkpoint, ticked if it is reached."""
     x, y = corner
-    for checkpoint, done in zip(get_task(BOWL).checkpoints, one.done, strict=True):
+    for checkpoint, done in zip(get_task(TASK).checkpoints, reached, strict=True):
         colour = OPERATION_COLOURS[checkpoint.operation]
         draw.rounded_rectangle((x, y, x + 28, y + 28), 5, fill=colour if done else None, outline=colour, width=3)
         if done:
@@ -189,31 +187,28 @@ def checkpoints(draw: ImageDraw.ImageDraw, corner: tuple[int, int], one: Shot) -
         x += 120
 
 
-def write(film: Sequence[Image.Image], path: Path) -> None:
-    """Write an animated WebP that begins anew at its end."""
-    duration = round(1000 * STRIDE / CONTROL_HZ / SPEED)
-    times = [duration] * (len(film) - 1) + [round(1000 * LAST)]
+def write(pictures: Sequence[Image.Image], path: Path) -> None:
+    """Write an animated WebP that repeats forever."""
+    milliseconds = [round(1000 * STRIDE / CONTROL_HZ / SPEED)] * (len(pictures) - 1) + [round(1000 * LAST_SECONDS)]
+    options = {"append_images": pictures[1:], "duration": milliseconds, "loop": 0, "quality": QUALITY, "method": 6}
     path.parent.mkdir(parents=True, exist_ok=True)
     with draft_of(path) as draft:
-        film[0].save(
-            draft, "WEBP", save_all=True, append_images=film[1:], duration=times, loop=0, quality=QUALITY, method=6
-        )
+        pictures[0].save(draft, "WEBP", save_all=True, **options)
 
 
 def main() -> None:
-    """Evaluate, choose, draw."""
+    """Evaluate, select a seed, replay and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/figures/memory.webp"))
     out = parser.parse_args().out
     with tempfile.TemporaryDirectory() as work:
-        found = {name: evaluate(name, Path(work) / name.replace(" ", "_")) for name in POLICIES}
-    for name, episodes in found.items():
+        rollouts = {name: evaluate(name, Path(work) / name.replace(" ", "_")) for name in POLICIES}
+    for name, episodes in rollouts.items():
         print(name, {seed: (record["success"], record["failure"]) for seed, (record, _) in episodes.items()})
-    seed = first_difference(found)
-    takes = {name: play(seed, *episodes[seed]) for name, episodes in found.items()}
-    film = list(frames(takes))
-    write(film, out)
-    print(f"{out}: seed {seed}, {len(film)} pictures, {out.stat().st_size / 1e6:.2f} MB")
+    seed = first_difference(rollouts)
+    pictures = list(animation({name: replay(seed, *episodes[seed]) for name, episodes in rollouts.items()}))
+    write(pictures, out)
+    print(f"{out}: seed {seed}, {len(pictures)} frames, {out.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

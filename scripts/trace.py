@@ -1,16 +1,16 @@
-"""How many of the project's own files the everyday calls enter.
+"""Count the package's files that common operations execute.
 
-    python scripts/trace.py [--list] [CALL ...]
+    python scripts/trace.py [--list] [OPERATION ...]
 
-A file is entered when one of its functions runs; what an import runs does not count, nor what numba has compiled. Each
-call is made in a process of its own, on the CPU, by public commands and LeRobot's interfaces:
+A file counts when one of its functions runs; code run by an import and code compiled by numba do not count. Each
+operation runs in a process of its own, on the CPU, through public commands and LeRobot's interfaces:
 
-words to plan      `lerobot eval env=memobench policy=memobench_small …`, from the typed words to the `EvaluationPlan`
-control step       processors, `select_action` and `env.step`, of a step at which nothing is planned
-planned step       processors and `select_action`, of a step at which an action chunk is planned
+words to plan      `lerobot eval env=memobench policy=memobench_small …`, from the command line to the `EvaluationPlan`
+control step       processors, `select_action` and `env.step`, at a step without planning
+planned step       processors and `select_action`, at a step that plans an action chunk
 training step      `lerobot train`: batch, processors and update, from the end of one update to the end of the next
-generated episode  `memobench generate` of one episode, all of the command
-report             `memobench report` of one evaluation, all of the command
+generated episode  the whole command `memobench generate`, for one episode
+report             the whole command `memobench report`, for one evaluation
 """
 
 from __future__ import annotations
@@ -26,119 +26,92 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from types import CodeType, FrameType, TracebackType
+from types import CodeType, FrameType
 from typing import Any
 
 if sys.path[0] == os.path.dirname(os.path.abspath(__file__)):
-    del sys.path[0]  # this file is named like a module of Python's library
+    del sys.path[0]  # this file has the name of a module of the standard library
 
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "lerobot_memobench"
 TASK = "check_the_top_drawer_of_the_cabinet"
 POLICY = "memobench_small"
 SEED = 20_000
 STEPS = 48
-"""Control steps that are watched: with 6 actions per chunk and every 8th frame in memory, all kinds are among them."""
+"""Traced control steps; with 6 actions per chunk and a memory stride of 8, they include every kind of step."""
 
 Functions = set[tuple[str, str]]
-"""File, below the package, and qualified name of each function that ran."""
+"""File (relative to the package) and qualified name of each executed function."""
 
 
-class Watch:
-    """While it lasts, note which of the project's functions run, in all threads.
-
-    Attributes:
-        functions: those that ran.
-    """
+class Trace:
+    """Context manager that records in ``functions`` the package's functions executed by any thread."""
 
     _tool = sys.monitoring.PROFILER_ID
+    _prefix = f"{SOURCE}{os.sep}"
 
     def __init__(self) -> None:
         self.functions: Functions = set()
-        self._prefix = f"{SOURCE}{os.sep}"
 
-    def __enter__(self) -> Watch:
-        self.start()
-        return self
-
-    def start(self) -> None:
-        """Note from now on."""
+    def __enter__(self) -> Trace:
         events = sys.monitoring.events
         sys.monitoring.use_tool_id(self._tool, "scripts/trace.py")
         sys.monitoring.restart_events()
         for event in (events.PY_START, events.PY_RESUME):
-            sys.monitoring.register_callback(self._tool, event, self._note)
+            sys.monitoring.register_callback(self._tool, event, self._record)
         sys.monitoring.set_events(self._tool, events.PY_START | events.PY_RESUME)
+        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
-    ) -> None:
-        self.stop()
-
-    def stop(self) -> None:
-        """Note no more."""
+    def __exit__(self, *_: object) -> None:
         if sys.monitoring.get_tool(self._tool) is not None:
             sys.monitoring.set_events(self._tool, sys.monitoring.events.NO_EVENTS)
             sys.monitoring.free_tool_id(self._tool)
 
-    def _note(self, code: CodeType, offset: int) -> Any:
+    def _record(self, code: CodeType, offset: int) -> Any:
         if not code.co_filename.startswith(self._prefix):
             return sys.monitoring.DISABLE
         frame: FrameType | None = sys._getframe(1)
         while frame is not None:
             if frame.f_code.co_name == "<module>" and frame.f_code.co_filename.startswith(self._prefix):
-                return None  # an import runs it; it may be called again
+                return None  # executed by an import; keep watching the function
             frame = frame.f_back
         self.functions.add((code.co_filename.removeprefix(self._prefix), code.co_qualname))
-        return sys.monitoring.DISABLE  # it is noted once
+        return sys.monitoring.DISABLE
 
 
-def lerobot(*words: object) -> None:
-    """Run the command ``lerobot``.
-
-    Raises:
-        RuntimeError: it failed.
-    """
-    from lerobot_memobench.cli.lerobot import main
-
-    if status := main([str(word) for word in words]):
-        raise RuntimeError(f"lerobot {words[0]} ended with status {status}")
-
-
-def memobench(*words: object) -> None:
-    """Run the command ``memobench``.
+def command(program: str, *words: object) -> None:
+    """Run ``lerobot`` or ``memobench``.
 
     Raises:
-        RuntimeError: it failed.
+        RuntimeError: the command failed.
     """
-    from lerobot_memobench.cli.memobench import main
+    from lerobot_memobench.cli import lerobot, memobench
 
-    if status := main([str(word) for word in words]):
-        raise RuntimeError(f"memobench {words[0]} ended with status {status}")
+    if status := {"lerobot": lerobot, "memobench": memobench}[program].main(list(map(str, words))):
+        raise RuntimeError(f"{program} {words[0]} ended with status {status}")
 
 
 def words_to_plan(folder: Path) -> list[Functions]:
-    """Trace ``lerobot eval`` until its plan is made, and end it there."""
+    """Trace ``lerobot eval`` until the plan is complete, and stop the command there."""
     from lerobot_memobench.run.plan import EvaluationPlan
 
-    make, watch = EvaluationPlan.__init__, Watch()
+    create, trace = EvaluationPlan.__init__, Trace()
 
-    def made(self: EvaluationPlan, *parts: Any, **fields: Any) -> None:
-        make(self, *parts, **fields)
-        watch.stop()
+    def create_and_stop(self: EvaluationPlan, *args: Any, **fields: Any) -> None:
+        create(self, *args, **fields)
+        trace.__exit__()
         raise SystemExit(0)
 
-    EvaluationPlan.__init__ = made  # type: ignore[method-assign]
-    with watch, contextlib.suppress(SystemExit):
-        lerobot("eval", "env=memobench", f"policy={POLICY}", f"tasks={TASK}", "episodes=2", f"output_dir={folder}/eval")
-    return [watch.functions]
+    EvaluationPlan.__init__ = create_and_stop  # type: ignore[method-assign]
+    words = ("env=memobench", f"policy={POLICY}", f"tasks={TASK}", "episodes=2", f"output_dir={folder}/eval")
+    with trace, contextlib.suppress(SystemExit):
+        command("lerobot", "eval", *words)
+    return [trace.functions]
 
 
 def control_and_planned_step(folder: Path) -> list[Functions]:
-    """Trace control steps of a shipped policy; return the one at which it does least and its side of the one at which
-    it does most.
+    """Trace control steps of a shipped policy; return the smallest control step and the largest policy call.
 
-    The least is an action from the queue, before the environment's step. The most is a frame that is remembered and a
-    chunk that is planned.
+    The smallest takes an action from the queue. The largest writes a frame to the memory and plans a chunk.
     """
     import torch
     from lerobot.configs import PreTrainedConfig
@@ -155,78 +128,82 @@ def control_and_planned_step(folder: Path) -> list[Functions]:
     config = PreTrainedConfig.from_pretrained(source, cli_overrides=["--device=cpu"])
     policy = get_policy_class(config.type).from_pretrained(source, config=config)
     before, after = make_pre_post_processors(config, pretrained_path=str(source))
-    scene = EnvConfig.get_choice_class("memobench")(
+    env_config = EnvConfig.get_choice_class("memobench")(
         tasks=TASK, obs_type="environment_state_agent_pos", log_dir=str(folder)
     )
-    env = next(env for by_task in make_env(scene, n_envs=1).values() for env in by_task.values())
-    env_before, env_after = make_env_pre_post_processors(scene, config)
+    env = next(env for by_task in make_env(env_config, n_envs=1).values() for env in by_task.values())
+    env_before, env_after = make_env_pre_post_processors(env_config, config)
     policy.reset()
     observation, _ = env.reset(seed=[SEED])
-    policy_sides, env_sides = [], []
+    policy_calls, env_calls = [], []
     for _ in range(STEPS):
         task = list(env.call("task_description"))
-        with Watch() as watch, torch.inference_mode():
+        with Trace() as trace, torch.inference_mode():
             batch = before(env_before(preprocess_observation(observation) | {"task": task}))
             action = env_after({ACTION: after(policy.select_action(batch))})[ACTION].numpy()
-        policy_sides.append(watch.functions)
-        with Watch() as watch:
+        policy_calls.append(trace.functions)
+        with Trace() as trace:
             observation, *_ = env.step(action)
-        env_sides.append(watch.functions)
+        env_calls.append(trace.functions)
     env.close()
-    least = min(range(1, STEPS), key=lambda t: len(policy_sides[t]))
-    return [policy_sides[least] | env_sides[least], max(policy_sides[1:], key=len)]
+    smallest = min(range(1, STEPS), key=lambda t: len(policy_calls[t]))
+    return [policy_calls[smallest] | env_calls[smallest], max(policy_calls[1:], key=len)]
 
 
 def training_step(folder: Path) -> list[Functions]:
-    """Trace ``lerobot train`` from the end of its second update to that of its third, and end it there."""
+    """Trace ``lerobot train`` from the end of its second update to the end of its third, and stop it there."""
     from lerobot_memobench.training.loop import Run
 
-    memobench("generate", "--tasks", TASK, "--episodes", 1, "--no-images", "--out", folder / "dataset")
-    update, watch, count = Run.update, Watch(), 0
+    generate(folder)
+    update, trace, count = Run.update, Trace(), 0
 
-    def updated(run: Run, batch: dict[str, Any]) -> dict[str, Any]:
+    def count_update(run: Run, batch: dict[str, Any]) -> dict[str, Any]:
         nonlocal count
-        if count == 3:  # the third has been made
-            raise SystemExit(0)
         result = update(run, batch)
         count += 1
         if count == 2:
-            watch.start()
+            trace.__enter__()
         elif count == 3:
-            watch.stop()
+            trace.__exit__()
+            raise SystemExit(0)
         return result
 
-    Run.update = updated  # type: ignore[method-assign]
+    Run.update = count_update  # type: ignore[assignment,method-assign]
+    policy = ("policy=memobench_mem", "size=small", "perception=objects", "align=semantic", "device=cpu")
+    run = (f"dataset={folder}/dataset", "steps=9", "batch_size=12", "num_workers=0", f"output_dir={folder}/train")
     with contextlib.suppress(SystemExit):
-        policy = ("policy=memobench_mem", "size=small", "perception=objects", "align=semantic", "device=cpu")
-        run = (f"dataset={folder}/dataset", "steps=9", "batch_size=12", "num_workers=0", f"output_dir={folder}/train")
-        lerobot("train", *policy, *run)
-    return [watch.functions]
+        command("lerobot", "train", *policy, *run)
+    return [trace.functions]
+
+
+def generate(folder: Path) -> None:
+    """Generate a dataset of one episode."""
+    command("memobench", "generate", "--tasks", TASK, "--episodes", 1, "--no-images", "--out", folder / "dataset")
 
 
 def generated_episode(folder: Path) -> list[Functions]:
     """Trace ``memobench generate``."""
-    with Watch() as watch:
-        memobench("generate", "--tasks", TASK, "--episodes", 1, "--no-images", "--out", folder / "dataset")
-    return [watch.functions]
+    with Trace() as trace:
+        generate(folder)
+    return [trace.functions]
 
 
 def report(folder: Path) -> list[Functions]:
-    """Trace ``memobench report`` of an evaluation that another process makes, so that nothing of it is warm here."""
-    in_other_process(partial(evaluate, folder=folder / "eval"))
-    with Watch() as watch:
-        memobench("report", folder / "eval")
-    return [watch.functions]
+    """Trace ``memobench report``, of an evaluation that another process runs so that all caches here are cold."""
+    run_in_process(partial(evaluate, folder=folder / "eval"))
+    with Trace() as trace:
+        command("memobench", "report", folder / "eval")
+    return [trace.functions]
 
 
 def evaluate(_: Path, folder: Path) -> list[Functions]:
-    """Write the log of one short episode."""
+    """Evaluate one short episode."""
     policy = ("policy=memobench_random", "horizon=5", "obs_type=environment_state_agent_pos")
-    lerobot("eval", "env=memobench", *policy, f"tasks={TASK}", "episodes=1", f"output_dir={folder}")
+    command("lerobot", "eval", "env=memobench", *policy, f"tasks={TASK}", "episodes=1", f"output_dir={folder}")
     return []
 
 
-CALLS: dict[tuple[str, ...], Callable[[Path], list[Functions]]] = {
+OPERATIONS: dict[tuple[str, ...], Callable[[Path], list[Functions]]] = {
     ("words to plan",): words_to_plan,
     ("control step", "planned step"): control_and_planned_step,
     ("training step",): training_step,
@@ -235,46 +212,46 @@ CALLS: dict[tuple[str, ...], Callable[[Path], list[Functions]]] = {
 }
 
 
-def in_other_process(call: Callable[[Path], list[Functions]]) -> list[Functions]:
-    """Make a call where nothing has run before."""
+def run_in_process(operation: Callable[[Path], list[Functions]]) -> list[Functions]:
+    """Run an operation in a new process."""
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
-        return process.submit(quietly, call).result()
+        return process.submit(run_quietly, operation).result()
 
 
-def quietly(call: Callable[[Path], list[Functions]]) -> list[Functions]:
-    """Make a call in a folder that is gone afterwards; what it prints is shown only when it fails."""
-    said = io.StringIO()
+def run_quietly(operation: Callable[[Path], list[Functions]]) -> list[Functions]:
+    """Run an operation in a temporary folder; print its output only if it fails."""
+    output = io.StringIO()
     with tempfile.TemporaryDirectory() as folder:
         try:
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-                return call(Path(folder))
+            with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+                return operation(Path(folder))
         except BaseException:
-            print(said.getvalue(), file=sys.stderr)
+            print(output.getvalue(), file=sys.stderr)
             raise
 
 
 def main() -> None:
-    """Trace the calls that are asked for and print a table."""
-    known = [name for names in CALLS for name in names]
+    """Trace the given operations and print a table."""
+    names = [name for group in OPERATIONS for name in group]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("call", nargs="*", metavar="CALL", help=f"one of: {', '.join(known)}; all when left out")
-    parser.add_argument("--list", action="store_true", help="print the files, with the functions in each")
-    asked = parser.parse_args()
-    if unknown := [name for name in asked.call if name not in known]:
-        parser.error(f"there is no call {unknown[0]!r}; expected one of: {', '.join(known)}")
+    parser.add_argument("operation", nargs="*", metavar="OPERATION", help=f"{', '.join(names)}; default: all")
+    parser.add_argument("--list", action="store_true", help="print the files and their executed functions")
+    args = parser.parse_args()
+    if unknown := [name for name in args.operation if name not in names]:
+        parser.error(f"unknown operation {unknown[0]!r}; available: {', '.join(names)}")
     os.environ |= {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    wanted = asked.call or known
-    print("| call | files | functions |\n|---|---|---|")
-    for names, call in CALLS.items():
-        if not set(names) & set(wanted):
+    selected = args.operation or names
+    print("| operation | files | functions |\n|---|---|---|")
+    for group, operation in OPERATIONS.items():
+        if not set(group) & set(selected):
             continue
-        traced = dict(zip(names, in_other_process(call), strict=True))
-        for name in (name for name in names if name in wanted):
-            functions = traced[name]
+        for name, functions in zip(group, run_in_process(operation), strict=True):
+            if name not in selected:
+                continue
             files = sorted({file for file, _ in functions})
             print(f"| {name} | {len(files)} | {len(functions)} |", flush=True)
-            for file in files if asked.list else ():
-                print(f"    {file}: {', '.join(sorted(called for where, called in functions if where == file))}")
+            for file in files if args.list else ():
+                print(f"    {file}: {', '.join(sorted(function for where, function in functions if where == file))}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Figures: everything is on them, and they stay small."""
+"""`scripts/gallery.py`: sheets show all pictures, and files stay small."""
 
 from __future__ import annotations
 
@@ -16,43 +16,45 @@ STOVE = "turn_on_the_stove_and_turn_it_off"
 BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
 
 
-def test_grid_has_room_for_every_picture() -> None:
+def test_grid_shows_every_picture() -> None:
     cells = [(f"picture {k}", np.full((40, 60, 3), 10 * k, np.uint8)) for k in range(5)]
     sheet = np.asarray(gallery.grid(cells, 2))
     for k in range(5):
         assert (sheet == 10 * k).all(axis=2).sum() >= 40 * 60
 
 
-def test_long_labels_are_wrapped_and_not_cut() -> None:
-    picture = np.full((40, 60, 3), 200, np.uint8)
-    short, long = (gallery.grid([(text, picture)], 1, label=10) for text in ("plate", "put the milk on the plate"))
-    assert long.width == short.width
-    assert long.height > short.height + 10
-    wrapped = gallery._wrapped("put the milk on the plate", ImageFont.load_default(10), 60)
-    assert " ".join(wrapped) == "put the milk on the plate"
-    assert max(ImageFont.load_default(10).getlength(line) for line in wrapped) <= 60
+def test_long_labels_are_wrapped() -> None:
+    picture, text = np.full((40, 60, 3), 200, np.uint8), "put the milk on the plate"
+    short, long = (gallery.grid([(label, picture)], 1, label=10) for label in ("plate", text))
+    assert (long.width, long.height > short.height + 10) == (short.width, True)
+    font = ImageFont.load_default(10)
+    lines = gallery._wrapped(text, font, 60)
+    assert " ".join(lines) == text
+    assert max(font.getlength(line) for line in lines) <= 60
 
 
-def test_tasks_stand_under_their_memory_type() -> None:
-    one = gallery.draw_tasks([STOVE], size=64)
-    two = gallery.draw_tasks([STOVE, BOWLS], size=64)
-    assert (one.width, two.width) == (64 + 12, 64 + 12)
-    assert two.height > 2 * one.height - 20
+def test_tasks_are_drawn_at_the_places_of_the_layout() -> None:
+    """`docs_reference` crops the pictures of task cards at these places."""
+    single, sheet = (np.asarray(gallery.draw_tasks(names, size=64)) for names in ([STOVE], [STOVE, BOWLS]))
+    places = gallery.task_places([STOVE, BOWLS], size=64)
+    scenes = {name: sheet[y : y + 64, x : x + 64].astype(int) for name, (x, y) in places.items()}
+    x, y = gallery.task_places([STOVE], size=64)[STOVE]
+    np.testing.assert_array_equal(scenes[STOVE], single[y : y + 64, x : x + 64])
+    assert np.abs(scenes[STOVE] - scenes[BOWLS]).mean() > 5
+    assert max(scene[edge].mean() for scene in scenes.values() for edge in (0, -1)) < 230, "scene, not background"
 
 
-def test_figures_are_shrunk_until_they_are_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_are_reduced_to_the_maximum_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gallery, "LARGEST_FILE", 8_000)
     noise = np.random.default_rng(0).integers(0, 255, (120, 120, 3), dtype=np.uint8)
-    path = gallery.save(Image.fromarray(noise), tmp_path / "deep" / "noise.png")
+    path = gallery.save(Image.fromarray(noise), tmp_path / "new" / "noise.png")
     assert path.stat().st_size <= 8_000
     assert Image.open(path).width < 120
-    plain = gallery.save(Image.new("RGB", (300, 300)), tmp_path / "plain.png")
-    assert Image.open(plain).size == (300, 300)
+    assert Image.open(gallery.save(Image.new("RGB", (300, 300)), tmp_path / "plain.png")).size == (300, 300)
 
 
-def test_sheets() -> None:
-    objects = gallery.draw_objects(["butter", "milk"], size=32)
-    assert objects.width == 2 * 4 * 32 + 18
-    closed_and_open = np.asarray(gallery.draw_fixtures(["microwave"], size=64)).astype(int)
-    left, right = closed_and_open[6:70, 6:70], closed_and_open[6:70, 140:204]
-    assert np.abs(left - right).mean() > 5
+def test_objects_and_fixtures() -> None:
+    assert gallery.draw_objects(["butter", "milk"], size=32).width == 2 * 4 * 32 + 18
+    fixtures = np.asarray(gallery.draw_fixtures(["microwave"], size=64)).astype(int)
+    closed, opened = fixtures[6:70, 6:70], fixtures[6:70, 140:204]
+    assert np.abs(closed - opened).mean() > 5

@@ -1,4 +1,4 @@
-"""`scripts/memory_film.py`, README's moving picture: which episode is shown, and how the film goes on and ends."""
+"""`scripts/memory_film.py`, README's animation: selection of the seed, and frames."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from tests.support.scripts import SCRIPTS
 
 @pytest.fixture(scope="module")
 def script() -> dict[str, Any]:
-    """The script's names."""
     return runpy.run_path(str(SCRIPTS / "memory_film.py"))
 
 
-def test_the_first_seed_that_tells_them_apart_is_shown(script: dict[str, Any]) -> None:
-    ends = {"a": (True, True, True), "b": (True, False, False)}
-    found: dict[str, Any] = {
-        name: {7 + k: ({"success": end}, []) for k, end in enumerate(told)} for name, told in ends.items()
+def test_first_seed_with_different_outcomes_is_selected(script: dict[str, Any]) -> None:
+    outcomes = {"a": (True, True, True), "b": (True, False, False)}
+    rollouts: dict[str, Any] = {
+        name: {7 + k: ({"success": success}, []) for k, success in enumerate(values)}
+        for name, values in outcomes.items()
     }
-    assert script["first_difference"](found) == 8
-    with pytest.raises(SystemExit, match="all end alike on seeds 7 to 9"):
-        script["first_difference"]({"a": found["a"]})
+    assert script["first_difference"](rollouts) == 8
+    with pytest.raises(SystemExit, match="7 to 9"):
+        script["first_difference"]({"a": rollouts["a"]})
 
 
-def test_a_short_take_waits_and_the_film_begins_anew(script: dict[str, Any], tmp_path: Path) -> None:
-    def take(length: int, solved: bool) -> list[Any]:
-        last = length - 1
-        shade = [np.full((side, side, 3), 20 * length + 40 * k, np.uint8) for k in range(length)]
+def test_finished_column_repeats_its_last_frame(script: dict[str, Any], tmp_path: Path) -> None:
+    side = script["SIDE"]
+
+    def column(length: int, solved: bool) -> list[Any]:
+        images = [np.full((side, side, 3), 20 * length + 40 * k, np.uint8) for k in range(length)]
         return [
-            script["Shot"](shade[k], EXECUTION if k else PROMPT, k, (solved and k == last,), not solved, solved)
-            for k in range(length)
+            script["Frame"](image, EXECUTION if k else PROMPT, k, (solved and k == length - 1,), not solved, solved)
+            for k, image in enumerate(images)
         ]
 
-    side = script["SIDE"]
-    film = list(script["frames"]({"short": take(2, True), "long": take(4, False)}))
-    assert len(film) == 4
-    assert film[0].width == 2 * side + script["GAP"]
-    left = [np.asarray(picture)[script["HEADER"] :, :side] for picture in film]  # below the clock
-    assert not np.array_equal(left[0], left[1])
-    np.testing.assert_array_equal(left[1], left[3])
-    script["write"](film, tmp_path / "film.webp")
-    with Image.open(tmp_path / "film.webp") as written:
+    pictures = list(script["animation"]({"short": column(2, True), "long": column(4, False)}))
+    assert len(pictures) == 4
+    assert pictures[0].width == 2 * side + script["MARGIN"]
+    first_column = [np.asarray(picture)[script["HEADER"] :, :side] for picture in pictures]
+    assert not np.array_equal(first_column[0], first_column[1])
+    np.testing.assert_array_equal(first_column[1], first_column[3])
+    script["write"](pictures, tmp_path / "animation.webp")
+    with Image.open(tmp_path / "animation.webp") as written:
         assert (getattr(written, "n_frames", 1), written.info["loop"]) == (4, 0)

@@ -1,4 +1,4 @@
-"""`scripts/trace.py`: which of the project's files a call enters."""
+"""`scripts/trace.py`: the files that an operation executes."""
 
 from __future__ import annotations
 
@@ -12,33 +12,31 @@ import pytest
 from lerobot_memobench.tasks.catalogue import task_names
 from tests.support.scripts import SCRIPTS
 
+COMMAND = [sys.executable, str(SCRIPTS / "trace.py")]
 
-def test_functions_count_and_imports_do_not() -> None:
-    trace = runpy.run_path(str(SCRIPTS / "trace.py"))  # by its name it would hide a module of Python's
+
+def test_trace_counts_functions_but_no_imports() -> None:
+    script = runpy.run_path(str(SCRIPTS / "trace.py"))  # an import would hide the standard library's `trace`
     module = sys.modules[task_names.__module__]
-    with trace["Watch"]() as watch:
+    with script["Trace"]() as trace:
         runpy.run_path(str(module.__file__))
-    assert not watch.functions
-    with trace["Watch"]() as watch:
+    assert not trace.functions
+    with script["Trace"]() as trace:
         task_names(suite="strict")
     task_names(suite="published")
-    files = {file for file, _ in watch.functions}
-    assert str(trace["SOURCE"] / next(iter(files))).endswith(".py")
-    assert any((trace["SOURCE"] / file).samefile(str(module.__file__)) for file in files)
+    file = str(module.__file__).removeprefix(f"{script['SOURCE']}/")
+    assert (file, "task_names") in trace.functions
 
 
 @pytest.mark.slow
-def test_words_to_plan_are_traced_and_listed() -> None:
-    command = [sys.executable, str(SCRIPTS / "trace.py"), "words to plan", "--list"]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    row = re.search(r"^\| words to plan \| (\d+) \| (\d+) \|$", said, flags=re.M)
+def test_trace_prints_table_and_files() -> None:
+    output = subprocess.run([*COMMAND, "words to plan", "--list"], capture_output=True, text=True, check=True).stdout
+    row = re.search(r"^\| words to plan \| (\d+) \| (\d+) \|$", output, flags=re.MULTILINE)
     assert row is not None
-    listed = re.findall(r"^    (\S+\.py): ", said, flags=re.M)
-    assert len(listed) == int(row[1]) > 5
-    assert int(row[2]) >= len(listed)
+    files = re.findall(r"^    (\S+\.py): ", output, flags=re.MULTILINE)
+    assert 5 < len(files) == int(row[1]) <= int(row[2])
 
 
-def test_an_unknown_call_is_refused() -> None:
-    run = subprocess.run([sys.executable, str(SCRIPTS / "trace.py"), "a nap"], capture_output=True, text=True)
-    assert run.returncode == 2
-    assert "there is no call 'a nap'; expected one of: words to plan" in run.stderr
+def test_unknown_operation_is_an_error() -> None:
+    run = subprocess.run([*COMMAND, "step"], capture_output=True, text=True)
+    assert (run.returncode, "'step'" in run.stderr, "control step" in run.stderr) == (2, True, True)

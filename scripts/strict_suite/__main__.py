@@ -1,6 +1,6 @@
-"""Write the strict suite's task folders: ``python scripts/strict_suite``; ``--check`` says which are not as written.
+"""Generate the strict suite's task folders: ``python scripts/strict_suite``; ``--check`` lists the files that differ.
 
-The folders are the data; this is how thirty tasks' formulas and texts are kept alike.
+The folders are the data; the generator keeps formulas and texts of thirty tasks consistent.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def strict_tasks() -> Iterable[StrictTask]:
 
 
 def stale() -> list[str]:
-    """Return the files that are missing or say something else than is written here."""
+    """Return the files that are missing or differ from the generated text."""
     return [
         str(path)
         for task in strict_tasks()

@@ -6,11 +6,11 @@ from lerobot_memobench.tasks.bddl import Problem, Region
 from lerobot_memobench.tasks.formula import Atom, Counted, Formula, children, format_formula
 
 LONGEST_ROW = 110
-"""Columns from which a formula gets a line per child."""
+"""Maximum columns of a formula on one line."""
 
 
 def format_bddl(problem: Problem, comment: str = "") -> str:
-    """Return ``problem`` as BDDL text; each line of ``comment`` goes above it."""
+    """Return ``problem`` as BDDL text, preceded by the lines of ``comment``."""
     lines = [f"; {line}" for line in comment.splitlines()]
     lines += [f"(define (problem {problem.name})"]
     if problem.domain:
@@ -40,7 +40,7 @@ def _region_row(region: Region) -> str:
 
 
 def _declaration_rows(declared: dict[str, str]) -> list[str]:
-    """One line per class, where that keeps the order of declaration, else one per instance."""
+    """Return a line per class if this keeps the order of declaration, else a line per instance."""
     by_class: dict[str, list[str]] = {}
     for instance, class_name in declared.items():
         by_class.setdefault(class_name, []).append(instance)
@@ -50,7 +50,7 @@ def _declaration_rows(declared: dict[str, str]) -> list[str]:
 
 
 def _goal(formula: Formula, indent: str) -> list[str]:
-    """One line where it fits, else one child per line."""
+    """Return the formula on one line if it fits, else one child per line."""
     flat = indent + format_formula(formula)
     if len(flat) <= LONGEST_ROW or isinstance(formula, Atom):
         return [flat]

@@ -1,4 +1,4 @@
-"""Counting: how often is in the instruction, and nothing in sight tells how often it has been done."""
+"""Counting: the instruction gives the number of repetitions; the scene does not show how many are done."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from words import AS_BEGUN, CABINET, DRAWERS, HOME, PLACES, TIMES, Texts, left_a
 from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Never, Round, When
 
 REST = 40
-"""Control steps of rest by which a policy says that it is done."""
+"""Control steps of rest with which a policy signals the end."""
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,10 @@ class Counted:
     """An event to be counted.
 
     Attributes:
-        asked: what the instruction asks for. did: what a memory says of it.
-        begun, ended: atoms between which the event is under way, and how a memory tells the first (coarse,
-            intermediate, fine).
+        asked: text of the instruction.
+        coarse, did, fine: the memory's text about a complete event.
+        begun, ended: atoms at the start and the end of the event.
+        opened: the memory's texts about its start (coarse, intermediate, fine).
     """
 
     name: str
@@ -126,7 +127,7 @@ def _setting(event: Counted, number: int) -> Setting:
 
 
 def _checkpoints(event: Counted, number: int) -> list[tuple[Formula, Texts]]:
-    """Return three moments, whatever the number: the labels of a task's checkpoints are those of all its variants."""
+    """Return three checkpoints for each number: all variants of a task share the labels of their checkpoints."""
     underway = [(_begun(event, k), _opened(event, k, number)) for k in range(1, number + 1)]
     complete = [(_done(event, k), _counted(event, k, number)) for k in range(1, number + 1)]
     if number == 1:

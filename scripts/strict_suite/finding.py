@@ -1,6 +1,6 @@
-"""Finding: the video shows in which drawer an object is hidden; closed drawers do not show it.
+"""Finding: the video shows the drawer in which an object is hidden; all drawers are closed during execution.
 
-A wrong drawer that is pulled beyond what is closed loses the episode: a little further its content can be seen.
+Pulling a wrong drawer open fails the episode, before its content becomes visible.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from lerobot_memobench.tasks.task import Prompt
 
 TABLE = "kitchen_table"
 SPOT = Region("table_region", TABLE, ((-0.09, 0.10, 0.05, 0.24), (-0.40, -0.60, 0.40, 0.60)))
-"""Where a found thing goes: anywhere on the table's top. The first range is the free spot that experts use."""
+"""Goal region of the found object: the whole table top. The first range is the free area that experts use."""
 
 
 @dataclass(frozen=True)
 class Thing:
-    """What is hidden: its instance and what it is called."""
+    """A hidden object: its instance and its name in texts."""
 
     instance: str
     words: str

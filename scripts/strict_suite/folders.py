@@ -1,4 +1,4 @@
-"""Write one strict task as a task folder: the published task's scene, with its own instruction, goal and metadata."""
+"""Write a strict task as a task folder: the scene of a published task with another instruction, goal and metadata."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from lerobot_memobench.tasks.formula import Formula, to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, STRICT, Prompt, Task
 
 LONGEST_ROW = 110
-"""Columns up to which a JSON value stands on one line."""
+"""Maximum columns of a JSON value on one line."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One thing that a seed can draw: instruction, goal, and what a memory should say (K checkpoints)."""
+    """A variant that a seed can draw: instruction, goal and memory texts (K checkpoints)."""
 
     language: str
     goal: Formula
@@ -33,12 +33,12 @@ class Setting:
 
 @dataclass(frozen=True)
 class StrictTask:
-    """A strict task: the settings that a seed draws from, the first of which stands in the BDDL file.
+    """A strict task with the settings that a seed draws from; the BDDL file contains the first.
 
     Attributes:
-        operations: S, U or C per checkpoint, the same at every level of language.
-        regions: places that the published file does not name.
-        moved: start regions in place of the published ones of the same name.
+        operations: S, U or C per checkpoint, equal at all levels of language.
+        regions: regions that the published file does not define.
+        moved: start regions that replace published ones of the same name.
     """
 
     name: str
@@ -57,12 +57,12 @@ class StrictTask:
 
     @property
     def folder(self) -> Path:
-        """Where it stands in the catalogue."""
+        """The folder in the catalogue."""
         return CATALOGUE_DIR / STRICT / self.scene.memory_type / self.name
 
 
 def files(task: StrictTask) -> dict[str, str]:
-    """Return file name -> text of a strict task's folder."""
+    """Return file name -> text of a task's folder."""
     problem = parse_bddl(task.scene.bddl_text, task.published)
     first = task.settings[0]
     regions = problem.regions | {region.full_name: region for region in (*task.regions, *task.moved)}
@@ -72,7 +72,7 @@ def files(task: StrictTask) -> dict[str, str]:
 
 
 def write(task: StrictTask) -> None:
-    """Write a strict task's folder, whatever is there."""
+    """Write a task's folder, replacing existing files."""
     task.folder.mkdir(parents=True, exist_ok=True)
     for name, text in files(task).items():
         write_file(task.folder / name, text)
@@ -119,7 +119,7 @@ def _prompt(prompt: Prompt | None) -> dict[str, Any] | None:
 
 
 def _json(value: Any, indent: str = "") -> str:
-    """Return JSON with each value on one line where it fits."""
+    """Return JSON with a value on one line if it fits."""
     flat = json.dumps(value, ensure_ascii=False)
     if len(indent) + len(flat) <= LONGEST_ROW or not isinstance(value, dict | list):
         return flat

@@ -1,4 +1,4 @@
-"""Order: each event exactly once and as the instruction orders them; what comes out of order cannot be mended."""
+"""Ordering: each event exactly once, in the order of the instruction; a wrong order cannot be corrected."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Never, 
 BOWL, PAN, WHITE = "akita_black_bowl_1", "chefmate_8_frypan_1", "white_bowl_1"
 STOVE, MICROWAVE = "flat_stove_1", "microwave_1"
 ASIDE = Region("akita_black_bowl_init_region", "kitchen_table", ((0.175, 0.125, 0.225, 0.175),))
-"""Where the bowl stands while all drawers are checked: where it stands as published, the hand at the lowest handle
-pushes it, and a moved bowl would tell which drawer has been open."""
+"""Start of the bowl when all drawers are checked. At the published start, the hand at the lowest handle pushes the
+bowl, and a moved bowl would show that this drawer has been open."""
 
 Event = tuple[Atom, Atom]
-"""Atoms between which something is under way."""
+"""Atoms at the start and the end of an event."""
 
 
 def strict_tasks() -> list[StrictTask]:
@@ -31,12 +31,12 @@ def _drawer(name: str) -> Event:
 
 
 def _once(event: Event) -> Formula:
-    """It has happened exactly once, and is over."""
+    """The event has happened exactly once and has ended."""
     return And((Exactly(1, Round(event)), event[1]))
 
 
 def _before(event: Event, later: Formula) -> Formula:
-    """When the later thing begins, the event has happened exactly once, from and back to the scene as it began."""
+    """When ``later`` becomes true, the event has happened exactly once, and the scene was restored after it."""
     return When((later, Exactly(1, Round((AS_BEGUN, *event, AS_BEGUN)))))
 
 
@@ -144,7 +144,7 @@ def _bowl_in_drawer() -> StrictTask:
 
 
 def _carried(asked: str, summary: str, event: Event, placed: Atom, texts: Sequence[Texts]) -> Setting:
-    """An appliance is used once, then a thing is carried: when it leaves its place, that must have been."""
+    """Return a setting in which an appliance is used once before an object leaves its place and is put down."""
     unmarked, moved = Never(left_ajar(*event[0].args)), Not(Atom("inplace", (placed.args[0],)))
     goal = And((unmarked, _before(event, moved), _once(event), placed))
     begun = Exactly(1, Round((AS_BEGUN, event[0])))

@@ -1,4 +1,4 @@
-"""Referent and procedure: what the video showed, drawn by seed; a wrong thing or a wrong order cannot be mended."""
+"""Referent and procedure: shown in the video, drawn by seed; a wrong object or a wrong order cannot be corrected."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _strict_task(name: str, published: str, language: str, family: str) -> Stric
 
 
 def _setting(one: Task, shown: Sequence[Task], language: str) -> Setting:
-    """The checkpoints are the published ones; the goal forbids what another video would ask for."""
+    """Return a variant with the published checkpoints and a goal that forbids the steps of the other variants."""
     steps, others = _steps(one), [atom for other in shown for atom in _steps(other)]
     foreign = tuple(dict.fromkeys(atom for atom in others if atom not in steps))
     order = [When((later, Then((earlier,)))) for earlier, later in pairwise(steps)]
@@ -100,11 +100,11 @@ def _setting(one: Task, shown: Sequence[Task], language: str) -> Setting:
 
 
 def _steps(task: Task) -> list[Atom]:
-    """Return what the published checkpoints ask for, in order: one atom each."""
+    """Return the atoms of the published checkpoints, in order."""
     return [atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)]
 
 
 def _reached(steps: Sequence[Atom]) -> Formula:
-    """The last place of each thing, held as long as a child of ``Then`` has to."""
+    """Return the goal that the final place of each object holds, for as long as a child of ``Then``."""
     last = tuple({step.args[0]: step for step in steps}.values())
     return Hold(HOLD_STEPS, And(last)) if len(steps) > 1 else last[0]

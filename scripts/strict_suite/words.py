@@ -1,4 +1,4 @@
-"""Words and formulas that the families share."""
+"""Texts and formulas shared by the families."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Or, Rou
 
 HOME = Atom("handhome", ())
 AS_BEGUN = Atom("asbegun", ())
-"""The scene as it began, to the bit: nothing in it can be read as a note on the past."""
+"""The scene equals its start bit for bit, so it cannot serve as a note."""
 CABINET = "wooden_cabinet_1"
 DRAWERS = ("top", "middle", "bottom")
 PLACES = tuple(Region(f"{drawer}_region", CABINET) for drawer in DRAWERS)
@@ -21,11 +21,11 @@ def region(drawer: str) -> str:
 
 
 def left_ajar(*joints: str) -> Formula:
-    """The hand is home and a door, drawer or knob stands in between: it could be read as a note."""
+    """The hand is home and a door, drawer or knob is partly open, which could serve as a note."""
     ajar = tuple(Atom("ajar", (joint,)) for joint in joints)
     return And((HOME, Or(ajar) if len(ajar) > 1 else ajar[0]))
 
 
 def times(number: int, *event: Formula) -> tuple[Formula, Formula]:
-    """The event has happened exactly so often, each time from the scene as it began."""
+    """The event has happened exactly ``number`` times, each time from the restored scene."""
     return Exactly(number, Round((AS_BEGUN, *event))), Exactly(number, Round(event))
