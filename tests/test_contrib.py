@@ -1,4 +1,4 @@
-"""What is ready to be sent to LeRobot agrees with the package: names, versions, command lines, metrics."""
+"""`contrib/lerobot`: names, versions, commands, metrics and features agree with the package."""
 
 from __future__ import annotations
 
@@ -26,132 +26,106 @@ from tests.support import hub_server
 from tests.test_docs import check, commands
 
 ROOT = Path(__file__).parents[1]
-OURS = ROOT / "contrib" / "lerobot"
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-DISTRIBUTION, VERSION = PROJECT["project"]["name"], PROJECT["project"]["version"]
-PAGE, PATCH = ((OURS / name).read_text() for name in ("memobench.mdx", "lerobot.patch"))
+CONTRIB = ROOT / "contrib" / "lerobot"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PAGE, PATCH, DOCKERFILE = (
+    (CONTRIB / name).read_text() for name in ("memobench.mdx", "lerobot.patch", "Dockerfile.benchmark.memobench")
+)
+(JOB,) = yaml.safe_load((CONTRIB / "benchmark_tests.memobench.yml").read_text()).values()
 
 
-# --- what goes where ---
+def test_readme_lists_every_file() -> None:
+    listed = set(re.findall(r"^\| `([^`]+?)/?` \|", (CONTRIB / "README.md").read_text(), re.MULTILINE))
+    assert listed == {path.name for path in CONTRIB.iterdir()} - {"README.md"}
 
 
-def test_every_file_is_told_where_it_goes() -> None:
-    told = set(re.findall(r"^\| `([^`]+?)/?` \|", (OURS / "README.md").read_text(), re.MULTILINE))
-    assert told == {path.name for path in OURS.iterdir()} - {"README.md"}
-    assert len((OURS / "README.md").read_text().splitlines()) <= 25
-
-
-def test_all_name_the_distribution_and_its_version() -> None:
-    pinned = f"{DISTRIBUTION}=={VERSION}"
+def test_versions_agree_with_the_package() -> None:
+    name, version = PROJECT["name"], PROJECT["version"]
     added = re.findall(r'^\+memobench = .*"(lerobot_policy\w+==[\d.]+); ', PATCH, re.MULTILINE)
-    dockerfile = (OURS / "Dockerfile.benchmark.memobench").read_text()
-    assert added == [pinned]
-    assert (OURS / "envhub" / "requirements.txt").read_text().split() == [pinned]
-    assert f"ARG MEMOBENCH_VERSION={VERSION}\n" in dockerfile
-    assert f'"{DISTRIBUTION}==${{MEMOBENCH_VERSION}}"' in dockerfile
-
-
-def test_the_arm_is_installed_as_our_users_install_it() -> None:
-    line = f"install --no-deps robosuite=={ROBOSUITE}"
-    assert line in (ROOT / "docs" / "start" / "install.md").read_text()
-    assert f"pip {line}" in PAGE
-    assert (
-        f"pip {line.replace('install', 'install --no-cache')}" in (OURS / "Dockerfile.benchmark.memobench").read_text()
-    )
+    assert added == (CONTRIB / "envhub" / "requirements.txt").read_text().split() == [f"{name}=={version}"]
+    assert f"ARG MEMOBENCH_VERSION={version}\n" in DOCKERFILE
+    assert f'"{name}==${{MEMOBENCH_VERSION}}"' in DOCKERFILE
+    robosuite = f"--no-deps robosuite=={ROBOSUITE}"
+    assert f"install {robosuite}" in (ROOT / "docs" / "start" / "install.md").read_text()
+    assert f"pip install {robosuite}" in PAGE
+    assert f"pip install --no-cache {robosuite}" in DOCKERFILE
 
 
 # --- commands ---
 
 
-def smoke() -> dict[str, Any]:
-    (job,) = yaml.safe_load((OURS / "benchmark_tests.memobench.yml").read_text()).values()
-    return job  # type: ignore[no-any-return]
-
-
-def smoke_commands() -> Iterator[list[str]]:
-    """Yield the words of each command that the smoke job runs."""
-    job = smoke()
-    for step in job["steps"]:
+def job_commands() -> Iterator[list[str]]:
+    """Yield the words of each command of the smoke job."""
+    for step in JOB["steps"]:
         text = step.get("run", "")
         inside = re.search(r'bash -ec "\n(.*)"\n', text, re.DOTALL)
         script = text if inside is None else inside[1].replace(r"\"", '"').replace(r"\$", "$")
-        for name, value in job["env"].items():
+        for name, value in JOB["env"].items():
             script = script.replace(f"${{{name}}}", value).replace(f"${name}", value)
         for line in re.sub(r"\\\n\s*", " ", script).splitlines():
             yield shlex.split(line)
 
 
-def test_the_pages_commands_are_understood() -> None:
-    found = [*commands(OURS / "memobench.mdx")]
+def test_commands_of_the_page_are_valid() -> None:
+    found = [*commands(CONTRIB / "memobench.mdx")]
     assert {words[0] for words in found} == {"pip", "memobench", "lerobot-eval", "lerobot-train"}
     for words in found:
         check(words)
 
 
-def test_the_smoke_jobs_commands_are_understood() -> None:
-    found = [words for words in smoke_commands() if words and words[0] in ("lerobot-eval", "memobench")]
-    assert [words[0] for words in found] == ["lerobot-eval", "memobench"]
-    for words in found:
+def test_commands_of_the_smoke_job_are_valid() -> None:
+    evaluation, report = (words for words in job_commands() if words and words[0] in ("lerobot-eval", "memobench"))
+    for words in (evaluation, report):
         check([word for word in words if not word.startswith("--policy.device")])
-    flags = dict(word.removeprefix("--").partition("=")[::2] for word in found[0][1:])
+    flags = dict(word.removeprefix("--").partition("=")[::2] for word in evaluation[1:])
     assert flags["policy.type"] == "memobench_expert"
     assert flags["env.expert_action"] == "true", "plain lerobot-eval does not set it"
     assert flags["eval.n_episodes"] == "1"
-    assert flags["output_dir"] == found[1][-1]
+    assert flags["output_dir"] == report[-1]
 
 
-def test_descriptions_are_keyed_as_lerobots_videos() -> None:
-    """By the function that the patch adds to their script."""
+def test_patch_returns_descriptions_by_video_folder() -> None:
     added = "\n".join(line[1:] for line in PATCH.splitlines() if line.startswith("+"))
     (function,) = re.findall(r"^def _memobench_descriptions.*?\n    return [^\n]*\n", added, re.DOTALL | re.MULTILINE)
     scope: dict[str, Any] = {}
     exec(compile(function, "patch", "exec"), scope)
-    task = smoke()["env"]["MEMOBENCH_TASK"]
+    task = JOB["env"]["MEMOBENCH_TASK"]
     ((suite, number, folder),) = MemobenchEnvConfig(tasks=task).selected()
     assert scope["_memobench_descriptions"](task) == {f"{suite}_{number}": load_task(folder).language}
 
 
-# --- what the page says ---
+# --- tables of the page ---
 
 
 def rows(heading: str) -> list[list[str]]:
-    """Return the rows of the first table behind some words of the page, without its head."""
+    """Return the rows of the first table after a text of the page, without the header."""
     table = re.search(r"(?:^\|.*\n)+", PAGE[PAGE.index(heading) :], re.MULTILINE)
     assert table is not None
     return [[cell.strip().strip("`") for cell in row.split("|")[1:-1]] for row in table[0].splitlines()[2:]]
 
 
-def test_suites_and_metrics_are_ours() -> None:
-    chosen = [suite for suite, *_ in MemobenchEnvConfig().selected()]
-    assert {suite: int(count) for suite, count, *_ in rows("## Available tasks")} == {
-        suite: chosen.count(suite) for suite in dict.fromkeys(chosen)
-    }
+def test_page_lists_suites_metrics_features_and_tasks() -> None:
+    suites = [suite for suite, *_ in MemobenchEnvConfig().selected()]
+    listed = {suite: int(count) for suite, count, *_ in rows("## Available tasks")}
+    assert listed == {suite: suites.count(suite) for suite in suites}
     assert [name for name, _ in rows("`memobench report` adds")] == list(METRICS)
-
-
-def test_inputs_are_ours() -> None:
-    told = {key: tuple(int(n) for n in re.findall(r"\d+", shape)) for key, shape, _ in rows("**Observations:**")}
+    shapes = {key: tuple(int(n) for n in re.findall(r"\d+", shape)) for key, shape, _ in rows("**Observations:**")}
     names = policy_names("both")
-    ours = {names[key]: tuple(one.shape) for key, one in policy_features("both").items() if key != "action"}
-    assert told == ours | {"observation.phase": (1,), "observation.step": (1,)}
-
-
-def test_tasks_that_are_named_exist() -> None:
-    named = {
-        word for text in (PAGE, yaml.safe_dump(smoke())) for word in re.findall(r"\b[a-z]+(?:_[a-z]+){4,}\b", text)
-    }
+    features = {names[key]: tuple(one.shape) for key, one in policy_features("both").items() if key != "action"}
+    assert shapes == features | {"observation.phase": (1,), "observation.step": (1,)}
+    named = re.findall(r"\b[a-z]+(?:_[a-z]+){4,}\b", PAGE + yaml.safe_dump(JOB))
     assert named
-    assert named <= set(task_names())
+    assert set(named) <= set(task_names())
 
 
 # --- EnvHub ---
 
 
 @pytest.fixture
-def on_a_hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A hub on this machine that holds the repository."""
+def hub_repository(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Serve `contrib/lerobot/envhub` as a repository of a local hub."""
     hub = hub_server.Hub()
-    hub.repos["somebody/memobench"] = {path.name: path.read_bytes() for path in (OURS / "envhub").iterdir()}
+    hub.repos["somebody/memobench"] = {path.name: path.read_bytes() for path in (CONTRIB / "envhub").iterdir()}
     hub.large["somebody/memobench"], hub.tags["somebody/memobench"] = set(), {}
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     monkeypatch.setattr(env_utils, "hf_hub_download", partial(hf_hub_download, endpoint=hub.address))
@@ -160,18 +134,18 @@ def on_a_hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     hub.server_close()
 
 
-def test_lerobots_hub_loader_makes_the_environments(
-    on_a_hub: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_lerobots_hub_loader_creates_the_environments(
+    hub_repository: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    found = factory.make_env(on_a_hub, 2, trust_remote_code=True, hub_cache_dir=str(tmp_path / "cache"))
-    assert {suite: len(tasks) for suite, tasks in found.items()} == {
+    envs = factory.make_env(hub_repository, 2, trust_remote_code=True, hub_cache_dir=str(tmp_path / "cache"))
+    assert {suite: len(tasks) for suite, tasks in envs.items()} == {
         **{"temporal": 10, "spatial": 10, "object": 5, "procedural": 5}
     }
-    env = found["temporal"][6]
+    env = envs["temporal"][6]
     assert env.num_envs == 2
     assert "stove" in env.call("task_description")[0]
-    module = env_utils._load_module_from_path(str(OURS / "envhub" / "env.py"))
-    of_class = type("Cfg", (), {"task": "object"})()
-    for cfg in (SimpleNamespace(task="object", fps=30, hub_path="x"), MemobenchEnvConfig(tasks="object"), of_class):
+    module = env_utils._load_module_from_path(str(CONTRIB / "envhub" / "env.py"))
+    class_config = type("Cfg", (), {"task": "object"})()
+    for cfg in (SimpleNamespace(task="object", fps=30, hub_path="x"), MemobenchEnvConfig(tasks="object"), class_config):
         assert {suite: [*tasks] for suite, tasks in module.make_env(1, cfg=cfg).items()} == {"object": [*range(20, 25)]}

@@ -1,6 +1,6 @@
-"""MEMOBench as LeRobot finds it: configuration, suites, features. Nothing is simulated.
+"""Configuration, suites and features of MEMOBench, without simulation.
 
-Needs the package (``pip install -e ".[memobench]"``); skipped without it.
+Skipped without the package (``pip install -e ".[memobench]"``).
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ TASK = "turn_on_the_stove_and_turn_it_off"
 
 
 @pytest.fixture(autouse=True)
-def _discovered() -> None:
+def _register_plugins() -> None:
     register_third_party_plugins()
 
 
 class TestMemobenchConfig:
-    def test_is_found_by_its_name(self):
+    def test_registered_by_name(self):
         assert "memobench" in EnvConfig.get_known_choices()
         assert make_env_config("memobench").type == "memobench"
 
-    def test_defaults_are_the_benchmarks(self):
+    def test_defaults(self):
         cfg = make_env_config("memobench")
         assert (cfg.fps, cfg.tasks, cfg.suite, cfg.horizon) == (20, "all", "published", 1200)
 
-    def test_features_by_the_policys_names(self):
+    def test_policy_features(self):
         features = env_to_policy_features(make_env_config("memobench"))
         assert {key: tuple(feature.shape) for key, feature in features.items()} == {
             ACTION: (7,),
@@ -44,7 +44,7 @@ class TestMemobenchConfig:
             f"{OBS_IMAGES}.wrist_image": (3, 256, 256),
         }
 
-    def test_objects_instead_of_pictures(self):
+    def test_object_observations(self):
         features = env_to_policy_features(
             make_env_config("memobench", obs_type="environment_state_agent_pos")
         )
@@ -54,7 +54,7 @@ class TestMemobenchConfig:
             FeatureType.ENV,
         }
 
-    def test_an_unknown_task_is_refused(self):
+    def test_unknown_task_is_an_error(self):
         with pytest.raises(ValueError, match="stov"):
             make_env_config("memobench", task="stov").create_envs(1)
 
@@ -76,13 +76,13 @@ class TestMemobenchEnvs:
         assert env.single_action_space.shape == (7,)
         assert set(env.single_observation_space["pixels"].spaces) == {"image", "wrist_image"}
 
-    def test_what_a_rollout_asks_is_there_before_any_reset(self, envs):
+    def test_attributes_of_rollouts_before_reset(self, envs):
         (env,) = envs["temporal"].values()
         assert set(env.call("task")) == {TASK}
         assert set(env.call("_max_episode_steps")) == {1200}
         assert all("stove" in text for text in env.call("task_description"))
 
-    def test_every_task_is_made_without_a_simulation(self, tmp_path):
+    def test_all_tasks_without_simulation(self, tmp_path):
         before = "mujoco" in sys.modules
         made = make_env(make_env_config("memobench", log_dir=str(tmp_path)), n_envs=1)
         assert {suite: len(tasks) for suite, tasks in made.items()} == {
