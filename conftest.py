@@ -1,4 +1,4 @@
-"""What every test starts from: no network, one thread, and the same examples on every run in CI."""
+"""Settings of all tests: no network, one thread per process, deterministic hypothesis examples in CI."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import logging
 import os
 from collections.abc import Iterator
 
-# Before torch or LeRobot is imported by any test. Two cores are shared by the tests' own worker processes.
+# Set before any test imports torch or LeRobot. The worker processes share the cores.
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
-os.environ["MEMOBENCH_PROMPT_CACHE"] = "off"  # tests simulate what they check, and leave nothing in the user's cache
+os.environ["MEMOBENCH_PROMPT_CACHE"] = "off"  # tests neither use nor fill the user's cache
 
 import ctypes.util
 import functools
@@ -23,19 +23,19 @@ from hypothesis import settings
 settings.register_profile("memobench", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("memobench")
 
-# draccus reads the source of every policy's configuration anew for each command line: half a second, hundreds of times.
+# draccus parses the source of all configurations for each command line, which takes half a second.
 docstring.get_attribute_docstring = functools.cache(docstring.get_attribute_docstring)
 
 
 def pytest_collection_finish() -> None:
-    """Keep what the imports made out of Python's garbage collections: a tenth of the time of tests of policies."""
+    """Exclude imported objects from garbage collection, which saves a tenth of the time of policy tests."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(autouse=True)
-def log_handlers_end_with_the_test() -> Iterator[None]:
-    """LeRobot's commands log to the stream of the test that ran them; a server's thread may outlive that stream."""
+def remove_log_handlers() -> Iterator[None]:
+    """Remove handlers that LeRobot's commands add: they log to the captured stream, which ends with the test."""
     yield
     root = logging.getLogger()
     for handler in list(root.handlers):
@@ -45,8 +45,8 @@ def log_handlers_end_with_the_test() -> Iterator[None]:
 
 @pytest.fixture
 def gl() -> str:
-    """Return with what MuJoCo's own renderer draws here; skip without its library."""
+    """Return the backend of MuJoCo's renderer; skip the test without its library."""
     backend = os.environ.get("MUJOCO_GL", "egl")
     if ctypes.util.find_library({"egl": "EGL", "osmesa": "OSMesa"}.get(backend, backend)) is None:
-        pytest.skip(f"MuJoCo's own renderer has no {backend} here")
+        pytest.skip(f"the library of MUJOCO_GL={backend} is missing")
     return backend
