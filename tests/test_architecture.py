@@ -1,4 +1,4 @@
-"""What docs/develop.md promises of the packages, read from the source: order, circles, private names."""
+"""The rules of docs/develop.md for packages and imports, checked in the source."""
 
 from __future__ import annotations
 
@@ -15,92 +15,78 @@ PACKAGE = architecture.PACKAGE
 
 @cache
 def imports() -> dict[str, set[str]]:
-    """Return what each module imports; not read while tests are collected, which every worker does."""
+    """Return the imports of each module; cached, and not read during collection."""
     return architecture.read_imports()
 
 
 @cache
 def trees() -> dict[str, ast.Module]:
-    """Return each module as it is parsed."""
+    """Return the syntax tree of each module."""
     return {name: ast.parse(path.read_text()) for name, path in architecture.modules().items()}
 
 
-def test_the_plan_names_every_package() -> None:
-    listed = set(architecture.plan())
-    there = {architecture.package_of(name) for name in imports()} - {""}
-    assert listed == there, "docs/develop.md lists the packages, lowest first"
+def test_develop_page_lists_all_packages() -> None:
+    assert set(architecture.plan()) == {architecture.package_of(name) for name in imports()} - {""}
 
 
-def test_imports_go_down_the_plan_only() -> None:
-    order = list(architecture.plan())
-    upwards = [
-        f"{name} imports {target}"
-        for name, targets in imports().items()
-        for target in targets
-        if architecture.package_of(name) and target != PACKAGE
-        if order.index(architecture.package_of(target)) > order.index(architecture.package_of(name))
-    ]
-    assert not upwards
+def upward_imports(found: dict[str, set[str]], order: list[str]) -> list[str]:
+    """Return the imports of a package that is listed below the importing one."""
+    level = {"": -1} | {package: k for k, package in enumerate(order)}
+    rank = {name: level[architecture.package_of(name)] for name in found}
+    return [f"{name} imports {target}" for name in found for target in found[name] if rank[target] > rank[name] >= 0]
 
 
-def test_what_is_imported_from_the_project_is_there() -> None:
-    """The type checker lets an import of a module that is gone pass."""
-    known = set(imports())
-    absent = [
+def test_imports_follow_package_order() -> None:
+    assert upward_imports(imports(), list(architecture.plan())) == []
+
+
+def test_imported_modules_exist() -> None:
+    """mypy ignores missing imports."""
+    missing = [
         f"{name} imports {source}"
         for name, tree in trees().items()
         for source, _ in architecture.imported(tree)
-        if source.partition(".")[0] == PACKAGE and source not in known
+        if source.partition(".")[0] == PACKAGE and source not in imports()
     ]
-    assert not absent
+    assert not missing
 
 
-def test_no_files_import_each_other_in_a_circle() -> None:
+def test_no_circular_imports() -> None:
     assert architecture.circle(imports()) == []
 
 
-def test_a_circle_is_found() -> None:
-    assert architecture.circle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
-    assert set(architecture.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
-
-
-def test_no_module_of_one_system_is_imported() -> None:
-    """Each can be imported on Windows and macOS, whose users read reports and train without the simulator."""
-    of_unix = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
-    of_windows = {"_winapi", "msvcrt", "winreg"}
+def test_no_platform_specific_modules() -> None:
+    """Reports and training must work on Windows and macOS."""
+    unix = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
+    windows = {"_winapi", "msvcrt", "winreg"}
     found = [(name, source) for name, tree in trees().items() for source, _ in architecture.imported(tree)]
-    assert [(name, source) for name, source in found if source in of_unix | of_windows] == []
+    assert [(name, source) for name, source in found if source in unix | windows] == []
 
 
-def renamed(tree: ast.AST) -> Iterator[str]:
-    """Yield calls that give a file its name once it is written, or make a file under a name of their own."""
+def renames(tree: ast.AST) -> Iterator[str]:
+    """Yield calls that rename files or create temporary files."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             call = ast.unparse(node.func)
-            made = node.func.attr in ("rename", "mkstemp", "mktemp", "NamedTemporaryFile")
+            creates = node.func.attr in ("rename", "mkstemp", "mktemp", "NamedTemporaryFile")
             path_replaces = node.func.attr == "replace" and len(node.args) == 1 and not node.keywords
-            if made or path_replaces or call in ("os.replace", "shutil.move"):
+            if creates or path_replaces or call in ("os.replace", "shutil.move"):
                 yield call
 
 
-def test_files_are_written_whole_in_one_place() -> None:
-    """Elsewhere finished folders are moved, by the one process that holds their destination."""
+def test_only_io_writes_files_atomically() -> None:
+    """The other allowed modules move finished folders that no other process uses."""
     movers = ("io", "datasets.staging", "datasets.lerobot_format.assembling", "training.view")
     allowed = {f"{PACKAGE}.{name}" for name in movers}
-    assert [(name, call) for name, tree in trees().items() for call in renamed(tree) if name not in allowed] == []
-
-
-def test_a_renaming_is_found() -> None:
-    source = "os.replace(a, b); a.replace(b); draft.rename(b); tempfile.mkstemp(); 'text'.replace('t', 'x')"
-    assert len(list(renamed(ast.parse(source)))) == 4
+    assert [(name, call) for name, tree in trees().items() for call in renames(tree) if name not in allowed] == []
 
 
 def is_private(name: str) -> bool:
     return name.startswith("_") and not name.endswith("__")
 
 
-def private_names(tree: ast.AST, known: Collection[str]) -> Iterator[str]:
-    """Yield what a file takes by ``from module import _name``, and what it reads as ``module._name``."""
+def private_uses(tree: ast.AST, known: Collection[str]) -> Iterator[str]:
+    """Yield private names of other modules: ``from module import _name`` and ``module._name``."""
     froms = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
     taken = [(node.module, alias) for node in froms for alias in node.names if str(node.module).startswith(PACKAGE)]
     yield from (f"{module}.{alias.name}" for module, alias in taken if is_private(alias.name))
@@ -110,25 +96,32 @@ def private_names(tree: ast.AST, known: Collection[str]) -> Iterator[str]:
             yield from [f"{node.value.id}.{node.attr}"] * is_private(node.attr)
 
 
-def test_no_private_name_crosses_modules() -> None:
-    assert [(name, found) for name, tree in trees().items() for found in private_names(tree, trees())] == []
+def test_private_names_stay_in_their_module() -> None:
+    assert [(name, use) for name, tree in trees().items() for use in private_uses(tree, trees())] == []
 
 
-def test_a_private_name_is_found() -> None:
+def test_checks_detect_violations() -> None:
+    assert set(architecture.circle({"a": {"b"}, "b": {"c"}, "c": {"b"}})) == {"b", "c"}
+    modules = {f"{PACKAGE}.{name}": {f"{PACKAGE}.{target}"} for name, target in (("io", "sim.x"), ("sim.x", "io"))}
+    assert upward_imports(modules, ["io", "sim"]) == [f"{PACKAGE}.io imports {PACKAGE}.sim.x"]
+    calls = "os.replace(a, b); a.replace(b); draft.rename(b); tempfile.mkstemp(); 'text'.replace('t', 'x')"
+    assert len(list(renames(ast.parse(calls)))) == 4
     source = f"from {PACKAGE}.sim import world\nfrom {PACKAGE}.io import _to_disk\nworld._x, world.__doc__"
-    assert list(private_names(ast.parse(source), trees())) == [f"{PACKAGE}.io._to_disk", "world._x"]
+    assert list(private_uses(ast.parse(source), trees())) == [f"{PACKAGE}.io._to_disk", "world._x"]
 
 
-def test_the_picture_shows_the_imports_of_today() -> None:
-    wanted = {here: targets for here, targets in architecture.direct(architecture.arrows(imports())).items() if targets}
-    assert architecture.drawn() == wanted, "draw it anew: python scripts/architecture.py"
+def test_picture_shows_current_imports() -> None:
+    found = architecture.direct(architecture.arrows(imports()))
+    assert architecture.drawn() == {here: targets for here, targets in found.items() if targets}, (
+        "update the picture: python scripts/architecture.py"
+    )
 
 
-def test_the_pages_for_newcomers_name_what_is_there() -> None:
+def test_developer_pages_name_existing_files() -> None:
     source, pages = architecture.SOURCE / PACKAGE, sorted((architecture.ROOT / "docs" / "develop").glob("*.md"))
     assert len(pages) == 6
+    folders = [architecture.ROOT, source, *(path for path in source.rglob("*") if path.is_dir())]
     for page in pages:
-        assert page.name in ("way_of_a_frame.md", "paper_world.md") or len(page.read_text().splitlines()) <= 40
         names = re.findall(r"`([\w/]+\.py)", page.read_text())
-        here = [architecture.ROOT, source, page.parent, *(path for path in source.rglob("*") if path.is_dir())]
-        assert [name for name in names if not any((base / name).is_file() for base in here)] == []
+        assert [name for name in names if not any((base / name).is_file() for base in (page.parent, *folders))] == []
+        assert page.name in ("way_of_a_frame.md", "paper_world.md") or len(page.read_text().splitlines()) <= 40

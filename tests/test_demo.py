@@ -1,4 +1,4 @@
-"""The demo: its commands are understood, and what it makes of evaluations. The evaluations are replaced here."""
+"""`examples/demo.py`: its commands, and its pictures of evaluations, which are replaced here."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FAILURES: dict[str, dict[int, str]] = {
     "with_memory": {3: "reference_drift"},
     "without_memory": {1: "reference_drift", 2: "reference_drift", 3: "storage_failure"},
 }
-"""Name of an evaluation of the second part -> episode -> its failure."""
+"""Evaluation of the second part -> failed episode -> failure class."""
 
 
 @pytest.fixture(scope="module")
@@ -35,66 +35,66 @@ def demo() -> SimpleNamespace:
     return SimpleNamespace(**runpy.run_path(str(DEMO)))
 
 
-def film(path: Path, length: int, shade: int | None = None) -> Path:
-    """A video of one shade of grey, or from black to white."""
-    strip = VideoRecorder(path)
+def video(path: Path, length: int, grey: int | None = None) -> Path:
+    """Write a video of one grey level, or from black to white."""
+    recorder = VideoRecorder(path)
     for k in range(length):
-        strip.add(np.full((HEIGHT, WIDTH, 3), 255 * k // (length - 1) if shade is None else shade, np.uint8))
-    strip.finish()
+        recorder.add(np.full((HEIGHT, WIDTH, 3), 255 * k // (length - 1) if grey is None else grey, np.uint8))
+    recorder.finish()
     return path
 
 
 def evaluate(demo: SimpleNamespace, words: list[str]) -> None:
-    """Write what the evaluation of a command would leave."""
+    """Write the output files of an evaluation command."""
     given = dict(word.split("=", 1) for word in words if "=" in word)
     folder = Path(given["output_dir"])
     if folder.name == "expert" and folder.parent.name != "memory":
         for name in demo.TASKS:
-            film(folder / "videos" / f"{name}.0.mp4", 12)
+            video(folder / "videos" / f"{name}.0.mp4", 12)
         return
     ends = [FAILURES[folder.name].get(k) for k in range(5)]
     records = [rollout(demo.BOWL, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)]
     write_episodes(folder, records)
-    film(folder / "videos" / f"{demo.BOWL}.1.mp4", 6, 100)  # the first episode in which they differ
+    video(folder / "videos" / f"{demo.BOWL}.1.mp4", 6, 100)  # the first episode with different outcomes
 
 
-def test_the_demo_folder(demo: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    typed: list[list[str]] = []
+def test_demo_writes_pictures_and_table(demo: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands: list[list[str]] = []
 
-    def replaced(command: list[str], **_: Any) -> None:
-        typed.append(command)
+    def fake_run(command: list[str], **_: Any) -> None:
+        commands.append(command)
         evaluate(demo, command)
 
-    monkeypatch.setattr(subprocess, "run", replaced)
+    monkeypatch.setattr(subprocess, "run", fake_run)
     monkeypatch.setattr(sys, "argv", ["demo.py", "--out", str(tmp_path)])
     demo.main()
     assert {path.name for path in tmp_path.iterdir()} == {
         *("expert", "memory", "contact_sheet.png", "memory.mp4", "memory.png", "memory.md"),
     }
-    assert [Path(command[0]).name for command in typed] == ["lerobot"] * 4
-    for command in typed:
+    assert [Path(command[0]).name for command in commands] == ["lerobot"] * 4
+    for command in commands:
         take_run_options(split_arguments([word for word in command[2:] if not word.startswith("policy=")]))
-    # The three of the second part differ in the policy and their folder alone.
-    of_policy = ("policy=", "output_dir=")
-    assert len({tuple(word for word in command if not word.startswith(of_policy)) for command in typed[1:]}) == 1
+    # The evaluations of the second part differ only in policy and folder.
+    varied = ("policy=", "output_dir=")
+    assert len({tuple(word for word in command if not word.startswith(varied)) for command in commands[1:]}) == 1
     assert [get_task(name).memory_type for name in demo.TASKS] == ["temporal", "spatial", "object", "procedural"]
     assert "| without memory | 2/5 | 2 |" in (tmp_path / "memory.md").read_text()
     with Image.open(tmp_path / "contact_sheet.png") as sheet:
         pixels = np.asarray(sheet.convert("L")).astype(int)
     assert pixels.shape == (4 * 160, demo.FRAMES_PER_VIDEO * demo.COLUMN_WIDTH)
     means = pixels[:160].reshape(160, demo.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
-    assert (np.diff(means) >= 0).all()  # in time, left to right
-    assert (means[0] < 20, means[-1] > 235) == (True, True), "both ends are there"
+    assert (np.diff(means) >= 0).all(), "frames are in order of time"
+    assert (means[0] < 20, means[-1] > 235) == (True, True), "first and last frames are included"
 
 
-def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
+def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
     return bool((picture == colour).all(axis=-1).any())
 
 
-def test_videos_side_by_side_say_how_they_ended(demo: SimpleNamespace, tmp_path: Path) -> None:
+def test_joined_videos_show_outcomes(demo: SimpleNamespace, tmp_path: Path) -> None:
     takes = {
-        "with": demo.Take(film(tmp_path / "with.mp4", 5, 60), True),
-        "without": demo.Take(film(tmp_path / "without.mp4", 9, 200), False),
+        "with": demo.Take(video(tmp_path / "with.mp4", 5, 60), True),
+        "without": demo.Take(video(tmp_path / "without.mp4", 9, 200), False),
     }
     frames = list(demo.joined(takes))
     assert len(frames) == 9 + LAST_FRAMES
@@ -102,9 +102,9 @@ def test_videos_side_by_side_say_how_they_ended(demo: SimpleNamespace, tmp_path:
     left, right = frames[0][demo.TITLE :, :WIDTH], frames[0][demo.TITLE :, WIDTH:]
     assert abs(float(left.mean()) - 60) < 4
     assert abs(float(right.mean()) - 200) < 4
-    ends = [[coloured(frame[: demo.TITLE], colour) for frame in frames] for colour in (demo.SOLVED, demo.FAILED)]
+    ends = [[has_colour(frame[: demo.TITLE], colour) for frame in frames] for colour in (demo.SOLVED, demo.FAILED)]
     assert [end.index(True) for end in ends] == [5 + LAST_FRAMES - 1, 9 + LAST_FRAMES - 1]
     picture = np.asarray(demo.strip(takes))
     assert picture.shape == (2 * (demo.TITLE + demo.STRIP_WIDTH * HEIGHT // WIDTH), 6 * demo.STRIP_WIDTH, 3)
-    assert coloured(picture[: demo.TITLE], demo.SOLVED)
-    assert coloured(picture[len(picture) // 2 :][: demo.TITLE], demo.FAILED)
+    assert has_colour(picture[: demo.TITLE], demo.SOLVED)
+    assert has_colour(picture[len(picture) // 2 :][: demo.TITLE], demo.FAILED)

@@ -13,11 +13,12 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Optional
 
 import numpy as np
 import pytest
 import typer
+from click import NoSuchOption
 from PIL import Image
 
 from lerobot_memobench.cli import memobench
@@ -64,36 +65,33 @@ def name(document: Path) -> str:
 
 
 def links(document: Path) -> list[str]:
-    """Return where a document's links lead, those to other sites left out."""
+    """Return the links of a document, without those to other sites."""
     text = WORDS.sub("", BLOCK.sub("", document.read_text()))
-    return [to for to in LINK.findall(text) if not re.match(r"[a-z]+:", to)]
+    return [link for link in LINK.findall(text) if not re.match(r"[a-z]+:", link)]
 
 
 def anchors(document: Path) -> set[str]:
-    """Return the names that GitHub gives a document's headings."""
+    """Return the anchors that GitHub gives to a document's headings."""
     headings = re.findall(r"^#+ (.+)$", BLOCK.sub("", document.read_text()), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def broken(document: Path) -> list[str]:
-    """Return a document's links that lead nowhere. Of pages that are made only the site's build knows the anchors."""
+    """Return the broken links of a document; anchors of generated pages are checked by the site's build only."""
     found = []
     for link in links(document):
         path, _, anchor = link.partition("#")
-        there = (document.parent / path).resolve() if path else document
-        if there in MADE:
-            continue
-        if not there.exists() or (anchor and anchor not in anchors(there)):
+        target = (document.parent / path).resolve() if path else document
+        if target not in MADE and (not target.exists() or (anchor and anchor not in anchors(target))):
             found.append(link)
     return found
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=name)
-def test_links_lead_somewhere(document: Path) -> None:
-    assert not broken(document)
+def test_links_are_valid() -> None:
+    assert {name(document): links for document in DOCUMENTS if (links := broken(document))} == {}
 
 
-def test_what_leads_nowhere_is_found(tmp_path: Path) -> None:
+def test_broken_links_are_detected(tmp_path: Path) -> None:
     document = tmp_path / "one.md"
     document.write_text(
         "# Here & there\n\n[a](#here--there) [b](#nowhere) [e](two.md) `[c](#code)` [d](https://a.b#c)\n"
@@ -103,7 +101,7 @@ def test_what_leads_nowhere_is_found(tmp_path: Path) -> None:
     assert broken(document) == ["#nowhere", "two.md"]
 
 
-def test_the_readme_needs_no_page_that_only_the_site_has() -> None:
+def test_readme_does_not_link_to_generated_pages() -> None:
     assert not [link for link in links(ROOT / "README.md") if (ROOT / link.partition("#")[0]).resolve() in MADE]
 
 
@@ -118,9 +116,8 @@ def of_a_laboratory(text: str) -> list[str]:
     return [found[0] for pattern in (HASH, PROCESSOR) for found in pattern.finditer(text)]
 
 
-@pytest.mark.parametrize("document", BY_HAND, ids=name)
-def test_hashes_commits_and_processors_stay_in_the_notes(document: Path) -> None:
-    assert not of_a_laboratory(document.read_text())
+def test_hashes_commits_and_processors_stay_in_the_notes() -> None:
+    assert {name(page): found for page in BY_HAND if (found := of_a_laboratory(page.read_text()))} == {}
 
 
 def test_what_belongs_into_the_notes_is_found() -> None:
@@ -134,28 +131,21 @@ def test_notes_are_dated(note: Path) -> None:
     assert re.search(r"\b(20\d\d-\d\d-\d\d|\d{1,2} [A-Z][a-z]+ 20\d\d)\b", "\n".join(note.read_text().splitlines()[:6]))
 
 
-def test_the_readme_is_short() -> None:
+def test_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120
 
 
-def test_every_page_has_its_place_in_the_site() -> None:
-    """The strict build says so too; here it is said without MkDocs."""
-    told = set(pages_of_the_site())
-    there = {str(page.relative_to(DOCS)) for page in DOCS.glob("**/*.md")}
-    assert told == there | set(reference.PAGES) | set(reference.COPIES.values())
-
-
-def pages_of_the_site() -> list[str]:
-    return re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2])
-
-
-def test_no_two_pages_share_an_address() -> None:
-    addresses = Counter(re.sub(r"(^|/)index$", "", page.removesuffix(".md")) for page in pages_of_the_site())
-    assert [address for address, count in addresses.items() if count > 1] == []
+def test_navigation_lists_every_page_once() -> None:
+    """The strict build of the site checks this too, but it is slow."""
+    listed = re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2])
+    pages = {str(page.relative_to(DOCS)) for page in DOCS.glob("**/*.md")}
+    assert set(listed) == pages | set(reference.PAGES) | set(reference.COPIES.values())
+    urls = Counter(re.sub(r"(^|/)index$", "", page.removesuffix(".md")) for page in listed)
+    assert [url for url, count in urls.items() if count > 1] == []
 
 
 @pytest.mark.slow
-def test_the_site_is_built_strictly(tmp_path: Path) -> None:
+def test_site_is_built_strictly(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -270,7 +260,7 @@ def test_a_claim_that_went_or_that_nobody_listed_is_found(tmp_path: Path) -> Non
 
 
 def commands(document: Path) -> Iterator[list[str]]:
-    """Yield the words of each command in a document's shell blocks."""
+    """Yield the words of each command in the shell blocks of a document."""
     for block in re.findall(r"```bash\n(.*?)```", document.read_text(), re.DOTALL):
         for line in re.sub(r"\\\n\s*", " ", block).splitlines():
             words: list[str] = []
@@ -288,14 +278,14 @@ TYPED = [(document, words) for document in BY_HAND for words in commands(documen
 
 
 @pytest.mark.parametrize(("document", "words"), TYPED, ids=lambda it: name(it) if isinstance(it, Path) else it[0])
-def test_commands_are_understood(document: Path, words: list[str]) -> None:
+def test_commands_are_valid(document: Path, words: list[str]) -> None:
     check(words)
 
 
 def check(words: list[str]) -> None:
-    """Raise where a command is none, or has an argument that it does not know. Nothing is run."""
+    """Raise an error for an unknown command or argument; nothing is executed."""
     program, *rest = words
-    if program == "accelerate":  # it starts what stands behind `$(which lerobot)`
+    if program == "accelerate":  # it runs the program after `$(which lerobot)`
         program, rest = "lerobot", rest[rest.index("lerobot)") + 1 :]
     match program:
         case "lerobot":
@@ -315,7 +305,7 @@ def check(words: list[str]) -> None:
         case _ if program.startswith("scripts/"):
             assert (ROOT / program).is_file(), program
         case _:
-            assert program in ("source", "pip", "uv", "gzip"), f"{program} is no command that the documents use"
+            assert program in ("source", "pip", "uv", "gzip"), f"unknown program {program}"
 
 
 def as_pair(flag: str) -> str:
@@ -325,11 +315,9 @@ def as_pair(flag: str) -> str:
 
 
 def check_lerobot(command: str, line: list[str]) -> None:
-    """Read a line as `lerobot` does. Folders, repositories and the example of the documents are not there: others stand
-    for them.
-    """
-    stand_in = {"policy": "policy=memobench_mem", "dataset": "dataset.root=outputs"}
-    pairs = [stand_in[key] if (key := word.partition("=")[0]) in stand_in and is_place(word) else word for word in line]
+    """Parse a line as `lerobot` does; folders, repositories and example policies are replaced by existing ones."""
+    existing = {"policy": "policy=memobench_mem", "dataset": "dataset.root=outputs"}
+    pairs = [existing[key] if (key := word.partition("=")[0]) in existing and is_place(word) else word for word in line]
     given = split_arguments(pairs)
     if command == "eval" and is_of_benchmark(given):
         read_settings(take_run_options(given)[1])
@@ -340,7 +328,7 @@ def check_lerobot(command: str, line: list[str]) -> None:
 
 
 def is_place(pair: str) -> bool:
-    """Whether a pair's value is a folder, a repository, or the policy of `examples/`."""
+    """Return whether a value is a folder, a repository or the policy of `examples/`."""
     key, _, value = pair.partition("=")
     return key == "dataset" or "/" in value or pair == "policy=window"
 
@@ -356,7 +344,7 @@ def check_vla_eval(line: list[str]) -> None:
 
 
 def check_viewer(line: list[str]) -> None:
-    """See that LeRobot's viewer knows the flags; its parser cannot be had without running it."""
+    """Compare flags with the source of LeRobot's viewer, whose parser cannot be used alone."""
     spec = importlib.util.find_spec("lerobot.scripts.lerobot_dataset_viz")
     assert spec is not None
     known = set(re.findall(r"add_argument\(\s*\"(--[\w-]+)\"", Path(str(spec.origin)).read_text()))
@@ -379,17 +367,8 @@ def check_memobench(line: list[str]) -> None:
         command.make_context(" ".join(path), list(line))
 
 
-def click_error() -> type[Exception]:
-    """Return the error of an option that a command does not know."""
-    try:
-        check_memobench(["tasks", "--no-such"])
-    except Exception as error:
-        return type(error)
-    raise AssertionError("an option that is none was understood")
-
-
 def check_python(line: list[str]) -> None:
-    """See that the script or module is there."""
+    """Check that the script or module exists."""
     if line[0] == "-m":
         assert importlib.util.find_spec(line[1]), line[1]
     elif line[0] != "-c":
@@ -402,7 +381,7 @@ def check_python(line: list[str]) -> None:
         "lerobot eval env=memobench episode=10",
         "lerobot-eval --env.type=memobench --env.tusks=object",
         "lerobot train policy=memobench_mem memory_frames=3",
-        "memobench generate --task object",
+        "memobench generate --no-such-option",
         "lerobot-dataset-viz --episode 0",
         "memobench no_such",
         "python examples/no_such.py",
@@ -410,29 +389,29 @@ def check_python(line: list[str]) -> None:
         "roscore",
     ],
 )
-def test_commands_that_are_not_understood_are_found(line: str) -> None:
-    with pytest.raises((MemobenchError, AssertionError, KeyError, click_error())):
+def test_invalid_commands_are_detected(line: str) -> None:
+    with pytest.raises((MemobenchError, AssertionError, KeyError, NoSuchOption)):
         check(shlex.split(line))
 
 
-# --- short forms, and pages that are made ---
+# --- generated pages ---
 
 
 @pytest.mark.parametrize("command", ["eval", "train"])
-def test_short_forms_are_those_of_the_help(command: str) -> None:
-    """Guides name the most used ones, the reference all."""
-    helped = {word for typed, *_ in reference.short_forms(command) for word in re.findall(r"\w+=", typed)}
+def test_short_forms_agree_with_help(command: str) -> None:
+    """Guides list the most important ones, the reference all."""
+    in_help = {word for typed, *_ in reference.short_forms(command) for word in re.findall(r"\w+=", typed)}
     text = (DOCS / "guides" / {"eval": "evaluate.md", "train": "train.md"}[command]).read_text()
     lines = text[text.index("| short form |") :].split("\n\n")[0].splitlines()[2:]
-    typed = {word for line in lines for word in re.findall(r"\w+=", line.split("|")[1])}
-    assert typed
-    assert typed <= helped
+    in_guide = {word for line in lines for word in re.findall(r"\w+=", line.split("|")[1])}
+    assert in_guide
+    assert in_guide <= in_help
     page = reference.lerobot_page().partition(f"## lerobot {command}")[2].partition("\n## ")[0]
-    assert all(f"`{word}`" in page for word in helped)
+    assert all(f"`{word}`" in page for word in in_help)
 
 
 @pytest.mark.parametrize("page", reference.PAGES)
-def test_pages_that_are_made(page: str) -> None:
+def test_generated_pages_have_valid_tables(page: str) -> None:
     text = reference.PAGES[page]()
     assert text.startswith("# ")
     for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
@@ -440,7 +419,7 @@ def test_pages_that_are_made(page: str) -> None:
         assert len(widths) == 1, block
 
 
-def test_every_field_of_the_log_is_explained() -> None:
+def test_all_fields_of_log_and_card_have_a_meaning() -> None:
     for kind in (
         episode_log.EpisodeRecord,
         episode_log.CheckpointRecord,
@@ -448,32 +427,37 @@ def test_every_field_of_the_log_is_explained() -> None:
         evaluation_file.WholeCard,
         evaluation_file.CardEpisode,
     ):
-        assert all(says for _, says, _ in reference.typed_rows(kind)), kind
+        assert all(meaning for _, meaning, _ in reference.typed_rows(kind)), kind
     rows = reference.typed_rows(episode_log.EpisodeRecord)
-    assert [name.strip("`") for name, _, kind in rows if kind.endswith("required")] == [
-        *("task", "memory_type", "episode", "success", "checkpoints"),
-    ]
+    required = [name.strip("`") for name, _, kind in rows if kind.endswith("required")]
+    assert required == ["task", "memory_type", "episode", "success", "checkpoints"]
 
 
-def test_every_task_has_a_card() -> None:
+def test_types_are_written_without_modules() -> None:
+    hints = (int | None, Optional[int], list[Path], Literal["a", "b"], dict[str, float | None])  # noqa: UP045
+    shown = [reference.type_name(hint) for hint in hints]
+    assert shown == ["int or None", "int or None", "list[Path]", "'a' or 'b'", "dict[str, float or None]"]
+
+
+def test_task_pages_have_a_card_per_task() -> None:
     from lerobot_memobench.tasks.catalogue import task_names
 
     for suite in ("published", "strict"):
         text = reference.tasks_page(suite)
-        assert all(f"\n`{one}`\n" in text for one in task_names(suite=suite))
+        assert all(f"\n`{task}`\n" in text for task in task_names(suite=suite))
         assert text.count("needs a memory") >= 30
 
 
 @pytest.mark.parametrize("number", [1, 6, 20, 30])
-def test_a_card_has_its_tasks_picture(number: int) -> None:
-    """It is cut out of the sheet of all, along the picture's edge: the sheet's ground is nearly white."""
+def test_task_pictures_are_cropped_at_their_edges(number: int) -> None:
+    """The background of the sheet is nearly white."""
     with Image.open(io.BytesIO(reference.scene(number))) as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
     assert pixels.shape == (256, 256, 3)
     assert max(edge.mean() for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1])) < 230
 
 
-def test_every_setting_of_a_policy_is_in_the_reference() -> None:
+def test_policy_page_lists_all_settings() -> None:
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 
     page = reference.policies_page()
@@ -481,7 +465,7 @@ def test_every_setting_of_a_policy_is_in_the_reference() -> None:
     assert [field for field in own if f"`{field}`" not in page] == []
 
 
-def test_cells_break_where_names_do_and_not_within_intervals() -> None:
+def test_cells_break_within_names_but_not_intervals() -> None:
     page = '<p>a_b</p><td><a href="x_y.html"><code>env.obs_type</code></a> 97.9 [96.9–98.5]</td>'
     assert reference.breakable(page) == (
         '<p>a_b</p><td><a href="x_y.html"><code>env.<wbr>obs_<wbr>type</code></a> '
@@ -489,14 +473,19 @@ def test_cells_break_where_names_do_and_not_within_intervals() -> None:
     )
 
 
-def test_links_that_leave_the_site_are_turned() -> None:
-    text = "[the lab](../../research/README.md), [a](../../src/x.py), [b](b.md), [`src/x.py`](../../src/x.py)"
-    assert reference.at_home(text, "research/index.md") == (
-        "[the lab](../develop/lab.md), a (`src/x.py`), [b](b.md), `src/x.py`"
+def test_links_to_files_outside_the_site_are_adapted() -> None:
+    text = (
+        "[the lab](../../research/README.md#use), [a](../../src/x.py), [b](b.md), [c](#c), [`src/x.py`](../../src/x.py)"
+    )
+    assert reference.relink(text, "docs/benchmark/page.md", "benchmark/page.md") == (
+        "[the lab](../develop/lab.md#use), a (`src/x.py`), [b](b.md), [c](#c), `src/x.py`"
+    )
+    assert (
+        reference.relink("[d](docs/develop.md)", "CONTRIBUTING.md", "develop/contributing.md") == "[d](../develop.md)"
     )
 
 
-def test_every_memory_has_its_page_and_its_row() -> None:
+def test_memory_guides_are_complete() -> None:
     index = (ROOT / "docs/guides/memories.md").read_text()
     assert [name for name in OURS if f"| [`{name}`](memory/{name}.md)" not in index] == []
     assert [name for name in OURS if not (ROOT / f"docs/guides/memory/{name}.md").is_file()] == []

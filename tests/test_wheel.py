@@ -1,4 +1,4 @@
-"""What a user gets who never sees this repository: sdist and wheel, and the wheel in a bare environment."""
+"""The published files: sdist and wheel, and an installation of the wheel in an empty environment."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COMMANDS = {"lerobot", "memobench"}
 
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that holds the sdist and the wheel."""
+    """Build sdist and wheel, once for this file; 3 s."""
     folder = tmp_path_factory.mktemp("dist")
     subprocess.run([sys.executable, "-m", "hatchling", "build", "-d", str(folder)], cwd=ROOT, check=True)
     return folder
@@ -35,7 +35,7 @@ def wheel(dist: Path) -> Path:
     return found
 
 
-def test_registries_would_take_them(dist: Path) -> None:
+def test_metadata_is_accepted_by_registries(dist: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "twine", "check", "--strict", *map(str, dist.iterdir())], capture_output=True, text=True
     )
@@ -43,7 +43,7 @@ def test_registries_would_take_them(dist: Path) -> None:
     assert done.stdout.count("PASSED") == 2
 
 
-def test_the_wheel_holds_the_product_alone(wheel: Path) -> None:
+def test_wheel_contains_only_the_package(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         (file,) = (name for name in names if name.endswith("METADATA"))
@@ -64,25 +64,25 @@ def test_the_wheel_holds_the_product_alone(wheel: Path) -> None:
     }
     assert len(files) > 10
     assert files <= set(names)
-    # What pip could not install without a compiler, or would install over another's files.
+    # pip would need a compiler for these, or install them over files of another package.
     assert not {"robosuite", "opencv-python", "pynput"} & {requirement.name for requirement in requirements}
 
 
-def test_the_sdist_holds_all_that_is_tracked(dist: Path) -> None:
+def test_sdist_contains_all_tracked_files(dist: Path) -> None:
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
     if listed.returncode:
         pytest.skip("no git checkout")
     (sdist,) = dist.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
-        held = {name.partition("/")[2] for name in archive.getnames()}
+        contained = {name.partition("/")[2] for name in archive.getnames()}
     tracked = {name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()}
-    assert tracked - held == set()
+    assert tracked - contained == set()
 
 
-def test_nobody_else_installs_our_commands() -> None:
-    """LeRobot's are named lerobot-eval, lerobot-train, …; one named lerobot would replace ours or be replaced."""
-    found = [entry for name in COMMANDS for entry in metadata.entry_points(group="console_scripts", name=name)]
-    assert {(entry.name, entry.value.partition(".")[0]) for entry in found} == {
+def test_no_other_package_installs_our_commands() -> None:
+    """LeRobot's commands are lerobot-eval, lerobot-train, …; pip would overwrite one of two commands `lerobot`."""
+    entries = [entry for name in COMMANDS for entry in metadata.entry_points(group="console_scripts", name=name)]
+    assert {(entry.name, entry.value.partition(".")[0]) for entry in entries} == {
         (name, "lerobot_memobench") for name in COMMANDS
     }
     theirs = {entry.name for entry in metadata.distribution("lerobot").entry_points}
@@ -90,8 +90,8 @@ def test_nobody_else_installs_our_commands() -> None:
     assert not COMMANDS & theirs
 
 
-def documented_lines(wheel: Path) -> list[list[str]]:
-    """Return the lines that docs/start/install.md says to type, with the wheel in place of the repository."""
+def installation_commands(wheel: Path) -> list[list[str]]:
+    """Return the commands of docs/start/install.md, with the wheel instead of the repository."""
     page = (ROOT / "docs" / "start" / "install.md").read_text()
     (block,) = (block for block in re.findall(r"```bash\n(.*?)```", page, re.DOTALL) if "pip install" in block)
     return [[str(wheel) if word == "." else word for word in shlex.split(line)] for line in block.splitlines()]
@@ -99,8 +99,8 @@ def documented_lines(wheel: Path) -> list[list[str]]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_a_bare_environment(wheel: Path, tmp_path: Path) -> None:
-    """The lines of the page, then one episode; without a compiler, uv, or this repository."""
+def test_documented_installation_runs_an_episode(wheel: Path, tmp_path: Path) -> None:
+    """In an empty environment without a compiler, uv or this repository."""
     bare = tmp_path / "bare"
     python = Path(sys.base_prefix) / "bin" / "python3.12"
     subprocess.run([python if python.exists() else sys.executable, "-m", "venv", str(bare)], check=True)
@@ -113,17 +113,17 @@ def test_a_bare_environment(wheel: Path, tmp_path: Path) -> None:
         return subprocess.run(program, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
     if run("pip", "download", "-q", "--no-deps", "-d", str(tmp_path), "termcolor").returncode:
-        pytest.skip("pip reaches no package index from here")
-    *installing, doctor = documented_lines(wheel)
-    for line in installing:
-        done = run(*line)
+        pytest.skip("pip cannot reach a package index")
+    *installing, doctor = installation_commands(wheel)
+    for command in installing:
+        done = run(*command)
         assert done.returncode == 0, done.stdout + done.stderr
     done = run(*doctor, "--json")
     findings = {finding["what"]: finding for finding in json.loads(done.stdout)}
     assert done.returncode == 0, findings
-    # The programs on the path are for whoever has them.
+    # FFmpeg is optional.
     assert [what for what, finding in findings.items() if finding["status"] == "warning"] in ([], ["FFmpeg"])
-    names = {one["name"].lower() for one in json.loads(run("pip", "list", "--format", "json").stdout)}
+    names = {package["name"].lower() for package in json.loads(run("pip", "list", "--format", "json").stdout)}
     assert {name for name in names if "opencv" in name} == {"opencv-python-headless"}
     done = run("lerobot", "eval", "env=memobench", "tasks=open_and_close_the_microwave", "episodes=1", "output_dir=out")
     assert done.returncode == 0, done.stdout + done.stderr

@@ -1,10 +1,10 @@
-"""Public names are the field's terms (docs/benchmark/glossary.md): words that were once our own do not come back."""
+"""Words: public names are terms of the field (docs/benchmark/glossary.md), and texts are plain English."""
 
 from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -28,6 +28,23 @@ OLD = {
     "house": "architecture",
     "orders": "run options",
 }
+"""Word of earlier versions -> term of the field."""
+
+PER_1000_LINES = {
+    "told, tells, telling": (re.compile(r"\b(told|tells|telling)\b", re.IGNORECASE), 0.5),
+    "beside, anew, nobody": (re.compile(r"\b(beside|anew|nobody)\b", re.IGNORECASE), 0.5),
+    "stands": (re.compile(r"\bstands\b", re.IGNORECASE), 0.5),
+    "mended": (re.compile(r"\bmended\b", re.IGNORECASE), 0.5),
+}
+"""Words -> pattern and maximum number per 1,000 lines."""
+TEXTS = {
+    "package": ("src/lerobot_memobench",),
+    "guides": ("docs/guides",),
+    "benchmark": ("docs/benchmark",),
+    "pages": ("README.md", "docs/start", "docs/develop", "docs/develop.md"),
+    "scripts": ("scripts", "benchmarks"),
+}
+"""Name -> files and folders whose lines are counted together."""
 
 
 def words(name: str) -> set[str]:
@@ -36,37 +53,69 @@ def words(name: str) -> set[str]:
 
 
 def public_names(tree: ast.Module) -> Iterator[str]:
-    """Yield classes, functions, methods, constants, fields and parameters that do not begin with an underscore."""
+    """Yield classes, functions, methods, constants and fields without a leading underscore."""
     for node in ast.walk(tree):
+        names: list[str] = []
         if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            yield node.name
+            names.append(node.name)
         if isinstance(node, ast.ClassDef | ast.Module):
             for part in node.body:
-                if isinstance(part, ast.AnnAssign) and isinstance(part.target, ast.Name):
-                    yield part.target.id
-                if isinstance(part, ast.Assign):
-                    yield from (target.id for target in part.targets if isinstance(target, ast.Name))
+                targets = part.targets if isinstance(part, ast.Assign) else [getattr(part, "target", None)]
+                names += [target.id for target in targets if isinstance(target, ast.Name)]
+        yield from (name for name in names if not name.startswith("_"))
 
 
 def old_words(root: Path) -> list[str]:
-    """Return ``file: name (what it should be called)`` of every public name with an old word."""
+    """Return ``file: name (term)`` of each public name with an old word."""
     found = []
     for path in sorted(root.rglob("*.py")):
-        if path.name.startswith("test_"):
-            continue
-        place = path.relative_to(root)
-        for name in [*place.with_suffix("").parts, *public_names(ast.parse(path.read_text()))]:
-            if not name.startswith("_"):
+        if not path.name.startswith("test_"):
+            place = path.relative_to(root)
+            for name in {*place.with_suffix("").parts, *public_names(ast.parse(path.read_text()))}:
                 found += [f"{place}: {name} ({OLD[word]})" for word in sorted(words(name) & OLD.keys())]
     return found
 
 
 @pytest.mark.parametrize("root", ["src/lerobot_memobench", "research", "examples"])
-def test_public_names_are_the_fields(root: str) -> None:
+def test_public_names_are_terms_of_the_field(root: str) -> None:
     assert old_words(ROOT / root) == []
 
 
-def test_old_words_are_found() -> None:
-    source = "class RowEyes:\n    told_objects: int\n\ndef finds(): ...\n\ndef _twin(): ..."
-    found = {word for name in public_names(ast.parse(source)) if name[0] != "_" for word in words(name) & OLD.keys()}
-    assert found == {"eyes", "told", "finds"}
+def test_old_words_are_detected(tmp_path: Path) -> None:
+    source = "class RowEyes:\n    told_objects: int\n\ndef finds(): ...\n\ndef _twin(): ...\nCROWD = 1\n"
+    (tmp_path / "module.py").write_text(source)
+    (tmp_path / "test_twins.py").write_text(source)
+    found = {line.split()[1] for line in old_words(tmp_path)}
+    assert found == {"RowEyes", "told_objects", "finds", "CROWD"}
+
+
+def too_frequent(places: Iterable[Path]) -> dict[str, tuple[float, list[str]]]:
+    """Return words above their limit -> their number per 1,000 lines and the lines."""
+    files = [file for place in places for file in (sorted(place.rglob("*.*")) if place.is_dir() else [place])]
+    lines = [
+        (f"{file.name}:{number}: {line.strip()}", line)
+        for file in files
+        if file.suffix in (".md", ".py", ".txt")
+        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
+    ]
+    found = {}
+    for group, (pattern, limit) in PER_1000_LINES.items():
+        counts = [(shown, len(pattern.findall(line))) for shown, line in lines]
+        rate = 1000 * sum(count for _, count in counts) / len(lines)
+        if rate > limit:
+            found[group] = rate, [shown for shown, count in counts if count]
+    return found
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_texts_use_plain_words(name: str) -> None:
+    assert too_frequent(ROOT / place for place in TEXTS[name]) == {}
+
+
+def test_frequent_words_are_detected(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("A guide.\n" * 1999 + "The log tells more.\n")
+    assert too_frequent([tmp_path]) == {}
+    page.write_text("A guide.\n" * 1998 + "It tells more.\nIt Told more.\n")
+    rate, lines = too_frequent([page])["told, tells, telling"]
+    assert (rate, lines[0]) == (1.0, "page.md:1999: It tells more.")
