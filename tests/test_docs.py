@@ -18,7 +18,6 @@ from typing import Any, Literal, Optional
 import numpy as np
 import pytest
 import typer
-from click import NoSuchOption
 from PIL import Image
 
 from lerobot_memobench.cli import memobench
@@ -368,6 +367,10 @@ def check_memobench(line: list[str]) -> None:
         command.make_context(" ".join(path), list(line))
 
 
+USAGE_ERROR: Any = typer.BadParameter.__base__
+"""Error of invalid options; typer does not export it."""
+
+
 def check_python(line: list[str]) -> None:
     """Check that the script or module exists."""
     if line[0] == "-m":
@@ -391,7 +394,7 @@ def check_python(line: list[str]) -> None:
     ],
 )
 def test_invalid_commands_are_detected(line: str) -> None:
-    with pytest.raises((MemobenchError, AssertionError, KeyError, NoSuchOption)):
+    with pytest.raises((MemobenchError, AssertionError, KeyError, USAGE_ERROR)):
         check(shlex.split(line))
 
 
