@@ -39,12 +39,10 @@ PER_1000_LINES = {
 """Words -> pattern and maximum number per 1,000 lines."""
 TEXTS = {
     "package": ("src/lerobot_memobench",),
-    "guides": ("docs/guides",),
-    "benchmark": ("docs/benchmark",),
-    "pages": ("README.md", "docs/start", "docs/develop", "docs/develop.md"),
+    "pages": ("README.md", "docs/start", "docs/guides", "docs/benchmark", "docs/develop", "docs/develop.md"),
     "scripts": ("scripts", "benchmarks"),
 }
-"""Name -> files and folders whose lines are counted together."""
+"""Name -> files and folders, counted together."""
 
 
 def words(name: str) -> set[str]:
