@@ -42,18 +42,19 @@ def imported(tree: ast.AST) -> Iterator[tuple[str, str | None]]:
             yield from ((node.module, alias.name) for alias in node.names)
 
 
-def read_imports() -> dict[str, set[str]]:
-    """Return the imports among the package's modules."""
-    known = modules()
+def imports_among(trees: Mapping[str, ast.AST]) -> dict[str, set[str]]:
+    """Return the imports among modules, given as name -> syntax tree."""
     found: dict[str, set[str]] = {}
-    for module, path in known.items():
-        targets = found.setdefault(module, set())
-        for source, name in imported(ast.parse(path.read_text())):
-            submodule = f"{source}.{name}"
-            target = submodule if submodule in known else source
-            if target in known and target != module:
-                targets.add(target)
+    for module, tree in trees.items():
+        pairs = [(f"{source}.{name}", source) for source, name in imported(tree)]
+        targets = {submodule if submodule in trees else source for submodule, source in pairs}
+        found[module] = targets & trees.keys() - {module}
     return found
+
+
+def read_trees() -> dict[str, ast.Module]:
+    """Return the syntax tree of each module."""
+    return {name: ast.parse(path.read_text()) for name, path in modules().items()}
 
 
 def circle(imports: Imports) -> list[str]:
@@ -149,7 +150,7 @@ def draw(picture: Path = PICTURE) -> None:
     matplotlib.rcParams.update({"svg.hashsalt": "architecture", "svg.fonttype": "none", "font.family": "sans-serif"})
     from matplotlib import pyplot as plt
 
-    found = arrows(read_imports())
+    found = arrows(imports_among(read_trees()))
     centres = {}
     for k, packages in enumerate(layers(found)):
         left = -(len(packages) - 1) / 2 * (WIDTH + GAP_X) + (SHIFT if k % 2 else -SHIFT)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFont
 
+from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.tasks.task import Task
 from tests.support.scripts import load_script
 
 gallery = load_script("gallery")
-
-STOVE = "turn_on_the_stove_and_turn_it_off"
-BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
 
 
 def test_grid_shows_every_picture() -> None:
@@ -33,15 +33,23 @@ def test_long_labels_are_wrapped() -> None:
     assert max(font.getlength(line) for line in lines) <= 60
 
 
-def test_tasks_are_drawn_at_the_places_of_the_layout() -> None:
+def test_tasks_are_drawn_at_the_places_of_the_layout(monkeypatch: pytest.MonkeyPatch) -> None:
     """`docs_reference` crops the pictures of task cards at these places."""
-    single, sheet = (np.asarray(gallery.draw_tasks(names, size=64)) for names in ([STOVE], [STOVE, BOWLS]))
-    places = gallery.task_places([STOVE, BOWLS], size=64)
-    scenes = {name: sheet[y : y + 64, x : x + 64].astype(int) for name, (x, y) in places.items()}
-    x, y = gallery.task_places([STOVE], size=64)[STOVE]
-    np.testing.assert_array_equal(scenes[STOVE], single[y : y + 64, x : x + 64])
-    assert np.abs(scenes[STOVE] - scenes[BOWLS]).mean() > 5
-    assert max(scene[edge].mean() for scene in scenes.values() for edge in (0, -1)) < 230, "scene, not background"
+    names = [*task_names()[:7], *task_names()[-2:]]
+
+    class FakeSimulation:
+        def __init__(self, task: Task, render: RenderSettings) -> None:
+            self.image = np.full((render.height, render.width, 3), 10 * names.index(task.name), np.uint8)
+
+        def reset(self, seed: int) -> None: ...
+
+        def render(self, camera: str) -> np.ndarray:
+            return self.image
+
+    monkeypatch.setattr(gallery, "Simulation", FakeSimulation)
+    sheet = np.asarray(gallery.draw_tasks(names, size=64))
+    for name, (x, y) in gallery.task_places(names, size=64).items():
+        assert (sheet[y : y + 64, x : x + 64] == 10 * names.index(name)).all(), name
 
 
 def test_figures_are_reduced_to_the_maximum_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
