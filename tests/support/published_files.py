@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.hdf5.reading import IMAGE_NAMES
+from lerobot_memobench.datasets.hdf5 import IMAGE_NAMES
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.formula import to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, Task
