@@ -110,7 +110,7 @@ def play(task: Task, episode: int, server: Websocket, replan: int) -> Record:
 
 
 def question(env: Any, task: Task, observed: dict[str, NDArray[np.float64]], step: int) -> dict[str, Any]:
-    """Return what the server is asked: the authors' keys without pictures, the step, and the state of the simulator."""
+    """Return the request to the server: the authors' keys without images, the step, and the simulator's state."""
     from robosuite.utils.transform_utils import quat2axisangle
 
     turned = quat2axisangle(observed["robot0_eef_quat"])
@@ -180,7 +180,7 @@ def compare(here: Path, there: Path) -> None:
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the requested command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     acting = commands.add_parser("stock", help="let a policy act in stock LIBERO")

@@ -29,7 +29,7 @@ FIRST_SEED = 21
 STEPS = 25
 """Control steps of one random action before a scene is compared."""
 FAR_OFF = 16
-"""Of 255: a pixel of which a channel is further off counts as differing."""
+"""Difference of a channel, of 255, above which a pixel counts as differing."""
 SHOWN, HIDDEN = 5, 4
 """Groups of sites."""
 WORLDS_TASKS = (
@@ -40,7 +40,7 @@ WORLDS_TASKS = (
 
 
 def tasks() -> list[Task]:
-    """Return the tasks of which all classes are LIBERO's own, in its world."""
+    """Return the tasks whose classes are all LIBERO's own, in its world."""
     return [task.in_world("libero") for name in task_names() if (task := get_task(name)).memory_type != "spatial"]
 
 
@@ -124,7 +124,7 @@ def _line(name: str, seed: int | str, row: list[float]) -> str:
 
 
 def worlds(path: Path) -> None:
-    """Draw scenes of both worlds, a row for each, agentview beside wrist, as a picture of at most 150 kB."""
+    """Draw scenes of both worlds, one row each with agentview and wrist, as an image of at most 150 kB."""
     rows = []
     for world in ("memobench", "libero"):
         pictures = []

@@ -84,7 +84,7 @@ def measure(parts: Callable[[str], Parts], name: str) -> None:
 
 
 def clock(work: Callable[..., Any], *given: Any) -> tuple[float, Any]:
-    """Return the CPU time of a call, s, and what it returns."""
+    """Return the CPU time of a call, s, and its result."""
     start = time.process_time()
     found = work(*given)
     return time.process_time() - start, found

@@ -1,6 +1,6 @@
-"""Write the strict suite's task folders: ``python scripts/strict_suite``; ``--check`` says which are not as written.
+"""Write the strict suite's task folders: ``python scripts/strict_suite``; ``--check`` lists differing files.
 
-The folders are the data; this is how thirty tasks' formulas and texts are kept alike.
+The folders are the data; this script keeps formulas and texts of thirty tasks consistent.
 """
 
 from __future__ import annotations

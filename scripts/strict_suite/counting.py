@@ -1,4 +1,4 @@
-"""Counting: how often is in the instruction, and nothing in sight tells how often it has been done."""
+"""Counting: the instruction contains the number of repetitions, and images do not show how many were done."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from words import AS_BEGUN, CABINET, DRAWERS, HOME, PLACES, TIMES, Texts, left_a
 from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Never, Round, When
 
 REST = 40
-"""Control steps of rest by which a policy says that it is done."""
+"""Control steps of rest by which a policy signals the end."""
 
 
 @dataclass(frozen=True)
@@ -18,8 +18,9 @@ class Counted:
     """An event to be counted.
 
     Attributes:
-        asked: what the instruction asks for. did: what a memory says of it.
-        begun, ended: atoms between which the event is under way, and how a memory tells the first (coarse,
+        asked: wording in the instruction.
+        did: wording in a memory.
+        begun, ended: atoms between which the event is in progress, and wording of the first in a memory (coarse,
             intermediate, fine).
     """
 
@@ -126,7 +127,7 @@ def _setting(event: Counted, number: int) -> Setting:
 
 
 def _checkpoints(event: Counted, number: int) -> list[tuple[Formula, Texts]]:
-    """Return three moments, whatever the number: the labels of a task's checkpoints are those of all its variants."""
+    """Return three moments for every number, because all variants of a task have the same labels of checkpoints."""
     underway = [(_begun(event, k), _opened(event, k, number)) for k in range(1, number + 1)]
     complete = [(_done(event, k), _counted(event, k, number)) for k in range(1, number + 1)]
     if number == 1:

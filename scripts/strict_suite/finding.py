@@ -1,6 +1,6 @@
 """Finding: the video shows in which drawer an object is hidden; closed drawers do not show it.
 
-A wrong drawer that is pulled beyond what is closed loses the episode: a little further its content can be seen.
+Opening a wrong drawer beyond its closed range fails the episode, because its content would be visible.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SPOT = Region("table_region", TABLE, ((-0.09, 0.10, 0.05, 0.24), (-0.40, -0.60, 
 
 @dataclass(frozen=True)
 class Thing:
-    """What is hidden: its instance and what it is called."""
+    """A hidden object: its instance and its name in texts."""
 
     instance: str
     words: str

@@ -16,12 +16,12 @@ from lerobot_memobench.tasks.formula import Formula, to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, STRICT, Prompt, Task
 
 LONGEST_ROW = 110
-"""Columns up to which a JSON value stands on one line."""
+"""Largest width of a JSON value on one line, columns."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One thing that a seed can draw: instruction, goal, and what a memory should say (K checkpoints)."""
+    """A setting that a seed can draw: instruction, goal, and texts of a memory (K checkpoints)."""
 
     language: str
     goal: Formula
@@ -33,7 +33,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class StrictTask:
-    """A strict task: the settings that a seed draws from, the first of which stands in the BDDL file.
+    """A strict task: the settings that a seed draws from; the BDDL file has the first one.
 
     Attributes:
         operations: S, U or C per checkpoint, the same at every level of language.
@@ -57,7 +57,7 @@ class StrictTask:
 
     @property
     def folder(self) -> Path:
-        """Where it stands in the catalogue."""
+        """Folder in the catalogue."""
         return CATALOGUE_DIR / STRICT / self.scene.memory_type / self.name
 
 
@@ -72,7 +72,7 @@ def files(task: StrictTask) -> dict[str, str]:
 
 
 def write(task: StrictTask) -> None:
-    """Write a strict task's folder, whatever is there."""
+    """Write a strict task's folder, replacing existing files."""
     task.folder.mkdir(parents=True, exist_ok=True)
     for name, text in files(task).items():
         write_file(task.folder / name, text)

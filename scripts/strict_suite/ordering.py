@@ -1,4 +1,4 @@
-"""Order: each event exactly once and as the instruction orders them; what comes out of order cannot be mended."""
+"""Order: each event exactly once and in the order of the instruction; a wrong order cannot be corrected."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Never, 
 BOWL, PAN, WHITE = "akita_black_bowl_1", "chefmate_8_frypan_1", "white_bowl_1"
 STOVE, MICROWAVE = "flat_stove_1", "microwave_1"
 ASIDE = Region("akita_black_bowl_init_region", "kitchen_table", ((0.175, 0.125, 0.225, 0.175),))
-"""Where the bowl stands while all drawers are checked: where it stands as published, the hand at the lowest handle
-pushes it, and a moved bowl would tell which drawer has been open."""
+"""Place of the bowl while all drawers are checked. At the published place the hand at the lowest handle pushes it, and
+a moved bowl would reveal which drawer was open."""
 
 Event = tuple[Atom, Atom]
-"""Atoms between which something is under way."""
+"""Atoms between which the event is in progress."""
 
 
 def strict_tasks() -> list[StrictTask]:

@@ -1,4 +1,4 @@
-"""Referent and procedure: what the video showed, drawn by seed; a wrong thing or a wrong order cannot be mended."""
+"""Referent and procedure: the seed draws the content of the video; a wrong object or order cannot be corrected."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _setting(one: Task, shown: Sequence[Task], language: str) -> Setting:
 
 
 def _steps(task: Task) -> list[Atom]:
-    """Return what the published checkpoints ask for, in order: one atom each."""
+    """Return the atoms of the published checkpoints, in order: one each."""
     return [atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)]
 
 

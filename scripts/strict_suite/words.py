@@ -7,7 +7,7 @@ from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Or, Rou
 
 HOME = Atom("handhome", ())
 AS_BEGUN = Atom("asbegun", ())
-"""The scene as it began, to the bit: nothing in it can be read as a note on the past."""
+"""The scene equals its start to the bit, so it cannot contain a note on the past."""
 CABINET = "wooden_cabinet_1"
 DRAWERS = ("top", "middle", "bottom")
 PLACES = tuple(Region(f"{drawer}_region", CABINET) for drawer in DRAWERS)
@@ -21,7 +21,7 @@ def region(drawer: str) -> str:
 
 
 def left_ajar(*joints: str) -> Formula:
-    """The hand is home and a door, drawer or knob stands in between: it could be read as a note."""
+    """The hand is home and a door, drawer or knob is ajar, which could be a note on the past."""
     ajar = tuple(Atom("ajar", (joint,)) for joint in joints)
     return And((HOME, Or(ajar) if len(ajar) > 1 else ajar[0]))
 
