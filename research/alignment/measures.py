@@ -19,8 +19,8 @@ from lerobot.policies import make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
 
+from lerobot_memobench.datasets.frames import FrameLookup
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
-from lerobot_memobench.datasets.lookup import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import SemanticAlignment, masked_mean
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy

@@ -15,8 +15,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from PIL import Image, ImageColor
 from safetensors.torch import load_file
 
-from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace, EpisodeRecord
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig

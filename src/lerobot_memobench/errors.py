@@ -1,4 +1,4 @@
-"""The one error that users see, what led to an error, and the help a message gives."""
+"""The error class of this package, chains of errors, and hints for messages."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Iterable, Iterator, Sequence
 
 
 class MemobenchError(ValueError):
-    """Bad input, told in one sentence: what was given, what was expected, what to do.
+    """Invalid input. The message names the value, the expected one and the fix.
 
-    The command line prints the message without a traceback and exits with status 2.
+    Commands print the message without a traceback and exit with status 2.
     """
 
 
 def chain(error: BaseException) -> Iterator[BaseException]:
-    """Yield an error and the errors that led to it, outermost first."""
+    """Yield an error and its causes, outermost first."""
     seen: set[int] = set()  # an error may be its own cause's cause
     current: BaseException | None = error
     while current is not None and id(current) not in seen:
@@ -25,27 +25,29 @@ def chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def unsupported_system() -> str:
-    """Return one sentence where nothing can be simulated, "" elsewhere."""
+    """Return a message on systems without support for simulation, "" on others."""
     if sys.platform not in ("win32", "cygwin"):
         return ""
-    return "Windows locks no folders, which every run does: use WSL2; docs/start/install.md lists what works without"
+    return "Windows cannot lock folders, as every run does: use WSL2; docs/start/install.md lists supported commands"
 
 
 def check_choice(name: str, value: object, known: Sequence[str]) -> None:
-    """Refuse a setting whose value is none of the known ones.
+    """Check that the value of a setting is known.
 
     Args:
-        name: of the setting, as it was given.
+        name: name of the setting.
+        value: its value.
+        known: allowed values.
 
     Raises:
-        MemobenchError: what it is, and the nearest known values.
+        MemobenchError: the value is unknown; the message names the nearest known values.
     """
     if value not in known:
         raise MemobenchError(f"{name} is {value!r}; {nearest(str(value), known)}")
 
 
 def nearest(given: str, known: Iterable[str], count: int = 3) -> str:
-    """Return a hint that names the known words nearest to ``given``, or all of them when few."""
+    """Return a hint that names the known words nearest to ``given``, or all of them if there are few."""
     words = sorted(known)
     if not words:
         return "there is none"

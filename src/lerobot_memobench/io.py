@@ -1,7 +1,4 @@
-"""Write files whole, keep names out of data inside their folder, read JSON into an expected shape.
-
-No file is ever half written. An error of the disk, full or read-only, becomes one sentence.
-"""
+"""Write files atomically, check file names from data, report disk errors, and read JSON of an expected schema."""
 
 from __future__ import annotations
 
@@ -37,20 +34,21 @@ CLOSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, e
 _IN_WORDS = re.compile(
     "|".join(os.strerror(number) for number in (*FULL, errno.EACCES, errno.EROFS, errno.EIO)), re.IGNORECASE
 )
-"""Libraries in C put the system's message into errors of their own."""
+"""Libraries in C include the system's message in their own errors."""
 LONGEST_NAME = 255
-"""Bytes of a file's name that common file systems take."""
+"""Longest file name of common file systems, bytes."""
 
 
 @contextlib.contextmanager
 def draft_of(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a temporary path in the folder of ``path``; it takes that name once the block has ended without an error.
+    """Yield a temporary path next to ``path``, which is renamed to ``path`` if the block ends without an error.
 
-    Readers see the earlier file or the whole new one, and processes that write the same file do not meet. The draft
-    keeps the ending of ``path``, by which libraries choose a format.
+    Readers see the earlier file or the complete new one, also if several processes write it. The temporary name keeps
+    the suffix of ``path``, by which libraries choose a format.
 
     Args:
-        durable: wait until the disk holds the content, so that a crash of the machine leaves no empty file either.
+        path: final path.
+        durable: whether to wait until the disk holds the content, so that a crash of the machine leaves no empty file.
     """
     draft = path.with_name(f".{os.getpid()}-{secrets.token_hex(4)}{DRAFT}{path.name}")
     try:
@@ -65,26 +63,27 @@ def draft_of(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
 
 def write_file(path: Path, content: str | bytes, *, durable: bool = False) -> Path:
-    """Write ``content`` (text as UTF-8) to ``path``, whole or not at all; return ``path``. See `draft_of`."""
+    """Write ``content`` (text as UTF-8) to ``path`` atomically, and return ``path``. See `draft_of`."""
     with draft_of(path, durable=durable) as draft:
         draft.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
 
 
 def remove_drafts(folder: Path) -> None:
-    """Remove the drafts of killed processes from a folder to which no other process writes."""
+    """Remove the temporary files of killed processes from a folder to which no other process writes."""
     for draft in folder.glob(f".*-*{DRAFT}*"):
         draft.unlink(missing_ok=True)
 
 
 def file_name(text: object, what: str) -> str:
-    """Return a name that came out of data, if it names a file in a folder and nothing anywhere else.
+    """Return a name read from data after checking that it names a file in one folder.
 
     Args:
-        text: the name as it was read. what: its role, for the message: ``the task's name in demo.hdf5``.
+        text: the name.
+        what: its role, for the message: ``the task's name in demo.hdf5``.
 
     Raises:
-        MemobenchError: it is no text, is empty, begins with a dot, or holds a separator or a control character.
+        MemobenchError: it is no text, is empty or too long, begins with a dot, or has a separator or control character.
     """
     if (
         not isinstance(text, str)
@@ -95,21 +94,21 @@ def file_name(text: object, what: str) -> str:
         or len(text.encode()) > LONGEST_NAME
     ):
         raise MemobenchError(
-            f"{what} is {str(text)[:80]!r}, which names no file; expected letters, digits, spaces and _-,.+ alone"
+            f"{what} is {str(text)[:80]!r}, which names no file; expected letters, digits, spaces and _-,.+ only"
         )
     return text
 
 
 def cache_folder() -> Path:
-    """Return the folder for files that this package can make again."""
+    """Return the folder of caches."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_memobench"
 
 
 def as_path(word: str) -> str:
-    """Return a word of a command line in which every library recognises a path.
+    """Return a word of a command line with a path that every library recognises.
 
-    ``~/`` at the beginning is expanded: not every shell does that behind ``key=``, and none in quotes.
-    An existing path with a colon becomes absolute: Arrow and FFmpeg read ``run: 2`` as an address.
+    A leading ``~/`` is expanded, which shells do not do in quotes or, some of them, after ``key=``. An existing path
+    with a colon becomes absolute, because Arrow and FFmpeg read ``run: 2`` as an address.
     """
     key, equals, value = word.partition("=")
     path = value if equals else word
@@ -121,7 +120,7 @@ def as_path(word: str) -> str:
 
 
 def file_hash(path: Path) -> str:
-    """Return the sha256 (hex) of a file; one that has not changed is read once per process."""
+    """Return the sha256 (hex) of a file; cached per process until the file changes."""
     found = os.stat(path)
     return _hash_of(str(path), found.st_ino, found.st_size, found.st_mtime_ns)
 
@@ -133,7 +132,7 @@ def _hash_of(path: str, *version: int) -> str:
 
 
 def disk_refusal(error: BaseException) -> str | None:
-    """Return the system's message where an error came from writing to a disk, else None."""
+    """Return the system's message if an error is caused by the disk, else None."""
     for current in chain(error):
         number = getattr(current, "errno", None)
         if number in (*FULL, *CLOSED):
@@ -146,19 +145,20 @@ def disk_refusal(error: BaseException) -> str | None:
 
 @contextlib.contextmanager
 def telling_of_the_disk(out: Path, kept: str = "") -> Iterator[None]:
-    """Turn an error of the disk in writing below ``out`` into one sentence.
+    """Turn a disk error in writing below ``out`` into a `MemobenchError`.
 
     Args:
-        out: the folder that is written. kept: ends the sentence: finished work, and how to go on.
+        out: folder that is written.
+        kept: end of the message: finished work, and how to continue.
 
     Raises:
-        MemobenchError: the disk is full, or takes nothing.
+        MemobenchError: the disk is full or not writable.
     """
     try:
         yield
     except MemobenchError:
         raise
-    except Exception as error:  # OSError, and whatever libraries in C make of it
+    except Exception as error:  # OSError, or an error of a library in C
         refusal = disk_refusal(error)
         named = getattr(error, "filename", None)
         if refusal is None or (named is not None and not _is_of(Path(os.fsdecode(named)), out)):
@@ -170,7 +170,7 @@ def telling_of_the_disk(out: Path, kept: str = "") -> Iterator[None]:
 
 
 def _is_of(path: Path, out: Path) -> bool:
-    """Whether a path is what is written, or on the way to it; not what is read."""
+    """Return whether a path is ``out``, below it or above it; other paths are read."""
     path, out = path.absolute(), out.absolute()
     return path.is_relative_to(out) or out.is_relative_to(path)
 
@@ -185,7 +185,7 @@ def in_words(size: float) -> str:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return how much may still be written to a folder, or to what it will lie in."""
+    """Return the free bytes of the disk of a folder, which need not exist."""
     folder = folder.absolute()
     while not folder.exists():
         folder = folder.parent
@@ -194,7 +194,7 @@ def free_bytes(folder: Path) -> int:
 
 def _to_disk(path: Path) -> None:
     if sys.platform == "win32":
-        return  # it opens no folders, and flushes no file that is open for reading
+        return  # it cannot open folders, or flush files that are open for reading
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -202,14 +202,14 @@ def _to_disk(path: Path) -> None:
         os.close(descriptor)
 
 
-# -- reading JSON: whatever a file holds ends in a value of the expected shape, or in a sentence -----------------------
+# --- JSON of an expected schema ---
 #
-# The schema of a file is a type: a pydantic model, a `TypedDict`, a list of them. No type is turned into another: "5"
-# is no number, true is no 1. Keys that a type does not name pass, since a later version may write more. pydantic is
-# imported when the first file is read, which costs as much as the rest of a short command.
+# The schema is a type: a pydantic model, a `TypedDict`, or a list of them. Values are not converted: "5" is no number,
+# and true is not 1. Unknown keys are allowed, because later versions may add some. pydantic is imported when the first
+# file is read, because the import takes as long as a short command.
 
 LARGEST = 2**53
-"""Beyond it not every integer is a double, so neither a browser nor an array of numbers would hold it."""
+"""Larger integers are not all representable as a double, so browsers and arrays may change them."""
 
 Whole = Annotated[int, Ge(-LARGEST), Le(LARGEST)]
 Count = Annotated[int, Ge(0), Le(LARGEST)]
@@ -217,10 +217,10 @@ Name = Annotated[str, MinLen(1), MaxLen(255)]
 Number = Annotated[float, Ge(-LARGEST), Le(LARGEST)]
 
 LONGEST = 80
-"""Characters of what was found that a message repeats."""
+"""Length of quoted values in messages, characters."""
 
 LONGEST_REASON = 200
-"""Characters of a library's message that a message of ours repeats."""
+"""Length of quoted messages of libraries, characters."""
 
 EXPECTED = {
     "string_type": "text",
@@ -237,36 +237,37 @@ EXPECTED = {
     "too_short": "{min_length} entries at least",
     "too_long": "{max_length} entries at most",
 }
-"""pydantic's name of an error -> what was expected."""
+"""pydantic's name of an error -> expected value."""
 
 
 class Malformed(MemobenchError):
-    """Content that is not of the expected shape; the message is the reason alone."""
+    """Content that does not match a schema; the message is the reason without the file."""
 
 
 PACKED = ".gz"
-"""What ``gzip`` puts behind the name of a file that it compresses."""
+"""Suffix of a file compressed by ``gzip``."""
 POINTER, LARGEST_POINTER = b"version https://git-lfs.github.com/spec/v1", 1024
-"""The first line of a Git LFS pointer, and the bytes that one has at most."""
+"""First line of a Git LFS pointer, and its largest size, bytes."""
 LARGEST_UNPACKED = 256 << 20
-"""Bytes that a compressed file may become: some hundred thousand episodes."""
+"""Largest unpacked size of a compressed file, bytes: about a hundred thousand episodes."""
 
 
 def is_there(path: Path) -> bool:
-    """Return whether there is a file, or the same file compressed by ``gzip``."""
+    """Return whether a file exists, or the same file compressed by ``gzip``."""
     return path.is_file() or packed(path).is_file()
 
 
 def packed(path: Path) -> Path:
-    """Return where ``gzip`` puts a file."""
+    """Return the path of a file compressed by ``gzip``."""
     return path.with_name(path.name + PACKED)
 
 
 def check_fetched(path: Path) -> None:
-    """Refuse a file, or a folder with a file, that is a Git LFS pointer: a clone without git-lfs has no more of it.
+    """Refuse a Git LFS pointer, which a clone without git-lfs has instead of the content, or a folder with one.
 
     Raises:
-        MemobenchError: naming the first such file. OSError: it cannot be read.
+        MemobenchError: naming the first pointer.
+        OSError: a file cannot be read.
     """
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if not file.is_file() or file.stat().st_size > LARGEST_POINTER:
@@ -274,15 +275,16 @@ def check_fetched(path: Path) -> None:
         with file.open("rb") as content:
             if content.read(len(POINTER)) == POINTER:
                 raise MemobenchError(
-                    f"{file} is a Git LFS pointer in the place of its content; run `git lfs pull` in its repository"
+                    f"{file} is a Git LFS pointer without its content; run `git lfs pull` in its repository"
                 )
 
 
 def file_bytes(path: Path) -> bytes:
-    """Return the content of a file, or of the same file compressed by ``gzip`` where only that exists.
+    """Return the content of a file, or of the same file compressed by ``gzip`` if only that exists.
 
     Raises:
-        FileNotFoundError: there is neither. OSError: it cannot be read, is damaged, or becomes too large.
+        FileNotFoundError: neither exists.
+        OSError: it cannot be read, is damaged, or is too large unpacked.
         MemobenchError: it is a Git LFS pointer.
     """
     if path.suffix != PACKED and not path.exists() and packed(path).exists():
@@ -304,12 +306,14 @@ def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any
     """Return the content of a JSON file, which may be compressed (`file_bytes`).
 
     Args:
-        schema: the type that it must have. advice: ends the message with the fix.
-        nan: whether NaN and Infinity are numbers, as of a training that diverged.
+        path: the file.
+        schema: its type.
+        advice: fix, which ends the message.
+        nan: whether NaN and Infinity are allowed, as in logs of a diverged training.
 
     Raises:
-        FileNotFoundError: there is none.
-        MemobenchError: it cannot be read or is not of the schema, named with the place in it.
+        FileNotFoundError: the file does not exist.
+        MemobenchError: it cannot be read or does not match the schema; the message names the place.
     """
     try:
         return checked(parsed(file_bytes(path), nan=nan), schema)
@@ -322,10 +326,10 @@ def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any
 
 
 def parsed(content: bytes | str, *, nan: bool = False) -> Any:
-    """Return the value of a JSON text; NaN (unless ``nan``), lone surrogates and bad UTF-8 are no JSON.
+    """Return the value of a JSON text.
 
     Raises:
-        Malformed: it is no JSON, or nested deeper than any file of ours.
+        Malformed: it is no JSON, nested too deeply, or has NaN (unless ``nan``), lone surrogates or invalid UTF-8.
     """
     from pydantic_core import from_json
 
@@ -337,10 +341,10 @@ def parsed(content: bytes | str, *, nan: bool = False) -> Any:
 
 
 def checked(value: Any, schema: Any) -> Any:
-    """Return ``value`` if it is of the type ``schema``: as the model where the schema is one, else itself.
+    """Return a value that matches ``schema``: an instance if the schema is a pydantic model, else the value itself.
 
     Raises:
-        Malformed: with the first place that is not: its value, and the value that was expected.
+        Malformed: naming the first place that differs, its value and the expected one.
     """
     from pydantic import BaseModel, ValidationError
 
@@ -355,12 +359,12 @@ def checked(value: Any, schema: Any) -> Any:
 def refusing(as_error: Callable[[str], MemobenchError], of: Path | None = None) -> Iterator[None]:
     """Turn every error of a block that reads possibly damaged files into a `MemobenchError`.
 
-    LeRobot, pyarrow, PyAV, h5py and NumPy answer damaged files with errors of every type. To be kept around reading
-    alone: an error in writing, such as a full disk, is not the file's.
+    LeRobot, pyarrow, PyAV, h5py and NumPy raise errors of many types for damaged files. The block must not write,
+    because an error in writing, such as a full disk, is not caused by the file.
 
     Args:
-        as_error: makes the error from a library's message, shortened to one line. It adds the file and the fix.
-        of: the file or folder that is read; a Git LFS pointer in its place is named before damage is (`check_fetched`).
+        as_error: returns the error for a library's message, shortened to one line; it adds file and fix.
+        of: file or folder that is read; if it is a Git LFS pointer, the message names that instead (`check_fetched`).
     """
     try:
         yield
@@ -381,7 +385,7 @@ def _adapter(schema: Any) -> TypeAdapter[Any]:
 
 
 def first_fault(errors: Iterable[ErrorDetails], value: Any) -> str:
-    """Return the first error in words; those of one place are the alternatives of a union."""
+    """Return a message for the first error; errors of one place are alternatives of a union."""
     first, *others = [(*_place(error["loc"], value), error) for error in errors]
     place, found, error = first
     if error["type"] == "missing":
@@ -390,14 +394,14 @@ def first_fault(errors: Iterable[ErrorDetails], value: Any) -> str:
         )
         return f"found no {', '.join(missing)}" + (f" in {place}" if place else "")
     start = f"found {f'{place} = ' if place else ''}{short(found)}"
-    if error["type"] in ("value_error", "assertion_error"):  # a check of ours, in its own words
+    if error["type"] in ("value_error", "assertion_error"):  # an error of a validator
         return f"{start}: {error['ctx']['error']}"
     alternatives = dict.fromkeys(_expected(e) for p, _, e in (first, *others) if p == place)
     return f"{start}, expected {' or '.join(alternatives)}"
 
 
 def _place(location: Iterable[int | str], value: Any) -> tuple[str, Any]:
-    """Return the path to what was found, and that. pydantic also names members of unions, and absent keys."""
+    """Return path and value of the deepest existing part of a location, which may include names of union members."""
     text = ""
     for part in location:
         if isinstance(value, Mapping) and part in value:
@@ -417,15 +421,15 @@ def _expected(error: ErrorDetails) -> str:
 
 
 def short(value: Any) -> str:
-    """Return the representation of a value, shortened to fit into a sentence."""
+    """Return the representation of a value, shortened for messages."""
     return cut(repr(value))
 
 
 def cut(text: str, longest: int = LONGEST) -> str:
-    """Return a text, shortened to fit into a sentence."""
+    """Return a text, shortened for messages."""
     return text if len(text) <= longest else text[: longest - 1] + "…"
 
 
 def count_of(number: int, word: str) -> str:
-    """Return a number of things in words, such as ``1 task`` or ``1,500 rollouts``."""
+    """Return a number with its noun, such as ``1 task`` or ``1,500 rollouts``."""
     return f"{number:,} {word}" + ("" if number == 1 else "s")

@@ -187,7 +187,7 @@ def test_generate_tells_what_became_of_every_seed(
     words = ["generate", "--tasks", TASK, "--episodes", "2", "--out", str(out), "--no-images", "--referent", "random"]
     words += ["--slurm", "--partition=cpu --time=8:00:00"]
     assert main(words) == (0 if solved == 2 else 1)
-    assert callable(asked.pop("tell"))
+    assert callable(asked.pop("notify"))
     assert asked == {
         "tasks": [TASK],
         "episodes": 2,

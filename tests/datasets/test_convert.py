@@ -1,13 +1,14 @@
-"""Conversion of files in the published layout, by this package and by hand; the simulator gives what they lack."""
+"""Conversion of files in the published layout, from a file, a folder and an archive."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
-import re
 import shutil
 import tempfile
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,44 +18,51 @@ import pytest
 
 from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
+from lerobot_memobench.datasets import generation
 from lerobot_memobench.datasets.convert import convert
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.hdf5.reading import Extras, PublishedFile
-from lerobot_memobench.datasets.hdf5.restore import restore, task_of
+from lerobot_memobench.datasets.demonstration import digest, labels
+from lerobot_memobench.datasets.hdf5 import Extras, PublishedFile, Unusable
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.recording import record_demonstration
-from lerobot_memobench.datasets.replay import replay
+from lerobot_memobench.datasets.restore import restore, task_of, truth_from_intervals
 from lerobot_memobench.datasets.staging import EpisodeStage
-from lerobot_memobench.datasets.validate import validate
+from lerobot_memobench.datasets.validate import replay
+from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
+from tests.datasets.conftest import BUTTER, STOVE
+from tests.support.kills import hashes, killed_at
 from tests.support.published_files import model_file, write_foreign, write_published
-from tests.support.short_demonstrations import beginning, drawn_steps, with_pictures
+from tests.support.short_demonstrations import beginning, drawn_steps, record_demonstration, with_pictures
 
-STOVE = "turn_on_the_stove_and_turn_it_off"
-BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
-SIZE = 32
+POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0b' * 32}\nsize 48213\n"
 
 
 @pytest.fixture(scope="module")
-def stove() -> Demonstration:
-    return record_demonstration(get_task(STOVE), 10_000, image_size=SIZE)
-
-
-@pytest.fixture(scope="module")
-def short() -> Demonstration:
+def short():
     """A few steps, some of them of a prompt."""
-    return with_pictures(drawn_steps(BUTTER, 10_000, 12, 4), SIZE)
+    return with_pictures(drawn_steps(BUTTER, 10_000, 12, 4), 32)
 
 
 @pytest.fixture(scope="module")
-def written(stove, short, tmp_path_factory) -> Path:
-    """Both with the attributes of earlier versions."""
+def begun(stove):
+    return with_pictures(beginning(stove, 20), 32)
+
+
+@pytest.fixture(scope="module")
+def written(begun, short, tmp_path_factory) -> Path:
+    """Two files of two short demonstrations, with the attributes of earlier versions."""
     folder = tmp_path_factory.mktemp("published")
-    for demo in (stove, short):
+    for demo in (begun, short):
         write_published(folder / f"{demo.task.name}_demo.hdf5", [demo] * 2)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def converted(written, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("converted") / "ds"
+    assert convert(written, folder, repo_id="local/test").exit_status == 0
     return folder
 
 
@@ -63,141 +71,208 @@ def source(written, tmp_path) -> Path:
     return Path(shutil.copytree(written, tmp_path / "source"))
 
 
-def test_our_own_files_come_back_as_they_were(written, stove, short, tmp_path):
-    summary = convert(written, tmp_path / "ds", repo_id="local/test")
-    assert summary.exit_status == 0
-    assert (summary.episodes, summary.problems) == (4, ())
-    direct = write_dataset([short, short, stove, stove], tmp_path / "direct", repo_id="local/test")
+# --- reading a file ---
+
+ROWS = ["0010011", "0001111"]
+
+
+@pytest.fixture
+def path(make_demo, tmp_path):
+    demos = [make_demo(ROWS, seed=10_000 + k, size=32) for k in range(2)]
+    return write_published(tmp_path / "hdf5" / "synthetic_task_demo.hdf5", demos, scene="<mujoco/>")
+
+
+def test_reading_a_group(path, make_demo):
+    demo = make_demo(ROWS, seed=10_001, size=32)
+    with h5py.File(path, "a") as file:
+        for copy in ("demo_10", "demo_9"):
+            file.copy("data/demo_0", f"data/{copy}")
+        file["data"].create_group("mask")
+    with PublishedFile(path) as file:
+        assert (file.groups(), file.announced()) == (["demo_0", "demo_1", "demo_9", "demo_10", "mask"], 2)
+        with pytest.raises(Unusable, match="demo_<number>"):
+            file.read("mask")
+        read = file.read("demo_1")
+        np.testing.assert_array_equal(read.states, demo.states)
+        np.testing.assert_array_equal(read.actions, demo.actions)
+        assert (read.image_size, read.model_file) == ((32, 32), "<mujoco/>")
+        assert read.metadata["key_frame"] == labels(demo).key_frames.tolist() == [2, 3]
+        satisfied = truth_from_intervals(read.extras.satisfied_intervals, len(demo))
+        np.testing.assert_array_equal(satisfied, demo.satisfied)
+        frames = list(file.images("demo_1"))
+        for camera in demo.images:
+            np.testing.assert_array_equal([frame[camera] for frame in frames], demo.images[camera])
+        flipped = next(file.images("demo_1", upside_down=True))
+        np.testing.assert_array_equal(flipped["image"][::-1], demo.images["image"][0])
+
+
+def delete(name):
+    return lambda group: group.__delitem__(name)
+
+
+def put(name, make):
+    def change(group):
+        old = group[name][:]
+        del group[name]
+        group[name] = make(old)
+
+    return change
+
+
+def attribute(name, value):
+    def change(group):
+        if value is None:
+            del group.attrs[name]
+        else:
+            group.attrs[name] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (delete("states"), "'states' is missing"),
+        (delete("obs"), "'obs' is missing"),
+        (delete("obs/robot0_eye_in_hand_image"), "'obs/robot0_eye_in_hand_image' is missing"),
+        (put("actions", lambda old: old[:-1]), "states 7, actions 6"),
+        (put("actions", lambda old: old[:, :6]), r"actions has shape \(7, 6\)"),
+        (put("actions", lambda old: old.astype(np.int64)), "actions has type int64"),
+        (put("states", lambda old: old.astype(np.float32)), "states has type float32"),
+        (put("states", lambda old: np.where(np.arange(7)[:, None] == 3, np.nan, old)), "states .* frame 3"),
+        (put("states", lambda old: np.where(np.arange(7)[:, None] == 3, -1e30, old)), "states .* frame 3"),
+        (put("obs/agentview_image", lambda old: old.astype(np.float32)), "agentview_image has type float32"),
+        (put("obs/agentview_image", lambda old: old[:, :16]), "different sizes"),
+        (attribute("num_samples", None), "'num_samples' is missing"),
+        (attribute("num_samples", 8), "num_samples is 8"),
+        (attribute("meta_data", None), "'meta_data' is missing"),
+        (attribute("meta_data", "{'key_frame': [2]}"), "meta_data is no valid JSON"),
+        (attribute("meta_data", "[1]"), "meta_data holds a list"),
+        (attribute("meta_data", 7), "'meta_data' is of type int64"),
+    ],
+)
+def test_differences_of_a_group_are_named(path, change, reason):
+    with h5py.File(path, "a") as file:
+        change(file["data/demo_1"])
+    with PublishedFile(path) as file:
+        file.read("demo_0")
+        with pytest.raises(Unusable, match=reason):
+            file.read("demo_1")
+
+
+def test_files_that_cannot_be_opened(path, tmp_path):
+    whole = path.read_bytes()
+    (tmp_path / "cut.hdf5").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.hdf5").write_text("no HDF5")
+    (tmp_path / "pointer.hdf5").write_text(POINTER)
+    with h5py.File(tmp_path / "empty.hdf5", "w") as file:
+        file.create_group("episodes")
+    with h5py.File(tmp_path / "link.hdf5", "w") as file:
+        file.create_group("data").attrs.update(bddl_file_name="a", bddl_file_content="b")
+        file["data/demo_0"] = h5py.ExternalLink("elsewhere.hdf5", "/demo_0")
+    with h5py.File(path, "a") as file:
+        del file["data"].attrs["bddl_file_content"]
+    for name, reason in {
+        "cut.hdf5": "cut off",
+        "text.hdf5": "no HDF5 file",
+        "pointer.hdf5": "git lfs pull",
+        "empty.hdf5": r"no group 'data' \(found episodes\)",
+        "link.hdf5": "link into the file 'elsewhere.hdf5'",
+        "hdf5/synthetic_task_demo.hdf5": "'bddl_file_content' is missing",
+        "absent.hdf5": "no such file",
+    }.items():
+        with pytest.raises(Unusable, match=reason), PublishedFile(tmp_path / name) as opened:
+            opened.read("demo_0")
+    with path.open("rb") as writer:
+        fcntl.flock(writer, fcntl.LOCK_EX)  # as HDF5 locks files that it writes
+        with pytest.raises(Unusable, match="is locked"):
+            PublishedFile(path)
+
+
+# --- restoring a demonstration ---
+
+
+def test_own_files_are_restored_exactly(converted, begun, short, tmp_path):
+    direct = write_dataset([short, short, begun, begun], tmp_path / "direct", repo_id="local/test")
     for folder in ("data", "videos", "states", "meta"):
-        files = [path for path in (direct / folder).rglob("*") if path.is_file()]
-        assert files
-        for path in files:
-            assert path.read_bytes() == (summary.folder / path.relative_to(direct)).read_bytes(), path
-    assert replay(read_episode(summary.folder, 2)) is None
-    assert not (tmp_path / "ds" / ".staging").exists()
+        assert hashes(direct / folder) == hashes(converted / folder)
+    assert replay(read_episode(converted, 2)) is None
+    assert not (converted / ".staging").exists()
 
 
-def test_files_by_hand_without_key_frames(stove, tmp_path):
-    """Checkpoint columns, proprioception and success are read off the states."""
+def test_foreign_files_without_key_frames(stove, tmp_path):
+    """Checkpoint columns, proprioception and success are computed from the states."""
     path = write_foreign(tmp_path / "stove.hdf5", stove)
     with PublishedFile(path) as file:
         found = file.read("demo_0")
         task = task_of(file, found)
-        assert found.extras == Extras()
-        assert (task.name, task.memory_type, task.family) == (STOVE, "temporal", stove.task.family)
-        np.testing.assert_array_equal(restore(task, found).states, stove.states)
-    summary = convert(path, tmp_path / "ds")
-    assert summary.exit_status == 0
-    episode = read_episode(tmp_path / "ds", 0)
-    assert (episode.seed, episode.task_name, episode.whole["success"]) == (-1, STOVE, True)
-    assert episode.whole["key_frames"] == labels(stove).key_frames.tolist()
+    assert found.extras == Extras()
+    assert (task.name, task.memory_type, task.family) == (STOVE, "temporal", stove.task.family)
+    restored = restore(task, found)
+    assert (restored.seed, restored.success) == (-1, True)
+    np.testing.assert_array_equal(restored.states, stove.states)
+    np.testing.assert_array_equal(restored.proprio, stove.proprio)
     for name, column in labels(stove).columns().items():
-        assert np.array_equal(episode.columns[name], column), name
-    np.testing.assert_array_equal(episode.columns["observation.state"], stove.proprio)
+        assert np.array_equal(labels(restored).columns()[name], column), name
 
 
-def test_files_by_hand_with_key_frames_and_a_model_file(stove, tmp_path):
+def test_foreign_files_with_key_frames_and_a_model_file(stove, tmp_path):
     path = write_foreign(tmp_path / "stove.hdf5", stove, key_frame=[30, 44], timestep_exec_start_idx=[5])
-    with h5py.File(path, "a") as file:
-        file["data/demo_0"].attrs["model_file"] = model_file(stove.task, stove.fixture_poses).replace(
-            'name="flat_stove_1"', 'name="flat_stove_1_main"'
-        )
-    convert(path, tmp_path / "ds")
-    episode = read_episode(tmp_path / "ds", 0)
-    assert episode.whole["key_frames"] == [30, 44]
-    assert episode.exec_start == 5
-    for name, pose in stove.fixture_poses.items():
-        np.testing.assert_allclose(episode.whole["fixture_poses"][name], pose, rtol=0, atol=1e-15)
-    assert episode.columns["checkpoint.index"].tolist() == [0] * 31 + [1] * 14 + [2] * (len(stove) - 45)
-
-
-def test_a_prompt_video_whose_end_is_not_told(tmp_path):
-    butter = record_demonstration(get_task(BUTTER), 10_000, images=False)
-    nothing = np.zeros((len(butter), 8, 8, 3), np.uint8)
-    butter = replace(butter, images={"image": nothing, "wrist_image": nothing})
-    path = write_foreign(tmp_path / "butter.hdf5", butter)
+    scene = model_file(stove.task, stove.fixture_poses).replace('name="flat_stove_1"', 'name="flat_stove_1_main"')
     with PublishedFile(path) as file:
         found = file.read("demo_0")
+        restored = restore(task_of(file, found), replace(found, model_file=scene))
+    assert restored.exec_start == 5
+    for name, pose in stove.fixture_poses.items():
+        np.testing.assert_allclose(restored.fixture_poses[name], pose, rtol=0, atol=1e-15)
+    assert labels(restored).index.tolist() == [0] * 31 + [1] * 14 + [2] * (len(stove) - 45)
+
+
+def test_prompt_without_stated_end(tmp_path):
+    butter = record_demonstration(get_task(BUTTER), 10_000, images=False)
+    black = np.zeros((len(butter), 8, 8, 3), np.uint8)
+    butter = replace(butter, images={"image": black, "wrist_image": black})
+    with PublishedFile(write_foreign(tmp_path / "butter.hdf5", butter)) as file:
+        found = file.read("demo_0")
         restored = restore(task_of(file, found), found)
-    assert restored.exec_start == butter.exec_start
+    assert (restored.exec_start, restored.success) == (butter.exec_start, True)
     np.testing.assert_array_equal(restored.satisfied, butter.satisfied)
-    assert restored.success
     moved = replace(found, states=found.states + np.linspace(0, 1, len(found.states))[:, None])
-    with pytest.raises(MemobenchError, match="timestep_exec_start_idx is -1 for a task with a demonstration prompt"):
+    with pytest.raises(MemobenchError, match="timestep_exec_start_idx is -1"):
         restore(restored.task, moved)
 
 
-def test_what_contradicts_itself_is_said(written, stove):
-    with PublishedFile(written / f"{STOVE}_demo.hdf5") as file:
+def test_contradictions_are_named(stove, tmp_path):
+    with PublishedFile(write_published(tmp_path / "stove.hdf5", [stove])) as file:
         found = file.read("demo_0")
         task = task_of(file, found)
     assert digest(restore(task, found)) == digest(stove)
     foreign = replace(found, extras=Extras())
-
-    def said(reason: str, **change) -> None:
-        metadata = found.metadata | change.pop("metadata", {})
+    order = [*range(20), 21, 20, *range(22, len(stove))]
+    for reason, change in [
+        ("key_frame .* is not in order", {"metadata": {"key_frame": [50, 20]}}),
+        ("outside of the execution", {"metadata": {"key_frame": [20, 5000]}}),
+        ("expected 2 frames", {"metadata": {"key_frame": [20]}}),
+        ("timestep_exec_start_idx 'first'", {"metadata": {"timestep_exec_start_idx": "first"}}),
+        ("execution starts at frame 9999", {"metadata": {"timestep_exec_start_idx": 9999}}),
+        ("states have width 12, expected 47", {"states": found.states[:, :12]}),
+        ("frame 21 is earlier", {"states": found.states[order]}),
+        ("'model_file' is missing", {"model_file": " "}),
+        ("no MJCF", {"model_file": "<scene/>"}),
+        ("the digest differs", {"actions": found.actions[::-1], "extras": found.extras}),
+    ]:
+        change["metadata"] = found.metadata | change.get("metadata", {})
         with pytest.raises(MemobenchError, match=reason):
-            restore(task, replace(foreign, metadata=metadata, **change))
-
-    said("key_frame .* is not in order", metadata={"key_frame": [50, 20]})
-    said("outside of the execution", metadata={"key_frame": [20, 5000]})
-    said("expected 2 frames", metadata={"key_frame": [20]})
-    said("expected a frame or -1", metadata={"timestep_exec_start_idx": "first"})
-    said("execution starts at frame 9999", metadata={"timestep_exec_start_idx": 9999})
-    said("states have width 12, expected 47 of the joints of model_file", states=found.states[:, :12])
-    said("not in order: frame 1 is earlier", states=found.states[::-1])
-    said("not in order: frame 21 is earlier", states=found.states[[*range(20), 21, 20, *range(22, len(stove))]])
-    said("the attribute 'model_file' is missing", model_file=" ")
-    with pytest.raises(MemobenchError, match="the digest differs"):
-        restore(task, replace(found, actions=found.actions[::-1]))
+            restore(task, replace(foreign, **change))
 
 
-def test_the_rest_converts(source, stove, tmp_path):
-    """Each kind of damage is named with file, group and reason; what is sound is in the dataset."""
-    (source / "notes.hdf5").write_text("no HDF5")
-    whole = (source / f"{BUTTER}_demo.hdf5").read_bytes()
-    (source / f"{BUTTER}_demo.hdf5").write_bytes(whole[: len(whole) * 2 // 3])
-    with h5py.File(source / f"{STOVE}_demo.hdf5", "a") as file:
-        file["data"].attrs["num_demos"] = 5
-        file.copy("data/demo_0", "data/demo_2")
-        file.copy("data/demo_0", "data/demo_3")
-        file["data/demo_1"].attrs["meta_data"] = "{"
-        del file["data/demo_2"].attrs["num_samples"]
-        file["data/demo_3/states"][:] = file["data/demo_3/states"][:][::-1]
-    summary = convert(source, tmp_path / "ds")
-    assert summary.exit_status == 1
-    assert summary.episodes == 1
-    told = [str(problem) for problem in summary.problems]
-    assert [line.split(": ")[0] for line in told] == [
-        "notes.hdf5",
-        f"{BUTTER}_demo.hdf5",
-        f"{STOVE}_demo.hdf5, data",
-        f"{STOVE}_demo.hdf5, data/demo_1",
-        f"{STOVE}_demo.hdf5, data/demo_2",
-        f"{STOVE}_demo.hdf5, data/demo_3",
-    ]
-    for line, reason in zip(
-        told,
-        ["no HDF5 file", "cut off", "num_demos is 5", "no valid JSON", "num_samples", "not in order"],
-        strict=True,
-    ):
-        assert reason in line
-    assert not (tmp_path / "ds" / ".staging").exists()
-    manifest = json.loads((tmp_path / "ds" / "manifest.json").read_text())
-    assert len(manifest["left_out"]) == 6
-    assert "Left out (6)" in (tmp_path / "ds" / "README.md").read_text()
-    again = convert(source, tmp_path / "ds")
-    assert (again.episodes, again.problems) == (summary.episodes, summary.problems)
-    np.testing.assert_array_equal(read_episode(tmp_path / "ds", 0).columns["action"], stove.actions)
-
+# --- left-out files and demonstrations ---
 
 NO_TEXT = b"\xff\xfe broken"
-"""Bytes that are no UTF-8, stored as if they were; h5py gives them back with lone surrogates."""
-
-SURROGATE = "half a character"
-"""Stands for the task's own metadata with one in its texts; JSON can say it, UTF-8 cannot."""
-
-BAD_IN_A_DEMONSTRATION = [
+"""Bytes that are no UTF-8; h5py returns them with lone surrogates."""
+SURROGATE = "surrogate"
+"""Replaced by the task's own metadata with a lone surrogate in its texts, which JSON allows and UTF-8 does not."""
+BAD_DEMONSTRATIONS = [
     ("seed", "many"),
     ("seed", np.uint64(2**63 + 1)),
     ("variant", np.arange(2)),
@@ -205,23 +280,24 @@ BAD_IN_A_DEMONSTRATION = [
     ("satisfied_intervals", "[[[0]], []]"),
     ("scene_hash", NO_TEXT),
     ("meta_data", '"text"'),
-    ("meta_data", None),
     ("model_file", 5),
-    ("num_samples", None),
     ("digest", np.arange(4)),
 ]
-BAD_IN_A_FILE = [
+BAD_FILES = [
     ("task_metadata", "{}"),
     ("task_metadata", NO_TEXT),
     ("task_metadata", SURROGATE),
     ("bddl_file_content", 1.5),
     ("bddl_file_name", None),
+    ("bddl_file_name", "tasks/.hidden/task_config.bddl"),
     ("memory_type", np.arange(3)),
+    ("memory_type", "../outside"),
 ]
-"""`test_damage` draws others."""
 
 
-def _spoil(attributes: h5py.AttributeManager, name: str, value: object) -> None:
+def spoil(attributes: h5py.AttributeManager, name: str, value: object) -> None:
+    if value is SURROGATE:
+        value = attributes[name].replace("stove", "st\\ud800ve")
     del attributes[name]
     if value is NO_TEXT:
         attributes.create(name, NO_TEXT, dtype=h5py.string_dtype())
@@ -229,95 +305,72 @@ def _spoil(attributes: h5py.AttributeManager, name: str, value: object) -> None:
         attributes[name] = value
 
 
-def test_a_bad_attribute_ends_its_episode_or_file_alone(stove, tmp_path):
-    """Of another type or shape, no Unicode, JSON of something else, missing: each is named, the sound one converted."""
-    source = tmp_path / "source"
-    many = source / "many.hdf5"
-    sound = write_published(tmp_path / "sound.hdf5", [with_pictures(beginning(stove, 20), SIZE)])
-    source.mkdir()
+def test_bad_attributes_end_their_episode_or_file_only(written, tmp_path, monkeypatch):
+    """Each is reported with file and group, the sound demonstrations are converted, and no name leads elsewhere."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder, sound = tmp_path / "folder", written / f"{STOVE}_demo.hdf5"
+    many = folder / "many.hdf5"
+    folder.mkdir()
     shutil.copy(sound, many)
     with h5py.File(many, "a") as file:
-        del file["data"].attrs["num_demos"]
-        for number, (name, value) in enumerate(BAD_IN_A_DEMONSTRATION, 1):
+        del file["data"].attrs["num_demos"], file["data/demo_1"]
+        for number, (name, value) in enumerate(BAD_DEMONSTRATIONS, 1):
             file.copy("data/demo_0", f"data/demo_{number}")
             if name != "digest":
-                del file[f"data/demo_{number}"].attrs["digest"]  # or all would be found by it
-            _spoil(file[f"data/demo_{number}"].attrs, name, value)
-    for number, (name, value) in enumerate(BAD_IN_A_FILE):
-        path = source / f"one_{number:02}.hdf5"
+                del file[f"data/demo_{number}"].attrs["digest"]  # which would reveal every change
+            spoil(file[f"data/demo_{number}"].attrs, name, value)
+    for number, (name, value) in enumerate(BAD_FILES):
+        path = folder / f"one_{number:02}.hdf5"
         shutil.copy(sound, path)
         with h5py.File(path, "a") as file:
-            del file["data"].attrs["num_demos"], file["data/demo_0"].attrs["digest"]
-            if value is SURROGATE:
-                value = file["data"].attrs["task_metadata"].replace("stove", "st\\ud800ve")
-            _spoil(file["data"].attrs, name, value)
-    summary = convert(source, tmp_path / "ds")
-    named = [(problem.file, problem.group.removeprefix("data/")) for problem in summary.problems]
-    expected = {("many.hdf5", f"demo_{n}") for n in range(1, len(BAD_IN_A_DEMONSTRATION) + 1)}
-    assert {each for each in named if each[0] == "many.hdf5"} == expected
-    assert {file for file, _ in named} - {"many.hdf5"} == {f"one_{n:02}.hdf5" for n in range(len(BAD_IN_A_FILE))}
+            del file["data"].attrs["num_demos"], file["data/demo_0"].attrs["digest"], file["data/demo_1"]
+            spoil(file["data"].attrs, name, value)
+    summary = convert(folder, tmp_path / "ds")
+    named = {(problem.file, problem.group.removeprefix("data/")) for problem in summary.problems}
+    assert {group for file, group in named if file == "many.hdf5"} == {
+        f"demo_{n}" for n in range(1, len(BAD_DEMONSTRATIONS) + 1)
+    }
+    assert {file for file, _ in named} - {"many.hdf5"} == {f"one_{n:02}.hdf5" for n in range(len(BAD_FILES))}
     assert all("\n" not in problem.reason for problem in summary.problems)
-    assert summary.episodes == 1
-    assert validate(tmp_path / "ds")[0].disagreement is None
+    assert (summary.episodes, summary.exit_status) == (1, 1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ds", "folder"]
+    manifest = json.loads((tmp_path / "ds" / "manifest.json").read_text())
+    assert len(manifest["left_out"]) == len(named)
+    assert f"Left out ({len(named)})" in (tmp_path / "ds" / "README.md").read_text()
+    assert convert(folder, tmp_path / "ds") == summary, "reported again"
 
 
-@pytest.mark.parametrize(
-    ("attribute", "value"),
-    [
-        ("memory_type", "{outside}"),
-        ("bddl_file_name", "tasks/.hidden/task_config.bddl"),
-    ],
-)
-def test_no_name_in_a_file_leads_out_of_the_folder(source, tmp_path, monkeypatch, attribute, value):
-    """The bad file is named, the others are converted, and nothing is written where the name leads."""
-    outside, temporary = tmp_path / "outside", tmp_path / "temporary"
-    outside.mkdir()
-    temporary.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-    with h5py.File(source / f"{STOVE}_demo.hdf5", "a") as file:
-        file["data"].attrs[attribute] = value.format(outside=outside)
-    summary = convert(source, tmp_path / "ds")
-    assert summary.episodes == 2
-    assert [(problem.file, problem.group) for problem in summary.problems] == [
-        (f"{STOVE}_demo.hdf5", f"data/demo_{k}") for k in range(2)
-    ]
-    assert all("names no file" in problem.reason for problem in summary.problems)
-    assert list(outside.iterdir()) == []
-
-
-def test_images_that_cannot_be_read_are_a_problem_of_their_group(source, tmp_path):
-    """A byte is changed within a compressed frame; only reading the frame shows it."""
+def test_damaged_parts_are_left_out(source, tmp_path):
+    (source / "notes.hdf5").write_text("no HDF5")
     path = source / f"{STOVE}_demo.hdf5"
-    with h5py.File(path) as file:
-        chunk = file["data/demo_0/obs/agentview_image"].id.get_chunk_info(40)
-    data = bytearray(path.read_bytes())
+    with h5py.File(path, "a") as file:
+        file["data"].attrs["num_demos"] = 5
+        chunk = file["data/demo_0/obs/agentview_image"].id.get_chunk_info(4)
+    data = bytearray(path.read_bytes())  # damage within a compressed frame is found by reading the frame
     data[chunk.byte_offset + 2 : chunk.byte_offset + chunk.size] = b"\xff" * (chunk.size - 2)
     path.write_bytes(data)
-    summary = convert(path, tmp_path / "ds")
-    assert summary.episodes == 1
-    (problem,) = summary.problems
-    assert problem.group == "data/demo_0"
-    assert "its images cannot be read from frame 32 on" in problem.reason
+    summary = convert(source, tmp_path / "ds")
+    assert (summary.episodes, summary.exit_status) == (3, 1)
+    assert [(problem.file, problem.group) for problem in summary.problems] == [
+        ("notes.hdf5", ""),
+        (path.name, "data"),
+        (path.name, "data/demo_0"),
+    ]
+    assert "from frame 0 on" in summary.problems[2].reason
 
 
-def test_a_task_that_is_not_the_catalogues_of_its_name_is_told(written, stove, tmp_path, capsys):
-    """The dataset holds the file's; what finds tasks by name finds another, and everybody is told."""
-    assert convert(written, tmp_path / "same").notes == ()
-    folder = tmp_path / "by hand"
-    folder.mkdir()
-    path = write_foreign(folder / "stove.hdf5", stove)
-    assert convert(path, tmp_path / "hand").notes == ()
+def test_task_unlike_the_catalogues_is_noted(written, tmp_path, capsys):
+    path = tmp_path / "stove.hdf5"
+    shutil.copy(written / f"{STOVE}_demo.hdf5", path)
     with h5py.File(path, "a") as file:
         text = file["data"].attrs["bddl_file_content"]
-        file["data"].attrs["bddl_file_content"] = text.replace(stove.task.language, "switch the stove on and off")
-        file.copy("data/demo_0", "data/demo_1")
+        file["data"].attrs["bddl_file_content"] = text.replace(get_task(STOVE).language, "switch the stove on and off")
+        for number in range(2):
+            del file[f"data/demo_{number}"].attrs["digest"]
     summary = convert(path, tmp_path / "ds")
     (note,) = summary.notes
-    assert str(note) == (
-        f"stove.hdf5: not as the catalogue's {STOVE}: instruction; the dataset holds the file's, but `lerobot eval` "
-        "and `memobench validate` know the catalogue's by that name"
-    )
-    assert (summary.episodes, summary.problems, summary.exit_status) == (2, (), 0)
+    assert f"{STOVE}: instruction" in note.reason
+    assert (summary.episodes, summary.exit_status) == (2, 0)
     assert convert(path, tmp_path / "ds") == summary
     assert str(note) in (tmp_path / "ds" / "README.md").read_text()
     assert read_episode(tmp_path / "ds", 0).columns["task"][0] == "switch the stove on and off"
@@ -333,12 +386,8 @@ def test_a_task_that_is_not_the_catalogues_of_its_name_is_told(written, stove, t
         ("robomimic's", ["env_args"], []),
     ],
 )
-def test_neighbouring_layouts_are_recognised(written, tmp_path, layout, attributes, cameras):
-    """In one sentence for the file, not one for each demonstration; what is sound beside it is converted."""
-    source = tmp_path / "source"
-    source.mkdir()
-    shutil.copy(written / f"{BUTTER}_demo.hdf5", source)
-    with h5py.File(source / "a.hdf5", "w") as file:
+def test_similar_layouts_are_recognised(tmp_path, layout, attributes, cameras):
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
         for key in attributes:
             file.require_group("data").attrs[key] = "{}"
         for number in range(3):
@@ -348,82 +397,132 @@ def test_neighbouring_layouts_are_recognised(written, tmp_path, layout, attribut
             group.create_group("obs")
             for camera in cameras:
                 group[f"obs/{camera}"] = np.zeros((4, 8, 8, 3), np.uint8)
-    summary = convert(source, tmp_path / "ds")
+    summary = convert(tmp_path / "a.hdf5", tmp_path / "ds")
     (problem,) = summary.problems
-    assert problem.reason.startswith(f"it is in {layout} layout, which lacks the checkpoints (meta_data)")
-    assert problem.reason.endswith("describe its task as docs/develop/add_a_task.md shows")
+    assert (summary.folder, summary.exit_status) == (None, 1)
+    assert not (tmp_path / "ds").exists()
     lacks = [] if layout == "LIBERO's" else ["bddl_file_name", "bddl_file_content"]
     lacks += [] if "agentview_image" in cameras else ["obs/agentview_image", "obs/robot0_eye_in_hand_image"]
-    assert all(f"'{each}'" in problem.reason for each in lacks)
-    assert summary.episodes == 2
+    assert layout in problem.reason
+    assert all(f"'{each}'" in problem.reason for each in ["meta_data", *lacks][1:])
 
 
-def test_nothing_usable_leaves_nothing(tmp_path):
-    (tmp_path / "a.hdf5").write_text("no HDF5")
-    summary = convert(tmp_path / "a.hdf5", tmp_path / "ds")
-    assert summary.folder is None
-    assert summary.exit_status == 1
-    assert not (tmp_path / "ds").exists()
+def test_no_files(tmp_path):
+    (tmp_path / "empty").mkdir()
     for missing in ("absent", "."):
-        (tmp_path / "empty").mkdir(exist_ok=True)
         with pytest.raises(MemobenchError, match=r"does not exist|found no HDF5 file"):
             convert(tmp_path / "empty" / missing, tmp_path / "ds")
-        assert not (tmp_path / "ds").exists()
+    assert not (tmp_path / "ds").exists()
 
 
-def test_a_full_disk_ends_a_conversion_in_a_sentence(written, tmp_path, monkeypatch):
-    """The episode that met it is not one that cannot be used, and the next run makes it."""
-    path, told = written / f"{BUTTER}_demo.hdf5", []
+# --- interrupted conversions ---
+
+
+def test_full_disk_keeps_finished_episodes(written, tmp_path, monkeypatch):
+    path, news = written / f"{BUTTER}_demo.hdf5", []
     with monkeypatch.context() as patch:
         full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         patch.setattr(EpisodeStage, "publish", lambda *_: (_ for _ in ()).throw(full))
         with pytest.raises(MemobenchError, match=r"ds cannot be written \(No space left on device.*finished.*stay"):
-            convert(path, tmp_path / "ds", tell=told.append)
-    assert re.match(r"1 file of [\d.]+ KiB: about [\d.]+ KiB in .*ds, [\d.]+ [KM]iB until it is finished", told[0])
+            convert(path, tmp_path / "ds", notify=news.append)
+    assert news[0].startswith("1 file of ")
     assert not is_dataset(tmp_path / "ds")
-    summary = convert(path, tmp_path / "ds")
-    assert (summary.episodes, summary.problems) == (2, ())
+    assert convert(path, tmp_path / "ds").episodes == 2
     (video,) = (tmp_path / "ds" / "videos" / "observation.images.image").rglob("*.mp4")
     video.write_bytes(video.read_bytes()[:-50])
-    with pytest.raises(MemobenchError, match=r"file-000\.mp4 is cut off or damaged at byte"):
+    with pytest.raises(MemobenchError, match=r"file-000\.mp4"):
         convert(path, tmp_path / "ds")
+    monkeypatch.setattr(generation, "free_bytes", lambda _: 1000)
+    with pytest.raises(MemobenchError, match="make room"):
+        convert(path, tmp_path / "other")
 
 
-def test_a_broken_off_conversion_goes_on(written, tmp_path, monkeypatch):
-    reference = convert(written / f"{BUTTER}_demo.hdf5", tmp_path / "reference")
+def test_interrupted_conversion_continues(written, converted, tmp_path, monkeypatch):
     made: list[str] = []
     inner = convert_module.ConversionJob.run
 
     def run(job):
-        if job.group == "demo_1" and "demo_1" not in made:
-            made.append("demo_1")
+        made.append(f"{job.file.name[:3]} {job.group}")
+        if made == ["put demo_0", "put demo_1"]:
             raise KeyboardInterrupt
-        made.append(job.group)
         inner(job)
 
     monkeypatch.setattr(convert_module.ConversionJob, "run", run)
     with pytest.raises(KeyboardInterrupt):
-        convert(written / f"{BUTTER}_demo.hdf5", tmp_path / "ds")
+        convert(written, tmp_path / "ds", repo_id="local/test")
     assert not is_dataset(tmp_path / "ds")
-    with pytest.raises(MemobenchError, match="unfinished run with upside_down=False, now True"):
-        convert(written / f"{BUTTER}_demo.hdf5", tmp_path / "ds", upside_down=True)
-    convert(written / f"{BUTTER}_demo.hdf5", tmp_path / "ds")
-    assert made == ["demo_0", "demo_1", "demo_1"]
-    for path in reference.folder.rglob("*"):
-        if path.is_file():
-            assert path.read_bytes() == (tmp_path / "ds" / path.relative_to(reference.folder)).read_bytes(), path
+    with pytest.raises(MemobenchError, match="upside_down=False"):
+        convert(written, tmp_path / "ds", upside_down=True)
+    convert(written, tmp_path / "ds", repo_id="local/test")
+    assert made == ["put demo_0", "put demo_1", "put demo_1", "tur demo_0", "tur demo_1"]
+    assert hashes(tmp_path / "ds") == hashes(converted)
 
 
-def test_metadata_that_is_none(source, tmp_path):
-    """A task that its file does not describe is left out, in one sentence without anybody's temporary folder."""
-    path = source / f"{STOVE}_demo.hdf5"
-    with h5py.File(path, "a") as file:
-        del file["data"].attrs["task_metadata"]
-        file["data/demo_0"].attrs["meta_data"] = json.dumps({"memory": []})
-        del file["data/demo_1"].attrs["digest"]  # it is of the task by its real name
-        file["data"].attrs["bddl_file_name"] = "C:\\tasks\\own task\\task_config.bddl"
-    summary = convert(path, tmp_path / "ds")
-    (problem,) = summary.problems
-    assert problem.reason.startswith("meta_data lacks 'operating_type', 'subtask_goals'")
-    assert os.sep + "tmp" not in problem.reason
-    assert read_episode(tmp_path / "ds", 0).task_name == "own task"
+# --- archives ---
+
+
+def packed(folder: Path, path: Path) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in sorted(folder.rglob("*.h*5")):
+            archive.write(file, f"some folder/{file.name}")
+        archive.writestr("README.md", "about it")
+        archive.writestr("__MACOSX/temporal/._a_demo.hdf5", "a fork")
+    return path
+
+
+def test_archive_equals_its_folder(written, converted, tmp_path):
+    news, counted = [], []
+    source = packed(written, tmp_path / "a.zip")
+    summary = convert(source, tmp_path / "ds", repo_id="local/test", notify=news.append, progress=counted.append)
+    assert (summary.episodes, summary.problems, summary.exit_status) == (4, (), 0)
+    for part in ("data", "videos", "states", "meta"):
+        assert hashes(tmp_path / "ds" / part) == hashes(converted / part)
+    largest = max(file.stat().st_size for file in written.rglob("*.hdf5"))
+    assert f"unpacked one by one (up to {largest / 1024:.1f} KiB)" in news[0]
+    assert [line.split(":")[0] for line in news[1:]] == ["file 1 of 2", "file 2 of 2"]
+    assert ([each.done for each in counted], counted[-1].total) == ([1, 2, 3, 4], 4)
+    assert convert(source, tmp_path / "ds", repo_id="local/test") == summary
+
+
+@pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("holder", "name", "call", "unpacked_again"),
+    [(os, "replace", "_demo.hdf5", 2), (os, "replace", "00002.json", 1), (VideoWriter, "add", 70, 1)],
+    ids=["while unpacking", "after inspection", "in the second file"],
+)
+def test_killed_conversion_continues(written, tmp_path, monkeypatch, holder, name, call, unpacked_again):
+    source, unpacked, inner = packed(written, tmp_path / "a.zip"), [], convert_module.unpack
+    killed_at(holder, name, call, lambda: convert(source, tmp_path / "ds"))
+    assert not is_dataset(tmp_path / "ds")
+    monkeypatch.setattr(convert_module, "unpack", lambda *args: unpacked.append(args) or inner(*args))
+    assert convert(source, tmp_path / "ds").episodes == 4
+    assert len(unpacked) == unpacked_again, "finished files are not unpacked again"
+
+
+def test_bad_archives(written, tmp_path, monkeypatch, capsys):
+    """Names that lead elsewhere are refused, damage is named, and the sound files are converted."""
+    source, work = tmp_path / "a.zip", tmp_path / "work"
+    work.mkdir()
+    sound = (written / f"{BUTTER}_demo.hdf5").read_bytes()
+    names = ["../out.hdf5", "/tmp/out.hdf5", "a/../../out.hdf5", "C:\\out.hdf5", ".hidden/a.hdf5", "two\nlines.hdf5"]
+    with zipfile.ZipFile(source, "w") as archive:
+        archive.writestr("good/a.hdf5", sound)
+        archive.writestr("cut.hdf5", b"PAYLOAD" * 8)
+        for name in names:
+            archive.writestr(name, "x" * 50)
+    source.write_bytes(source.read_bytes().replace(b"PAYLOADPAYLOAD", b"PAYLOADPAYL0AD", 1))
+    monkeypatch.chdir(work)
+    assert command(source, tmp_path / "ds") == 1
+    out = capsys.readouterr().out
+    assert list(work.iterdir()) == []
+    assert not (tmp_path / "out.hdf5").exists()
+    for name in [*names, "cut.hdf5"]:
+        (line,) = [line for line in out.splitlines() if line.startswith(f"left out: {name.replace(chr(10), '?')}: ")]
+        assert ("cannot be unpacked" if name == "cut.hdf5" else "names no file") in line
+    assert read_episode(tmp_path / "ds", 1).task_name == BUTTER
+    (tmp_path / "cut.zip").write_bytes(source.read_bytes()[:-100])
+    with zipfile.ZipFile(tmp_path / "empty.zip", "w") as archive:
+        archive.writestr("README.md", "about an empty archive")
+    for name, reason in (("cut", "download it again"), ("empty", "found no HDF5 file")):
+        with pytest.raises(MemobenchError, match=reason):
+            convert(tmp_path / f"{name}.zip", tmp_path / "ds2")

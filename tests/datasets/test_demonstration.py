@@ -1,12 +1,17 @@
+"""Labels, language rows and hash of a demonstration."""
+
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.demonstration import digest, labels
+from lerobot_memobench.datasets.demonstration import digest, labels, persistent_rows
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.memory_text import IMPERATIVES, memory_text, subtask_texts
 
 
 def bits(values) -> str:
@@ -14,17 +19,13 @@ def bits(values) -> str:
 
 
 def test_checkpoints_in_order(make_demo):
-    # frame              0123456789
-    demo = make_demo(["0011000000", "0000011111", "0000000001"])
-    found = labels(demo)
+    # frame                  0123456789
+    found = labels(make_demo(["0011000000", "0000011111", "0000000001"]))
     assert found.key_frames.tolist() == [2, 5, 9]
-    assert bits(found.index) == "0001112222"  # frames before t: the event's own frame does not count yet
+    assert bits(found.index) == "0001112222"  # frames before t: the event's own frame is not counted
     assert found.operation.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 2]
     assert bits(found.event) == "0010010001"
-    assert bits(found.completed[:, 0]) == "0011111111"  # includes frame t, and stays
-    assert bits(found.completed[:, 1]) == "0000011111"
-    assert bits(found.completed[:, 2]) == "0000000001"
-    assert not found.completed[:, 3:].any()
+    assert [bits(found.completed[:, k]) for k in range(4)] == ["0011111111", "0000011111", "0000000001", "0" * 10]
     assert bits(found.phase) == "1111111111"
 
 
@@ -32,34 +33,28 @@ def test_texts(make_demo):
     found = labels(make_demo(["01000", "00100", "00010"]))
     assert found.simple_subgoal == ["did thing 0"] * 2 + ["did thing 1"] + ["did thing 2"] * 2
     assert found.grounded_subgoal[2] == "did thing 1 with the left hand"
+    assert found.coarse_subgoal == ["coarse 0"] * 2 + ["coarse 1"] + ["coarse 2"] * 2, "the last text remains"
     assert found.operation.tolist() == [0, 0, 1, 2, -1], "none is left"
-    assert found.coarse_subgoal == ["coarse 0"] * 2 + ["coarse 1"] + ["coarse 2"] * 2, "the last one's stays"
-    assert found.memory == [
-        "",
-        "",
-        "did thing 0",
-        "did thing 0; did thing 1",
-        "did thing 0; did thing 1; did thing 2",
-    ]
+    done = ["did thing 0", "did thing 0; did thing 1", "did thing 0; did thing 1; did thing 2"]
+    assert found.memory == ["", "", *done]
 
 
 def test_prompt_frames(make_demo):
     found = labels(make_demo(["000001", "000000"], exec_start=3))
     assert bits(found.phase) == "000111"
-    assert bits(found.index) == "000000"
-    assert not found.completed[:3].any()
+    assert found.step.tolist() == [0, 1, 2, 0, 1, 2]
     assert set(found.memory) == {""}
     assert found.key_frames.tolist() == [5, -1]  # frames of the episode, prompt included
 
 
-def test_task_without_checkpoints(make_demo, make_task):
+def test_number_of_checkpoints(make_demo, make_task):
     demo = make_demo(["000"], task=make_task("S"))
-    bare = replace(demo, task=make_task(""), satisfied=np.zeros((3, 0), dtype=np.bool_))
-    found = labels(bare)
+    found = labels(replace(demo, task=make_task(""), satisfied=np.zeros((3, 0), dtype=np.bool_)))
     assert found.operation.tolist() == [-1] * 3
-    assert found.simple_subgoal == [bare.task.language] * 3
-    assert not found.event.any()
+    assert found.simple_subgoal == [demo.task.language] * 3
     assert found.key_frames.shape == (0,)
+    with pytest.raises(MemobenchError, match="7 checkpoints"):
+        labels(make_demo(["0"] * 7, task=make_task("SSSSSSS")))
 
 
 def test_columns_are_typed_and_complete(make_demo):
@@ -74,17 +69,11 @@ def test_columns_are_typed_and_complete(make_demo):
         "checkpoint.event": "bool",
     }
     assert set(columns) - set(kinds) == {"simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"}
-    assert all(len(column) == 4 for column in columns.values())
 
 
-def test_too_many_checkpoints(make_demo, make_task):
-    with pytest.raises(MemobenchError, match="7 checkpoints"):
-        labels(make_demo(["0"] * 7, task=make_task("SSSSSSS")))
-
-
-def test_labels_match_a_plain_simulation_of_the_definition(make_demo):
+def test_labels_equal_a_plain_simulation_of_the_definition(make_demo):
     rng = np.random.default_rng(0)
-    for _ in range(200):
+    for _ in range(100):
         length, count = int(rng.integers(1, 15)), int(rng.integers(1, 4))
         start = int(rng.integers(0, length))
         table = rng.random((count, length)) < 0.2
@@ -102,57 +91,123 @@ def test_labels_match_a_plain_simulation_of_the_definition(make_demo):
                 index += 1
 
 
-def test_labels_of_a_frame_are_those_of_the_frames_up_to_it(make_demo):
-    whole, part = (
-        labels(make_demo(["000010", "011111"], exec_start=1)),
-        labels(make_demo(["00001", "01111"], exec_start=1)),
-    )
-    for name, column in part.columns().items():
-        assert np.array_equal(np.asarray(column), np.asarray(whole.columns()[name])[:5]), name
-
-
-def test_digest_sees_every_part(make_demo, make_task):
-    demo = make_demo(["0010", "0001"], exec_start=1)
-    same = make_demo(["0010", "0001"], exec_start=1)
-    assert digest(demo) == digest(same)
-    assert len(digest(demo)) == 64
-    changed_state = demo.states.copy()
-    changed_state[-1, -1] = np.nextafter(changed_state[-1, -1], 9)
-    changed_action = demo.actions.copy()
-    changed_action[0, 0] *= -1
-    satisfied = demo.satisfied.copy()
+def test_hash_covers_every_part(make_demo, make_task):
+    demo = make_demo(["0010", "0001"], exec_start=1, size=16)
+    states, actions, satisfied = demo.states.copy(), demo.actions.copy(), demo.satisfied.copy()
+    states[-1, -1] = np.nextafter(states[-1, -1], 9)
+    actions[0, 0] *= -1
     satisfied[3] = False
-    others = [
-        replace(demo, states=changed_state),
-        replace(demo, actions=changed_action),
-        replace(demo, satisfied=satisfied),
-        replace(demo, seed=1),
-        replace(demo, variant=1),
-        replace(demo, exec_start=2),
-        replace(demo, success=False),
-        replace(demo, task=make_task("UU")),
+    changes = [
+        {"states": states},
+        {"actions": actions},
+        {"executed": actions},
+        {"satisfied": satisfied},
+        {"seed": 1},
+        {"variant": 1},
+        {"exec_start": 2},
+        {"success": False},
+        {"task": make_task("UU")},
+        {"task": demo.task.in_world("libero")},
     ]
-    assert len({digest(demo), *(digest(other) for other in others)}) == len(others) + 1
-    # Images and memory layout are no part of it.
-    assert digest(replace(demo, states=np.asfortranarray(demo.states))) == digest(demo)
-    shown = make_demo(["0010", "0001"], exec_start=1, size=16)
-    assert digest(replace(shown, images=None)) == digest(shown)
+    assert len({digest(demo), *(digest(replace(demo, **change)) for change in changes)}) == len(changes) + 1
+    assert digest(replace(demo, images=None, states=np.asfortranarray(demo.states))) == digest(demo)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"states": np.zeros((4, 5), dtype=np.float32)}, "states has type float32"),
-        ({"actions": np.zeros((3, 7), dtype=np.float32)}, "actions has type float32 and shape"),
+        ({"states": np.zeros((4, 5), dtype=np.float32)}, "states"),
+        ({"actions": np.zeros((3, 7), dtype=np.float32)}, "actions"),
         ({"actions": np.zeros((4, 6), dtype=np.float32)}, "actions"),
-        ({"proprio": np.zeros((4, 8))}, "proprio has type float64"),
+        ({"proprio": np.zeros((4, 8))}, "proprio"),
         ({"satisfied": np.zeros((4, 3), dtype=np.bool_)}, "satisfied"),
         ({"satisfied": np.ones((4, 2), dtype=np.bool_), "exec_start": 1}, "demonstration prompt"),
-        ({"exec_start": 4}, "execution starts at frame 4 of 4"),
+        ({"exec_start": 4}, "frame 4 of 4"),
         ({"images": {"image": np.zeros((4, 8, 8, 3), dtype=np.uint8)}}, "images"),
         ({"images": {"image": np.zeros((4, 8, 8), dtype=np.uint8)}}, "images"),
     ],
 )
-def test_inconsistent_arrays_are_named(make_demo, change, message):
+def test_inconsistent_arrays_are_refused(make_demo, change, message):
     with pytest.raises(MemobenchError, match=message):
         replace(make_demo(["0010", "0001"]), **change)
+
+
+# --- language rows ---
+
+
+def rows_of(demo, style):
+    return [(row["timestamp"], row["content"]) for row in persistent_rows(labels(demo)) if row["style"] == style]
+
+
+def test_rows_follow_the_text_columns(make_demo):
+    demo = make_demo(["0" * 10 + "1" * 30, "0" * 30 + "1" * 10])
+    times = [float(np.float32(frame / 20)) for frame in (0, 11, 31)]
+    assert rows_of(demo, "subtask") == [(times[0], "did thing 0"), (times[1], "did thing 1")]
+    assert rows_of(demo, "memory") == [(times[1], "did thing 0"), (times[2], "did thing 0; did thing 1")]
+
+
+def test_short_lived_texts_get_no_row(make_demo):
+    # Checkpoints 0 and 1 complete two frames apart: "did thing 1" is the subtask for 0.1 s only.
+    demo = make_demo(["0" * 10 + "1" * 30, "0" * 12 + "1" * 28, "0" * 30 + "1" * 10])
+    assert [text for _, text in rows_of(demo, "subtask")] == ["did thing 0", "did thing 2"]
+    memory = rows_of(demo, "memory")
+    assert [text for _, text in memory] == ["did thing 0; did thing 1", "did thing 0; did thing 1; did thing 2"]
+    assert memory[0][0] == float(np.float32(13 / 20)), "not before both are done"
+    assert rows_of(make_demo(["0100000000", "0001111111"]), "subtask") == [(0.0, "did thing 1")], "from frame 0 on"
+
+
+def test_rows_satisfy_lerobots_writer_and_resolvers(make_demo):
+    writer = pytest.importorskip("lerobot.annotations.steerable_pipeline.writer")
+    from lerobot.datasets import language_render
+
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        table = np.zeros((3, 30), dtype=int)
+        for k in range(3):
+            table[k, int(rng.integers(1, 30)) :] = 1
+        rows = persistent_rows(labels(make_demo(["".join(map(str, row)) for row in table])))
+        empty = {"camera": None, "tool_calls": None}  # "" and [] here, for lerobot-dataset-viz
+        assert [writer._normalize_persistent_row(row | empty) for row in rows] == [row | empty for row in rows]
+        assert sorted(rows, key=writer._row_persistent_sort_key) == rows
+        for t in np.float32(np.arange(30) / 20).tolist():
+            for style in ("subtask", "memory"):
+                language_render.emitted_at(t, persistent=rows, events=[], style=style)  # raises for two rows
+                active = language_render.active_at(t, persistent=rows, style=style)
+                assert style == "memory" or active is not None
+
+
+VERBS = "|".join(set(IMPERATIVES) - set(IMPERATIVES.values()))
+PAST = re.compile(rf"(?:^|; |\band |\bthen |^.*, and )({VERBS})\b")
+
+
+@pytest.mark.parametrize("suite", ["published", "strict"])
+def test_subtasks_are_instructions_and_memories_are_not(suite):
+    """Of every checkpoint of every variant: no past tense, no completed step, no repetition."""
+    for base in map(get_task, task_names(suite=suite)):
+        for task in map(base.variant, range(base.num_variants)):
+            texts = subtask_texts(task)
+            assert len(texts) == len(task.checkpoints)
+            for k, (text, checkpoint) in enumerate(zip(texts, task.checkpoints, strict=True)):
+                assert text.split()[0] in IMPERATIVES.values(), text
+                assert not PAST.search(text), text
+                assert not re.search(r"by now|in all|each once|the one time", text), text
+                assert text not in texts[:k]
+                assert checkpoint.language[1].split()[0] in IMPERATIVES, "past tense"
+            assert memory_text(task, len(texts)).startswith(task.checkpoints[0].language[1])
+
+
+@pytest.mark.parametrize(
+    ("name", "variant", "number", "text"),
+    [
+        ("turn_the_stove_on_and_off_a_given_number_of_times", 2, 1, "switch the stove on and off again for the second"),
+        ("turn_the_stove_on_and_off_a_given_number_of_times", 2, 3, "come to rest"),
+        (
+            "find_the_tomato_hidden_in_one_of_the_drawers",
+            2,
+            0,
+            "pull out the bottom drawer, where the tomato",
+        ),
+    ],
+)
+def test_text_of_a_subtask(name, variant, number, text):
+    assert subtask_texts(get_task(name).variant(variant))[number].startswith(text)

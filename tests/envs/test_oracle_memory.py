@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.datasets.demonstration import labels
-from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.memory_text import NOTHING_YET, with_memory
+from tests.support.short_demonstrations import record_demonstration
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"

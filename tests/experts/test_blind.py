@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
@@ -11,7 +13,7 @@ COUNTED = "turn_the_stove_on_and_off_a_given_number_of_times"
 LIT = Atom("turnon", ("flat_stove_1",))
 
 
-def test_the_published_task_is_done_and_begun_again() -> None:
+def test_published_task_is_done_and_begun_again() -> None:
     episode = Episode(get_task(STOVE))
     episode.reset(20_001)
     lit, turned_on, succeeded = False, 0, False
@@ -26,7 +28,8 @@ def test_the_published_task_is_done_and_begun_again() -> None:
     assert turned_on > 1, "it goes on after the goal has come true"
 
 
-def test_who_cannot_count_fails_the_strict_task() -> None:
+@pytest.mark.slow
+def test_blind_routine_fails_the_strict_task() -> None:
     episode = Episode(get_task(COUNTED))
     episode.reset(20_001)
     while not episode.done:

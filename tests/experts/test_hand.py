@@ -47,7 +47,7 @@ def test_frame_is_a_rotation_along_the_given_axes(rng: np.random.Generator) -> N
 
 
 @pytest.mark.parametrize("yaw", np.linspace(-np.pi, 3 * np.pi, 25))
-def test_downward_closes_along_the_angle_the_easy_way_round(yaw: float) -> None:
+def test_downward_rotation(yaw: float) -> None:
     turn = downward(float(yaw))
     np.testing.assert_allclose(turn[:, 2], DOWN, atol=1e-12)
     assert abs(turn[:, 0] @ [np.cos(yaw), np.sin(yaw), 0.0]) == pytest.approx(1.0)
@@ -55,7 +55,7 @@ def test_downward_closes_along_the_angle_the_easy_way_round(yaw: float) -> None:
 
 
 @pytest.mark.parametrize(("kept_shut", "most"), [(0, 3), (9, 12), (500, MAX_OPENING_STEPS)])
-def test_late_opening_fingers_are_waited_for(
+def test_waits_for_late_opening_fingers(
     kept_shut: int, most: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three steps with an opening command count; steps in which the command stays closed do not."""

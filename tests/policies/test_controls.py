@@ -14,8 +14,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 
-from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lookup import FrameLookup
+from lerobot_memobench.datasets.frames import FrameLookup, read_frame_table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import SEVERAL, WordTextEncoder, shuffled_subgoals, text_rows
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy

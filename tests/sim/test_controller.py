@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -239,7 +238,7 @@ def test_episodes_are_equal_bit_for_bit(task: str) -> None:
             action = MOVES[k % len(MOVES)]
         compiled.step(action), plain.step(action)
         assert bits(compiled.sim) == bits(plain.sim), f"step {k}"
-    assert control._Process.agrees, "nothing was compared"
+    assert control._Process.agrees, "no step was compared"
     assert k > 50
 
 
@@ -251,19 +250,6 @@ def test_a_snapshot_continues_equally_in_both() -> None:
         sim.restore(snapshot)
         sim.step(NO_OP)
     assert bits(sims[0]) == bits(sims[1])
-
-
-@pytest.mark.parametrize("broken", [np.nan, np.inf])
-def test_non_finite_goals_are_treated_alike(broken: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file
-    sims = simulation(), by_numpy(simulation())
-    for sim in sims:
-        sim.reset(7)
-        sim._controller.set_goal(sim.data, MOVES[0])
-        sim._controller.goal_position = np.array([broken, 0.0, 1.0])
-        sim._controller.advance(sim.data, 1.0, 3)
-    assert bits(sims[0]) == bits(sims[1])
-    assert sims[0].data.warning.number.sum() > 0
 
 
 def test_copied_data_moves_independently() -> None:
@@ -287,37 +273,6 @@ def test_threads_do_not_disturb_each_other() -> None:
     for thread in threads:
         thread.join()
     assert found == [expected] * 3
-
-
-_WORKERS = """
-import hashlib, multiprocessing, sys
-from lerobot_memobench.sim import controller as control
-from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.catalogue import get_task
-
-def moved(_):
-    sim = Simulation(get_task(sys.argv[1]))
-    sim.reset(7)
-    sim.step([0.3, -0.4, -0.5, 0.1, 0.2, 0.3, 1.0])
-    return hashlib.sha256(sim.state().tobytes()).hexdigest(), control._Process.agrees
-
-if __name__ == "__main__":
-    here = moved(0)
-    for method in ("fork", "spawn"):
-        with multiprocessing.get_context(method).Pool(2) as pool:
-            assert pool.map(moved, range(2)) == [here, here], method
-    assert here[1]
-"""
-
-
-@pytest.mark.slow
-def test_workers_move_as_their_parent(tmp_path: Path) -> None:
-    script = tmp_path / "workers.py"
-    script.write_text(_WORKERS)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", str(script), TASKS[0]], capture_output=True, text=True, timeout=300
-    )
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 # --- fall back to numpy ---

@@ -206,7 +206,7 @@ def test_no_image_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     assert table(started(NINE)).any()
 
 
-def test_a_scene_with_more_things_than_slots_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_too_many_things_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(object_slots, "SLOTS", 5)
     with pytest.raises(MemobenchError, match=r"10 .* 5 slots"):
         ObjectSlots(started(NINE))

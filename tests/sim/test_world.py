@@ -99,7 +99,7 @@ def test_on_an_object_needs_contact_height_and_distance(simulate: Simulate) -> N
     put(sim, "butter_1", bowl + np.array([0, 0, inside + 0.01]))
     assert not holds(sim, "on", "butter_1", "bowl_left"), "no contact"
     put(sim, "butter_1", bowl + np.array([0.031, 0, inside - 0.0005]))
-    assert not holds(sim, "on", "butter_1", "bowl_left"), "3.1 cm beside the bowl's middle"
+    assert not holds(sim, "on", "butter_1", "bowl_left"), "3.1 cm from the bowl's centre"
 
 
 def test_on_a_site_needs_contact_with_its_fixture(simulate: Simulate) -> None:
@@ -156,7 +156,7 @@ def sim() -> Simulation:
 
 
 def act(sim: Simulation, steps: int, **values: float) -> None:
-    """Take steps of one action, named by what it moves."""
+    """Take steps of one action, given by its components."""
     action = NO_OP.copy()
     for name, value in values.items():
         action[["x", "y", "z", "rx", "ry", "rz", "grip"].index(name)] = value
@@ -165,7 +165,7 @@ def act(sim: Simulation, steps: int, **values: float) -> None:
 
 
 @pytest.mark.parametrize("move", [{"x": 0.2}, {"z": 0.5}, {"rz": 0.5}, {"grip": 1.0}])
-def test_a_moved_rotated_or_closed_hand_is_not_home(sim: Simulation, move: dict[str, float]) -> None:
+def test_moved_rotated_or_closed_hand_is_not_home(sim: Simulation, move: dict[str, float]) -> None:
     start = sim.snapshot()
     for _ in range(20):
         assert sim.holds(HOME), "a resting hand stays home"
@@ -186,7 +186,7 @@ def arm(sim: Simulation) -> bytes:
 @pytest.mark.parametrize(
     "move", [{}, {"x": 0.25}, {"y": -0.2, "z": 0.2}, {"rx": 0.15}, {"y": 0.2, "rz": -0.1}, {"z": 0.2, "grip": 1.0}]
 )
-def test_a_hand_that_rests_near_home_is_restored_to_the_bit(sim: Simulation, move: dict[str, float]) -> None:
+def test_hand_at_rest_near_home_is_restored_exactly(sim: Simulation, move: dict[str, float]) -> None:
     """A policy cannot store information in its pose at home."""
     first = arm(sim)
     act(sim, 3, **move)
@@ -196,7 +196,7 @@ def test_a_hand_that_rests_near_home_is_restored_to_the_bit(sim: Simulation, mov
     assert sim.holds(HOME)
 
 
-def test_a_hand_that_passes_or_rests_farther_away_is_not_home(sim: Simulation) -> None:
+def test_passing_or_distant_hand_is_not_home(sim: Simulation) -> None:
     start, _ = sim.eef_pose()
     act(sim, 1, y=0.3)
     while np.linalg.norm(sim.eef_pose()[0] - start) < 1.2 * DETENT_DISTANCE:
@@ -210,7 +210,7 @@ def test_a_hand_that_passes_or_rests_farther_away_is_not_home(sim: Simulation) -
         assert not sim.holds(HOME)
 
 
-def test_a_hand_that_leaves_home_in_a_step_was_home(sim: Simulation) -> None:
+def test_home_includes_the_beginning_of_a_step(sim: Simulation) -> None:
     states = [sim.state()]
     for expected in (True, False):
         act(sim, 1, x=1.0)
@@ -230,7 +230,7 @@ def test_published_scenes_have_no_detent() -> None:
     assert np.linalg.norm(sim.eef_pose()[0] - sim.home[0]) > 0.005
 
 
-def test_an_object_is_in_place_up_to_the_stated_distance_from_the_start_of_the_execution(sim: Simulation) -> None:
+def test_in_place_tolerance(sim: Simulation) -> None:
     joint = sim.data.joint(f"{BOWL}_joint0")
     state = sim.state()
     for shift, expected in ((0.9 * PLACE_DISTANCE, True), (1.1 * PLACE_DISTANCE, False)):
@@ -243,7 +243,7 @@ def test_an_object_is_in_place_up_to_the_stated_distance_from_the_start_of_the_e
     assert sim.holds(HOME)
 
 
-def test_a_strict_task_begins_as_its_published_task_does() -> None:
+def test_strict_and_published_start_poses_are_equal() -> None:
     strict, published = Simulation(get_task(TASK)), Simulation(get_task("open_and_close_the_microwave"))
     for seed in (7, 20_000):
         strict.reset(seed)

@@ -1,4 +1,4 @@
-"""SIGKILL at a chosen call, as the kernel or a cluster ends a process: nothing is cleaned up."""
+"""SIGKILL at a chosen call, as the kernel or a cluster ends a process, without cleanup."""
 
 from __future__ import annotations
 

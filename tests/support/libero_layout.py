@@ -1,6 +1,6 @@
 """A demonstration of LIBERO's world as the authors' collecting script would have written it: scene, states, attributes.
 
-Bodies have robosuite's names. Written from the layout's description, with nothing of the reader.
+Bodies have robosuite's names. Written from the layout's description, independent of the reader.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.hdf5.reading import IMAGE_NAMES
+from lerobot_memobench.datasets.hdf5 import IMAGE_NAMES
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.formula import to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, Task
@@ -47,7 +47,7 @@ def write_published(path: Path, demos: Sequence[Demonstration], scene: str | Non
 
 
 def write_foreign(path: Path, demo: Demonstration, **metadata: Any) -> Path:
-    """Write a demonstration as others do: with nothing beyond the layout, and ``metadata`` in its ``meta_data``."""
+    """Write a demonstration with the attributes of the layout only, and ``metadata`` in its ``meta_data``."""
     write_published(path, [demo])
     given = json.loads((demo.task.folder / METADATA_FILE).read_text())
     given = {key: value for key, value in given.items() if key not in ("memory_type", "family", "variants", "prompt")}
@@ -166,7 +166,7 @@ def _scene_xml(task: Task) -> str:
         texture.rgb1 = [0.8, 0.8, 0.8]
     for mesh in spec.meshes:
         if not mesh.file:
-            mesh.usertexcoord = []  # without a picture they say nothing, and MuJoCo writes them incompletely
+            mesh.usertexcoord = []  # useless without a texture, and MuJoCo writes them incompletely
             mesh.userfacetexcoord = []
     spec.compile()
     return str(spec.to_xml())

@@ -1,18 +1,30 @@
-"""Demonstrations of the real simulator that cost next to nothing: few steps, and pictures of any size."""
+"""Demonstrations of the simulator: of the expert, or short ones of random actions, with images of any size."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.replay import resimulate
+from lerobot_memobench.datasets.recording import RecordingSettings, compiled_episode, record
+from lerobot_memobench.datasets.validate import resimulate
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.task import MEMOBENCH
+from lerobot_memobench.tasks.task import MEMOBENCH, Task
+
+
+def record_demonstration(task: Task, seed: int, *, variant: int = 0, **settings: Any) -> Demonstration:
+    """Record a demonstration of the expert, with its images; ``settings`` are fields of `RecordingSettings`."""
+    chosen = RecordingSettings(**settings)
+    shown: list[dict[str, np.ndarray]] = []
+    demo = record(compiled_episode(task.variant(variant), chosen), seed, chosen, shown.append)
+    if not shown:
+        return demo
+    return replace(demo, images={name: np.stack([images[name] for images in shown]) for name in shown[0]})
 
 
 def drawn_steps(task_name: str, seed: int, frames: int, exec_start: int = 0, world: str = MEMOBENCH) -> Demonstration:

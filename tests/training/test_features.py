@@ -12,8 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lookup import FrameLookup
+from lerobot_memobench.datasets.frames import FrameLookup, read_frame_table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.training import features as module
 from lerobot_memobench.training.features import EpisodeFeatures, Features, episode_file, features_folder, make_features

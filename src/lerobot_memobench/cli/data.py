@@ -91,7 +91,7 @@ def generate(
             slurm=cluster,
             finish=finish,
             progress=advance,
-            tell=partial(screen.print, soft_wrap=True),
+            notify=partial(screen.print, soft_wrap=True),
             **named,
         )
     _print_summary(summary, out)
@@ -153,7 +153,7 @@ def convert(
             upside_down=upside_down,
             workers=workers,
             progress=advance,
-            tell=partial(screen.print, soft_wrap=True),
+            notify=partial(screen.print, soft_wrap=True),
             **({} if repo_id is None else {"repo_id": repo_id}),
         )
     for problem in summary.problems:
@@ -275,9 +275,9 @@ def push(
     """Upload a dataset to the Hugging Face hub. The token is that of `hf auth login` or HF_TOKEN. The same command
     continues a broken upload. Files of an earlier dataset there are deleted.
     """
-    from lerobot_memobench.datasets.push import push as run
+    from lerobot_memobench.datasets.publish import push as run
 
-    say(f"dataset: {run(folder, repo_id, private=private, tell=say)}")
+    say(f"dataset: {run(folder, repo_id, private=private, notify=say)}")
     return 0
 
 
@@ -287,11 +287,11 @@ def describe(
     suite: OfSuite = None,
 ) -> int:
     """Summarise a dataset. The card's tables and the hash of every episode, small enough to commit."""
-    from lerobot_memobench.datasets.describe import describe as run
     from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
+    from lerobot_memobench.datasets.publish import describe as run
 
     if suite is not None:
         check_suite_of(folder, suite)
-    for file in run(folder, out or folder / "description", say=say):
+    for file in run(folder, out or folder / "description", notify=say):
         say(file)
     return 0

@@ -1,21 +1,23 @@
 """Convert files in the published HDF5 layout to a LeRobotDataset.
 
-File after file is looked through, and its demonstrations are staged as generated ones are (see `staging`). A file of a
-zip archive is unpacked before and removed afterwards. A file or group that cannot be used is named with its reason. The
-same command continues a killed conversion; it reads the findings on a file instead of looking through it again.
+Each file is inspected, then its demonstrations are staged like generated ones (see `staging`). A file of a zip archive
+is unpacked before and removed afterwards: 340 GiB need not be unpacked at once. A file or group that cannot be used is
+reported with its reason. The same command continues a killed conversion and does not inspect finished files again.
 
 ::
 
     <staging>/episodes/                 finished episodes, see `staging`
-              files/00003.json          findings on the third file
+              files/00003.json          `Findings` of the third file
               unpacked/<name>           the file of an archive that is being converted
 """
 
 from __future__ import annotations
 
 import shutil
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,47 +25,52 @@ from pydantic import BaseModel
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.generation import check_room, run_size
-from lerobot_memobench.datasets.hdf5.archive import Archive, Member, is_archive
-from lerobot_memobench.datasets.hdf5.reading import (
+from lerobot_memobench.datasets.hdf5 import (
     NO_SEED,
-    Problem,
     PublishedDemo,
     PublishedFile,
     Unusable,
-    find_files,
-    usable_or_named,
+    demo_number,
+    first_line,
+    unusable_on_error,
 )
-from lerobot_memobench.datasets.hdf5.restore import restore, task_of, unlike_the_catalogue, world_of
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    DEFAULT_REPO_ID,
-    STAGING,
-    check_destination,
-    check_whole,
-    is_dataset,
-    read_manifest,
-)
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING, Problem, check_destination
+from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
+from lerobot_memobench.datasets.restore import restore, task_of, unlike_the_catalogue, world_of
 from lerobot_memobench.datasets.staging import (
     EpisodeStage,
     StagedJob,
-    compare_requests,
     episode_info,
     episodes_folder,
-    remove_staging,
+    finished_manifest,
     stage_failure,
     staged,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, count_of, free_bytes, in_words, read_json, telling_of_the_disk, write_file
+from lerobot_memobench.io import (
+    Count,
+    check_fetched,
+    count_of,
+    draft_of,
+    file_name,
+    free_bytes,
+    in_words,
+    read_json,
+    telling_of_the_disk,
+    write_file,
+)
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 from lerobot_memobench.sim.worlds import KINDS
 from lerobot_memobench.tasks.task import World
 
+SUFFIXES = (".hdf5", ".h5")
+MACOS_FOLDER = "__MACOSX"
+"""Folder that macOS adds to archives."""
 UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
-"""Bytes of a frame's pictures in the published files, which do not compress them."""
+"""Bytes of a frame's images in the published files, which are not compressed."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +78,10 @@ class ConversionSummary:
     """Outcome of a conversion.
 
     Attributes:
-        folder: the dataset, or None when nothing could be converted.
-        episodes: how many episodes it has.
-        problems: what was left out, and why.
-        notes: differences of what was converted to the catalogue's task of its name.
+        folder: the dataset, or None if no demonstration could be converted.
+        episodes: number of its episodes.
+        problems: files and groups that were left out, and why.
+        notes: differences between converted tasks and the catalogue's tasks of their names.
     """
 
     folder: Path | None
@@ -84,7 +91,7 @@ class ConversionSummary:
 
     @property
     def exit_status(self) -> int:
-        """0 when everything was converted, else 1."""
+        """0 if everything was converted, else 1."""
         return 1 if self.problems or self.folder is None else 0
 
 
@@ -96,311 +103,341 @@ def convert(
     upside_down: bool = False,
     workers: int = 1,
     progress: ProgressCallback | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> ConversionSummary:
     """Convert a file in the published layout, or all in a folder or a zip archive, to a LeRobotDataset in ``out``.
 
     Args:
         source: the file, folder or archive.
-        out: absent, empty, or a conversion of the same files that was not finished.
+        out: absent, empty, or an unfinished conversion of the same files.
         repo_id: name of the dataset.
-        upside_down: the images are stored as robosuite's renderer gives them, bottom row first: turn them up.
-        workers: processes.
+        upside_down: the images are stored bottom row first, as robosuite renders them; flip them.
+        workers: number of processes.
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number,
             and its ``total`` is estimated from the files so far.
-        tell: called with the size of the dataset before the first episode, and with each file of an archive.
+        notify: called with the size of the dataset before the first episode, and with each file of an archive.
 
     Raises:
-        MemobenchError: there is nothing to convert, ``out`` holds something else, its disk has no room (what is
-            finished stays), or LIBERO's assets are not installed, which files of its scenes need.
+        MemobenchError: there is no file to convert, ``out`` holds something else, its disk has no room (finished
+            episodes stay), or LIBERO's assets, which files of its scenes need, are not installed.
     """
     source, out = Path(source).absolute(), Path(out)
-    if not source.exists():
-        raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")
     staging = out / STAGING
-    archive = Archive(source) if is_archive(source) else None
-    files = _files(source) if archive is None else _members(archive, staging.absolute() / "unpacked")
+    files, refused = find_files(source, staging.absolute() / "unpacked")
     request = {"files": [file.identity for file in files], "upside_down": upside_down}
-    if is_dataset(out):
-        return _finished(out, request)
+    manifest = finished_manifest(out, request, "left_out")
+    if manifest is not None:
+        left_out, noted = (tuple(map(Problem.model_validate, manifest.get(key, []))) for key in ("left_out", "notes"))
+        return ConversionSummary(out, len(manifest["episodes"]), left_out, noted)
     check_destination(out)
     with (
-        telling_of_the_disk(out, "what is finished stays, and the same command goes on from there"),
+        telling_of_the_disk(out, "finished episodes stay, and the same command continues"),
         episodes_folder(out, request) as folder,
     ):
-        _tell_size(files, folder, out, tell)
-        conversion = _Conversion(staging, folder, upside_down, workers, progress, sum(file.size for file in files))
+        _report_size(files, folder, out, notify)
+        conversion = _Conversion(source, staging, folder, upside_down, workers, progress, files)
         for number, file in enumerate(files, 1):
-            conversion.add(file, staging / "files" / f"{number:05d}.json", archive, f"{number} of {len(files)}", tell)
-        problems = [*conversion.problems, *(archive.problems if archive is not None else ())]
+            conversion.add(number, file, notify)
+        problems, notes = [*conversion.problems, *refused], conversion.notes
         good = [episode for episode in map(staged, conversion.jobs) if episode.failure is None]
         if good:
-            notes = conversion.notes
+            made_by = (
+                f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; columns that "
+                "they do not hold were computed from their states in the simulator."
+            )
             assemble(
                 good,
                 out,
                 repo_id=repo_id,
-                made_by=f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; "
-                "what they do not hold was read off their states in the simulator."
-                + "".join(f" {note}." for note in notes),
+                made_by=made_by + "".join(f" {note}." for note in notes),
                 manifest={
                     "request": request,
-                    "left_out": [asdict(problem) for problem in problems],
-                    **({"notes": [asdict(note) for note in notes]} if notes else {}),
+                    "left_out": [problem.model_dump() for problem in problems],
+                    **({"notes": [note.model_dump() for note in notes]} if notes else {}),
                 },
                 left_out=[str(problem) for problem in problems],
             )
         shutil.rmtree(staging, ignore_errors=True)
     if not any(out.iterdir()):
         out.rmdir()
-    return ConversionSummary(out if good else None, len(good), tuple(problems), tuple(conversion.notes))
-
-
-def _finished(out: Path, request: dict[str, Any]) -> ConversionSummary:
-    """Report a conversion that is finished already."""
-    try:
-        manifest = read_manifest(out)
-        earlier, left_out = manifest["request"], manifest["left_out"]
-    except (FileNotFoundError, KeyError):
-        raise MemobenchError(
-            f"{out} already holds a dataset that this command did not make; name another folder"
-        ) from None
-    compare_requests(earlier, request, f"{out} already holds a finished conversion", "name another folder")
-    check_whole(out)
-    remove_staging(out)
-    problems, notes = (tuple(Problem(**each) for each in part) for part in (left_out, manifest.get("notes", [])))
-    return ConversionSummary(out, len(manifest["episodes"]), problems, notes)
+    return ConversionSummary(out if good else None, len(good), tuple(problems), tuple(notes))
 
 
 # --- the files ---
 
 
 @dataclass(frozen=True)
-class _File:
+class SourceFile:
     """A file to convert.
 
     Attributes:
-        name: within the source. size: bytes, unpacked.
-        path: where it is read. member: its place in an archive, from which it is unpacked to ``path``.
+        name: path within the source.
+        size: bytes, unpacked.
+        path: place where it is read.
         identity: distinguishes it from another file of the same name.
+        member: its entry in an archive, from which it is unpacked to ``path``; None for a file of a folder.
     """
 
     name: str
     size: int
     path: Path
     identity: list[Any]
-    member: Member | None = None
+    member: zipfile.ZipInfo | None = None
 
 
-def _files(source: Path) -> list[_File]:
-    """Return the HDF5 files of a path, by their names below it."""
-    found = []
-    for path in find_files(source):
-        name, stat = path.name if path == source else path.relative_to(source).as_posix(), path.stat()
-        found.append(_File(name, stat.st_size, path, [name, stat.st_size, stat.st_mtime_ns]))
-    return found
+def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Problem]]:
+    """Return the HDF5 files of a path, sorted by name, and the files of an archive whose names are refused.
+
+    Args:
+        source: a file, a folder, or a zip archive, whose files are unpacked below ``unpacked``.
+
+    Raises:
+        MemobenchError: there is none, or the archive is damaged.
+    """
+    if not source.exists():
+        raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")
+    files, refused = [], []
+    if source.is_file() and source.suffix.lower() == ".zip":
+        for info in _entries(source):
+            try:
+                name = "/".join(file_name(part, "a part of its name") for part in info.filename.split("/"))
+            except MemobenchError as error:
+                printable = "".join(letter if letter.isprintable() else "?" for letter in info.filename)[:200]
+                refused.append(Problem(file=printable, group="", reason=str(error)))
+            else:
+                identity = [name, info.file_size, info.CRC]
+                files.append(SourceFile(name, info.file_size, unpacked / name, identity, info))
+    else:
+        paths = (
+            [source]
+            if source.is_file()
+            else sorted(path for path in source.rglob("*") if path.suffix in SUFFIXES and path.is_file())
+        )
+        for path in paths:
+            name, stat = path.name if path == source else path.relative_to(source).as_posix(), path.stat()
+            files.append(SourceFile(name, stat.st_size, path, [name, stat.st_size, stat.st_mtime_ns]))
+    if not files and not refused:
+        raise MemobenchError(
+            f"found no HDF5 file ({', '.join(SUFFIXES)}) in {source}; name a file, a folder of them, or a zip archive"
+        )
+    return files, refused
 
 
-def _members(archive: Archive, unpacked: Path) -> list[_File]:
-    """Return the HDF5 files of an archive, which are unpacked below a folder."""
-    return [
-        _File(member.name, member.size, unpacked / member.name, [member.name, member.size, member.checksum], member)
-        for member in archive.members
-    ]
+def _entries(archive: Path) -> list[zipfile.ZipInfo]:
+    """Return the entries of an archive's HDF5 files, sorted by name."""
+    check_fetched(archive)
+    try:
+        with zipfile.ZipFile(archive) as file:
+            entries = file.infolist()
+    except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
+        raise MemobenchError(
+            f"{archive} is no zip archive, or was not downloaded completely ({first_line(error)}); download it again"
+        ) from None
+    found = [e for e in entries if Path(e.filename).suffix in SUFFIXES and not e.filename.startswith(MACOS_FOLDER)]
+    return sorted(found, key=lambda entry: entry.filename)
 
 
-def _tell_size(files: Sequence[_File], folder: Path, out: Path, tell: Callable[[str], None]) -> None:
+def unpack(archive: Path, file: SourceFile) -> None:
+    """Write a file of an archive to its path.
+
+    Raises:
+        Unusable: it cannot be unpacked, or has another length than stated.
+    """
+    assert file.member is not None
+    file.path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with draft_of(file.path) as draft:
+            with zipfile.ZipFile(archive) as opened, opened.open(file.member) as packed, draft.open("wb") as unpacked:
+                shutil.copyfileobj(packed, unpacked, 2**22)
+            if draft.stat().st_size != file.size:
+                raise Unusable(f"it is {draft.stat().st_size} bytes long, expected {file.size}")
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
+        raise Unusable(f"it cannot be unpacked ({first_line(error)}); download the archive again") from None
+
+
+def _report_size(files: Sequence[SourceFile], folder: Path, out: Path, notify: Callable[[str], None]) -> None:
     """Report the size of the dataset, and of the largest unpacked file, before either is made."""
-    sizes = [file.size for file in files]
-    total, largest = sum(sizes), max(sizes, default=0)
+    total, largest = sum(file.size for file in files), max((file.size for file in files), default=0)
     size = run_size(total // UNPACKED_FRAME, IMAGE_SIZE)
     there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    what, work = f"{count_of(len(files), 'file')} of {in_words(total)}", 0
+    work, extra = f"{count_of(len(files), 'file')} of {in_words(total)}", 0
     if any(file.member is not None for file in files):
-        what, work = f"{what}, unpacked one by one (up to {in_words(largest)})", largest
-    check_room(out, size, min(there, size), tell, what, work=work)
+        work, extra = f"{work}, unpacked one by one (up to {in_words(largest)})", largest
+    check_room(out, size, min(there, size), notify, work, extra=extra)
 
 
-# --- findings on a file ---
+# --- inspection of a file ---
 
 
 class Sound(BaseModel):
-    """A demonstration that can be converted: its group, height and width of all pictures, its length."""
+    """A demonstration that can be converted: its group, and height and width of its images."""
 
     group: str
     height: Count
     width: Count
-    frames: Count
-
-
-class LeftOut(BaseModel):
-    """A group that cannot be used, "" for the file as a whole."""
-
-    group: str
-    reason: str
 
 
 class Findings(BaseModel):
-    """Demonstrations, problems and notes of a file, and the world of its scenes; kept as JSON."""
+    """Demonstrations, problems and notes of a file, and the world of its scenes."""
 
     demonstrations: list[Sound] = []
-    problems: list[LeftOut] = []
-    notes: list[str] = []
+    problems: list[Problem] = []
+    notes: list[Problem] = []
     world: World | None = None
 
 
-def look_through(path: Path, world: World | None) -> Findings:
-    """Return the findings on a file; ``world`` is that of the files before it.
+def inspect(file: SourceFile, world: World | None) -> Findings:
+    """Return the findings of a file; ``world`` is that of the files before it.
 
     Raises:
-        MemobenchError: its world's files are not installed.
+        MemobenchError: the assets of its world are not installed.
     """
     found = Findings(world=world)
+
+    def leave_out(group: str, reason: object) -> None:
+        found.problems.append(Problem(file=file.name, group=group, reason=str(reason)))
+
     try:
-        with PublishedFile(path) as file, usable_or_named():
-            found.problems += [LeftOut(group="data", reason=reason) for reason in _miscounted(file)]
-            for group in file.groups():
+        with PublishedFile(file.path) as opened, unusable_on_error():
+            announced, groups = opened.announced(), opened.groups()
+            if announced not in (None, len(groups)):
+                leave_out("data", f"its num_demos is {announced}, but there are {len(groups)} demonstrations")
+            if not groups:
+                leave_out("data", "it has no demonstrations")
+            for group in groups:
                 try:
-                    demo = file.read(group)
+                    demo = opened.read(group)
                     found.world = _checked_world(demo, found.world)
-                    height, width = demo.image_size
-                    found.demonstrations.append(Sound(group=group, height=height, width=width, frames=len(demo.states)))
-                    found.notes += [note for note in _notes(file, demo) if note not in found.notes]
                 except Unusable as error:
-                    found.problems.append(LeftOut(group=f"data/{group}", reason=str(error)))
+                    leave_out(f"data/{group}", error)
+                    continue
+                height, width = demo.image_size
+                found.demonstrations.append(Sound(group=group, height=height, width=width))
+                notes = [Problem(file=file.name, group="", reason=note) for note in _notes(opened, demo)]
+                found.notes += [note for note in notes if note not in found.notes]
     except Unusable as error:
-        found.problems.append(LeftOut(group="", reason=str(error)))
+        leave_out("", error)
     return found
 
 
 def _checked_world(demo: PublishedDemo, others: World | None) -> World:
     world = world_of(demo)
     if world != (others or world):
-        raise Unusable(f"its scenes are of world={world}, those before of {others}; convert each by itself")
+        raise Unusable(f"its scenes are of world={world}, those before of {others}; convert each world separately")
     KINDS[world].check()
     return world
 
 
 def _notes(file: PublishedFile, demo: PublishedDemo) -> list[str]:
-    """Return how a demonstration differs from this package's; nothing where it makes no task or scene."""
+    """Return differences of a demonstration's task to the catalogue's; errors are reported by its conversion."""
     try:
         task = task_of(file, demo).variant(0)
-        reasons = [unlike_the_catalogue(task)]
-    except MemobenchError:  # named when it is converted
+        notes = [unlike_the_catalogue(task)]
+    except MemobenchError:
         return []
     if file.lacks_its_text:
-        reasons.append(f"bddl_file_content is no text: the task is the catalogue's {task.name}")
-    return [reason for reason in reasons if reason]
+        notes.append(f"bddl_file_content is no text: the task is the catalogue's {task.name}")
+    return [note for note in notes if note]
 
 
-def _miscounted(file: PublishedFile) -> list[str]:
-    announced, count = file.announced(), len(file.groups())
-    reasons = []
-    if announced is not None and announced != count:
-        reasons.append(f"its num_demos is {announced}, but there are {count} demonstrations")
-    if not count:
-        reasons.append("it has no demonstrations")
-    return reasons
-
-
-# --- the work ---
+# --- conversion ---
 
 
 class _Conversion:
-    """The episodes of file after file.
+    """Stage the episodes of one file after another.
 
     Attributes:
         jobs: one per demonstration that can be converted, all of them run.
-        problems, notes: on the files so far, in their order.
+        problems, notes: of the files so far, in their order.
     """
 
     def __init__(
         self,
+        source: Path,
         staging: Path,
         folder: Path,
         upside_down: bool,
         workers: int,
         progress: ProgressCallback | None,
-        size: int,
+        files: Sequence[SourceFile],
     ) -> None:
         self.jobs: list[ConversionJob] = []
         self.problems: list[Problem] = []
         self.notes: list[Problem] = []
-        self._staging, self._folder, self._upside_down = staging, folder, upside_down
-        self._workers, self._progress, self._size = workers, progress, size
-        self._read = self._found = 0
+        self._source, self._staging, self._folder, self._upside_down = source, staging, folder, upside_down
+        self._workers, self._progress, self._files = workers, progress, files
+        self._resumed = 0
         self._world: World | None = None
         shutil.rmtree(staging / "unpacked", ignore_errors=True)  # a killed run may have left a part
         (staging / "files").mkdir(exist_ok=True)
 
-    def add(self, file: _File, record: Path, archive: Archive | None, which: str, tell: Callable[[str], None]) -> None:
-        """Look through a file and stage its demonstrations.
-
-        Args:
-            record: file of its findings. archive: it is a member of. which: its number, for ``tell``.
-        """
-        findings: Findings | None
-        try:
-            findings = read_json(record, Findings, "delete it to look through the file again")
-        except FileNotFoundError:
-            findings = None
-        jobs = self._jobs_of(file, findings) if findings is not None else []
-        if archive is not None and (findings is None or not all(job.finished() for job in jobs)):
-            tell(f"file {which}: {file.name}, {in_words(file.size)}")
-            findings = self._unpack(archive, file, findings)
+    def add(self, number: int, file: SourceFile, notify: Callable[[str], None]) -> None:
+        """Inspect a file and stage its demonstrations; ``number`` counts from 1."""
+        record = self._staging / "files" / f"{number:05d}.json"
+        findings = _read_findings(record)
+        if file.member is not None and not (findings and all(job.finished() for job in self._jobs_of(file, findings))):
+            notify(f"file {number} of {len(self._files)}: {file.name}, {in_words(file.size)}")
+            findings = self._unpack(file, findings)
         if findings is None:
-            findings = look_through(file.path, self._world)
+            findings = inspect(file, self._world)
         write_file(record, findings.model_dump_json(), durable=True)
         self._world = findings.world
         jobs = self._jobs_of(file, findings)
-        self._read += file.size
-        run_jobs(jobs, workers=self._workers, progress=self._ahead(len(jobs)))
+        run_jobs(jobs, workers=self._workers, progress=self._progress and self._counting(number, len(jobs)))
         self.jobs += jobs
         if file.member is not None:
             file.path.unlink(missing_ok=True)
-        failed = [(job.group, staged(job).failure) for job in jobs]
-        self.problems += [Problem(file.name, problem.group, problem.reason) for problem in findings.problems]
-        self.problems += [Problem(file.name, f"data/{group}", reason) for group, reason in failed if reason is not None]
-        self.notes += [Problem(file.name, "", note) for note in findings.notes]
+        failed = [(f"data/{job.group}", reason) for job in jobs if (reason := job.failure()) is not None]
+        self.problems += [
+            *findings.problems,
+            *(Problem(file=file.name, group=group, reason=reason) for group, reason in failed),
+        ]
+        self.notes += findings.notes
 
-    def _unpack(self, archive: Archive, file: _File, findings: Findings | None) -> Findings | None:
-        """Unpack a member; return the findings on it, those that it cannot be unpacked among them."""
-        assert file.member is not None
-        unpacked = self._staging / "unpacked"
-        if (free := free_bytes(unpacked)) < file.size:
+    def _unpack(self, file: SourceFile, findings: Findings | None) -> Findings | None:
+        """Unpack a file of the archive; return its findings, or the reason if it cannot be unpacked."""
+        if (free := free_bytes(self._staging)) < file.size:
             raise MemobenchError(
                 f"{file.name} takes {in_words(file.size)} unpacked, but {in_words(free)} are free in {self._staging}; "
-                "make room, and the same command goes on from there"
+                "make room, then repeat the command to continue"
             )
         try:
-            archive.extract(file.member, unpacked)
+            unpack(self._source, file)
         except Unusable as error:
-            if findings is not None:  # its demonstrations were found by an earlier run
-                raise MemobenchError(f"{archive.path}, {file.name}: {error}") from None
-            return Findings(problems=[LeftOut(group="", reason=str(error))], world=self._world)
+            if findings is not None:  # an earlier run found its demonstrations
+                raise MemobenchError(f"{self._source}, {file.name}: {error}") from None
+            problem = Problem(file=file.name, group="", reason=str(error))
+            return Findings(problems=[problem], world=self._world)
         return findings
 
-    def _jobs_of(self, file: _File, findings: Findings) -> list[ConversionJob]:
-        """Return the jobs of a file; they refuse pictures of another size than the first one's."""
+    def _jobs_of(self, file: SourceFile, findings: Findings) -> list[ConversionJob]:
+        """Return the jobs of a file; they refuse images of another size than the first demonstration's."""
         first, jobs = len(self.jobs), list[ConversionJob]()
         for number, demo in enumerate(findings.demonstrations, first):
             size = next((job.image_size for job in (*self.jobs[:1], *jobs[:1])), (demo.height, demo.width))
-            folder = self._folder / f"{number:06d}"
-            jobs.append(ConversionJob(file.path, demo.group, folder, size, self._upside_down))
+            jobs.append(ConversionJob(file.path, demo.group, self._folder / f"{number:06d}", size, self._upside_down))
         return jobs
 
-    def _ahead(self, here: int) -> ProgressCallback:
-        """Return the callback of a file's jobs; the files after it are taken to be as full as those before."""
-        before, found = len(self.jobs), self._found
-        episodes = before + here
-        total = episodes + round((self._size - self._read) * episodes / max(self._read, 1))
+    def _counting(self, number: int, jobs: int) -> ProgressCallback:
+        """Return the callback of a file's jobs; later files are assumed to have as many episodes per byte."""
+        before, resumed = len(self.jobs), self._resumed
+        read, size = (sum(file.size for file in files) for files in (self._files[:number], self._files))
+        total = round((before + jobs) * size / max(read, 1))
 
         def advance(news: Advance) -> None:
-            self._found = found + news.found
-            if self._progress is not None:
-                self._progress(replace(news, done=before + news.done, total=total, found=self._found))
+            self._resumed = resumed + news.found
+            assert self._progress is not None
+            self._progress(replace(news, done=before + news.done, total=total, found=self._resumed))
 
         return advance
+
+
+def _read_findings(record: Path) -> Findings | None:
+    try:
+        found: Findings = read_json(record, Findings, "delete it to inspect the file again")
+    except FileNotFoundError:
+        return None
+    return found
 
 
 @dataclass(frozen=True)
@@ -421,7 +458,7 @@ class ConversionJob(StagedJob):
     @property
     def seed(self) -> int:
         """The group's number."""
-        return int(self.group.removeprefix("demo_"))
+        return demo_number(self.group) or 0
 
     def run(self) -> None:
         """Stage the episode, or the reason why it cannot be used."""
@@ -440,7 +477,7 @@ class ConversionJob(StagedJob):
             raise
 
     def _restored(self, file: PublishedFile) -> Demonstration:
-        with usable_or_named():
+        with unusable_on_error():
             found = file.read(self.group)
             if found.image_size != self.image_size:
                 raise Unusable(
@@ -448,5 +485,5 @@ class ConversionJob(StagedJob):
                     f"demonstration {self.image_size[0]}×{self.image_size[1]}"
                 )
             demo = restore(task_of(file, found), found)
-            EpisodeRecord.model_validate(episode_info(demo))  # it ends one episode here, and all of them in assembly
+            EpisodeRecord.model_validate(episode_info(demo))  # a bad value ends this episode, not the assembly of all
             return demo

@@ -1,8 +1,7 @@
-"""The one in-memory form of a demonstration, its labels and its hash.
+"""A demonstration in memory, its labels and its hash.
 
-An episode is recorded by the scripted expert, read from HDF5 or taken from a rollout; whatever its origin it becomes a
-:class:`Demonstration`. Every checkpoint column of a dataset is a function of it, `labels`, so that writers, validators
-and policies cannot disagree about its meaning.
+Episodes recorded by the scripted expert and episodes read from HDF5 both become a `Demonstration`. Every checkpoint
+column of a dataset is computed from it by `labels`, so that writers, validators and policies use the same definition.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ from lerobot_memobench.tasks.task import LEVELS, MEMOBENCH, OPERATIONS, Task
 MAX_CHECKPOINTS = 6
 """Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
 MIN_FRAMES_BETWEEN_ROWS = 5
-"""LeRobot's ``emitted_at`` looks 0.1 s to either side and raises when it finds two rows of a style, so rows
-of one style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
-LATER = ("step", "coarse_subgoal", "subtask")
-"""Labels that an episode's hash leaves out."""
+"""LeRobot's ``emitted_at`` searches 0.1 s to either side and raises if it finds two rows of a style, so rows of one
+style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
+NOT_HASHED = ("step", "coarse_subgoal", "subtask")
+"""Labels that are not part of an episode's hash."""
 LanguageRow = dict[str, Any]
 
 
@@ -45,27 +44,27 @@ class Demonstration:
     """One episode, T frames of it; frame t is the observation before ``actions[t]`` was applied.
 
     Attributes:
-        task: the task as it was carried out; with ``variant`` k > 0 this is ``task.variant(k)`` already.
+        task: the performed variant of the task: ``task.variant(k)`` for ``variant`` k > 0.
         seed: seed of the scene.
         referent: ``"fixed"`` or ``"random"``; of a strict task ``"drawn"``.
-        variant: which admissible referent or order was asked for; 0 is the published one.
+        variant: number of the requested referent or order; 0 is the published one.
         states: (T, D) float64, the simulator's flattened state (1 + nq + nv).
-        actions: (T, 7) float32, OSC pose deltas and gripper: the label of this frame.
+        actions: (T, 7) float32, OSC pose deltas and gripper: labels of the frames.
         proprio: (T, 8) float32, end-effector position 3, axis-angle 3, gripper joints 2.
         images: ``{"image", "wrist_image"}`` to (T, H, W, 3) uint8, or None.
-        exec_start: the frame at which execution starts; the frames before it are the demonstration prompt, and those
-            in which the robot idles and the actions are zeros.
-        satisfied: (T, K) bool, predicate of checkpoint k true at frame t; false throughout the prompt. The
-            world is evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
+        exec_start: first frame of the execution; frames before it are the demonstration prompt and idle frames, whose
+            actions are zeros.
+        satisfied: (T, K) bool, whether the predicate of checkpoint k is true at frame t; false in the prompt.
+            Predicates are evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
         success: whether the goal was reached.
         objects: (T, SIZE) float32, the visible objects (`sim.object_slots`).
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
         scene_hash: hash of the initial scene, or empty.
-        stand_ins: classes of the scene with missing scans, for which others were used.
-        executed: (T, 7) float32, the actions really applied where the arm was moved off its way; None: ``actions``.
+        stand_ins: classes of the scene whose missing scans were replaced by boxes.
+        executed: (T, 7) float32, the applied actions of a perturbed episode; None: ``actions``.
 
     Raises:
-        MemobenchError: arrays of different length, or of another type or width than stated above.
+        MemobenchError: arrays have different lengths, or another type or width than stated above.
     """
 
     task: Task
@@ -104,7 +103,7 @@ class Demonstration:
         if not 0 <= self.exec_start < length:
             raise MemobenchError(
                 f"{self._where()}: execution starts at frame {self.exec_start} of {length}; "
-                "it must be one of the episode's frames"
+                "expected one of the episode's frames"
             )
         if self.satisfied[: self.exec_start].any():
             raise MemobenchError(
@@ -132,7 +131,7 @@ class Demonstration:
 
     @property
     def applied(self) -> NDArray[np.float32]:
-        """The actions (T, 7) that moved the arm: played again, they give the states."""
+        """The applied actions (T, 7); replaying them gives the states."""
         return self.actions if self.executed is None else self.executed
 
 
@@ -141,22 +140,22 @@ class Demonstration:
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Per-frame columns of one episode of T frames (attribute to column name: :meth:`columns`).
+    """Per-frame columns of one episode of T frames; see `columns` for their names in a dataset.
 
     Attributes:
         phase: (T,) int64, 0 prompt, 1 execution.
-        step: (T,) int64, control steps since that phase began; `NO_CLOCK` in the execution of a task that idles.
-        index: (T,) int64, checkpoints completed in order at frames before t: the number of the one worked on.
-        operation: (T,) int64, 0 S, 1 U, 2 C of that checkpoint, -1 when none is left.
-        completed: (T, 6) bool, checkpoint k has been satisfied at some frame up to and including t.
-        event: (T,) bool, some checkpoint is satisfied for the first time at frame t.
-        simple_subgoal: T strings, intermediate-level text of the checkpoint worked on. Once all are done the
-            last one's text stays (``operation`` is -1 there), so the column is never empty.
+        step: (T,) int64, control steps since the phase began; `NO_CLOCK` in the execution of a task that idles.
+        index: (T,) int64, number of checkpoints completed in order before frame t: index of the present one.
+        operation: (T,) int64, 0 S, 1 U, 2 C of the present checkpoint, -1 after the last one.
+        completed: (T, 6) bool, whether checkpoint k was satisfied at any frame up to and including t.
+        event: (T,) bool, whether any checkpoint is satisfied for the first time at frame t.
+        simple_subgoal: T strings, intermediate-level text of the present checkpoint. After the last one its text
+            remains (``operation`` is -1 there), so the column is never empty.
         grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
         memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
             "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
-        subtask: T strings, the checkpoint worked on as an instruction: in LeRobot's language rows, and no column.
-        key_frames: (K,) int64, the frame at which checkpoint k was completed in order, -1 if it never was.
+        subtask: T strings, the present checkpoint as an instruction; used in LeRobot's language rows only.
+        key_frames: (K,) int64, frame at which checkpoint k was completed in order, -1 if it never was.
     """
 
     phase: NDArray[np.int64]
@@ -191,21 +190,20 @@ class Labels:
 def labels(demo: Demonstration) -> Labels:
     """Compute every checkpoint column of a demonstration.
 
-    A checkpoint is completed in order at the first frame at which its predicate holds while all earlier ones
-    have been completed (at that frame or before it). Several may be completed at one frame. A predicate that
-    held too early and no longer holds when its turn comes is not completed, though ``completed`` and
-    ``event``, which ignore the order, show it.
+    A checkpoint is completed in order at the first frame at which its predicate is true and all earlier checkpoints
+    were completed at this frame or before. Several may be completed at one frame. A predicate that was true too early
+    and is false in its turn is not completed in order; ``completed`` and ``event`` ignore the order.
     """
     task, length = demo.task, len(demo)
     if len(task.checkpoints) > MAX_CHECKPOINTS:
         raise MemobenchError(
             f"task {task.name} has {len(task.checkpoints)} checkpoints; the column checkpoint.completed has room for "
-            f"{MAX_CHECKPOINTS}, so merge some of them"
+            f"{MAX_CHECKPOINTS}; merge some of them"
         )
     key_frames = _ordered_completion(demo.satisfied)
     index = np.searchsorted(key_frames[key_frames >= 0], np.arange(length), side="left").astype(np.int64)
     ever = np.logical_or.accumulate(demo.satisfied, axis=0)
-    # One entry per value of index, 0 ... K; the last means "none left". A code is a position in "SUC".
+    # One entry per value of index, 0 ... K; the last follows the last checkpoint. A code is a position in "SUC".
     codes = [OPERATIONS.index(checkpoint.operation) for checkpoint in task.checkpoints] + [-1]
     texts = {level: _subgoals(task, number) for number, level in enumerate(LEVELS)}
     subtasks = subtask_texts(task)
@@ -243,7 +241,7 @@ def _ordered_completion(satisfied: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _subgoals(task: Task, level: int) -> list[str]:
-    """K + 1 texts; once all checkpoints are done the last one's stays. A task without any has its instruction."""
+    """Return K + 1 texts, the last one repeated; a task without checkpoints has its instruction."""
     texts = [checkpoint.language[level] for checkpoint in task.checkpoints] or [task.language]
     return [*texts, texts[-1]]
 
@@ -254,14 +252,13 @@ def _subgoals(task: Task, level: int) -> list[str]:
 def persistent_rows(found: Labels) -> list[LanguageRow]:
     """Return an episode's language rows for LeRobot's training recipes, sorted by timestamp, style, role.
 
-    LeRobot keeps them in the column ``language_persistent``: one list per episode, repeated on every frame, each row
+    LeRobot stores them in the column ``language_persistent``: one list per episode, repeated on every frame, each row
     active from its timestamp until the next of its style (``lerobot.datasets.language``). The styles are those of its
-    annotation pipeline: ``subtask`` (the next thing to do, as an instruction) and ``memory`` (the things done, in the
-    past tense; none before the first completion).
+    annotation pipeline: ``subtask`` (the next step, as an instruction) and ``memory`` (the completed steps, in the past
+    tense; none before the first completion).
 
-    A text that is replaced again within 0.2 s (checkpoints completed at nearly the same time) gets no row;
-    the text before it stays active until the one after it begins, so a row never claims something too early.
-    The per-frame string columns keep every change.
+    A text that is replaced within 0.2 s gets no row: the text before it stays active until the one after it begins, so
+    no row names a completion too early. The per-frame string columns contain every change.
     """
     rows = [_row("subtask", text, frame) for frame, text in _changes(found.subtask)]
     rows += [_row("memory", text, frame) for frame, text in _changes(found.memory) if text]
@@ -276,7 +273,7 @@ def _changes(texts: list[str]) -> list[tuple[int, str]]:
             continue
         if kept and frame - kept[-1][0] < MIN_FRAMES_BETWEEN_ROWS:
             replaced, _ = kept.pop()
-            frame = 0 if replaced == 0 else frame  # something must be active from the episode's first frame on
+            frame = 0 if replaced == 0 else frame  # a text must be active from the first frame on
         kept.append((frame, text))
     return kept
 
@@ -289,9 +286,8 @@ def _row(style: str, text: str, frame: int) -> LanguageRow:
         "content": text,
         "style": style,
         "timestamp": timestamp,
-        # LeRobot's annotation writer puts None here, and then its own `lerobot-dataset-viz` cannot open the dataset:
-        # it batches frames with torch's collate function, which knows no None. Empty means the same to LeRobot's
-        # recipes: they look at a camera only when asked for one, and at tool calls if there are any.
+        # LeRobot's annotation writer uses None here, but `lerobot-dataset-viz` cannot open such a dataset: torch's
+        # collate function does not accept None. LeRobot's recipes treat empty values like None.
         "camera": "",
         "tool_calls": [],
     }
@@ -303,9 +299,9 @@ def _row(style: str, text: str, frame: int) -> LanguageRow:
 def digest(demo: Demonstration) -> str:
     """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
 
-    Images are left out: they follow from the states, and a renderer may differ in a pixel where physics does
-    not. So are the visible objects, and ``step``, ``coarse_subgoal`` and ``subtask``, which the other columns and the
-    task decide: they came later than the first datasets, and their hashes stay what they are.
+    Images are not hashed: they are determined by the states, and a renderer may differ in a pixel where physics does
+    not. Visible objects and the labels of `NOT_HASHED` are determined by the other columns too; hashing them would
+    change the hashes of earlier datasets.
     """
     found = labels(demo)
     identity = {
@@ -320,7 +316,7 @@ def digest(demo: Demonstration) -> str:
     columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
     if demo.executed is not None:
         columns["executed"] = demo.executed
-    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in LATER}
+    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in NOT_HASHED}
     # Independent of byte order, memory layout and dictionary order.
     sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
     for name in sorted(columns):

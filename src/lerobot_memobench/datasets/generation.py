@@ -1,8 +1,8 @@
-"""Demonstrations made by the scripted experts, and the dataset that they become.
+"""Generate demonstrations with the scripted experts, and assemble them to a dataset.
 
-A run can be killed at any moment and goes on when the same command is given again: finished episodes wait in
-``DIR/.staging`` (see ``staging``), the dataset is assembled from them at the end. Each episode is a function
-of task, seed and settings, so neither interruptions nor the number of workers change the result.
+A run that was killed is continued when the same command is given again: finished episodes are kept in ``DIR/.staging``
+(see `staging`), and the dataset is assembled from them at the end. Each episode is a function of task, seed and
+settings, so neither interruptions nor the number of workers change the result.
 """
 
 from __future__ import annotations
@@ -19,22 +19,9 @@ from typing import Any
 
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.card import SCRIPTED
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    DEFAULT_REPO_ID,
-    STAGING,
-    check_destination,
-    check_whole,
-    is_dataset,
-    read_manifest,
-)
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING, check_destination, is_dataset
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.staging import (
-    FINISHED_EARLY,
-    compare_requests,
-    episodes_folder,
-    remove_staging,
-    staged,
-)
+from lerobot_memobench.datasets.staging import FINISHED_EARLY, episodes_folder, finished_manifest, staged
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import free_bytes, in_words, telling_of_the_disk
 from lerobot_memobench.jobs.processes import ProgressCallback
@@ -51,11 +38,11 @@ FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
 }
-"""Frames of a demonstration, prompt included, on average over the full runs (docs/research/demonstration_runs.md).
-Frames in which a robot idles take next to no time and room."""
-FRAME_BYTES, PICTURES_BYTES = 800, 5_400
-"""Bytes of a frame without pictures, and of both cameras' videos per frame at 256 × 256."""
-FRAME_SECONDS, PICTURES_SECONDS = 0.0045, 0.011
+"""Mean frames of a demonstration, prompt included, in the full runs (docs/research/demonstration_runs.md). Frames in
+which a robot idles are not counted: they take little time and room."""
+FRAME_BYTES, IMAGES_BYTES = 800, 5_400
+"""Bytes of a frame without images, and of both cameras' videos per frame at 256 × 256."""
+FRAME_SECONDS, IMAGES_SECONDS = 0.0045, 0.011
 """Seconds of one core to make a frame, and to draw and encode both cameras at 256 × 256."""
 
 
@@ -76,27 +63,29 @@ def generate(
     repo_id: str = DEFAULT_REPO_ID,
     finish: bool = False,
     progress: ProgressCallback | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> GenerationSummary:
     """Make ``episodes`` demonstrations of each task (with a prompt: ``prompted_episodes``) into the folder ``out``.
 
-    Failed episodes are in no dataset, but in the summary, the manifest and the card. An unfinished run of the same
-    request in ``out`` is continued, a finished one only reported.
+    Failed episodes are not in the dataset, but in the summary, the manifest and the card. An unfinished run of the same
+    request in ``out`` is continued; a finished one is reported again.
 
     Args:
-        tasks: to demonstrate. episodes, prompted_episodes: of each, without and with a prompt. out: destination.
+        tasks: tasks to demonstrate.
+        episodes, prompted_episodes: demonstrations of each task without and with a prompt.
+        out: destination.
         seed_base: episode i has the scene of seed ``seed_base`` + i.
         workers: episodes made at a time.
-        slurm: make them on Slurm (`slurm_of`); the call returns when the jobs are submitted, and the last of them
-            writes the dataset.
-        finish: make the dataset of an unfinished run's episodes, and no other episode.
-        tell: called, before the first episode, with about how large the dataset will be and how long it will take.
+        slurm: make them on Slurm (`slurm_of`); the call returns after submission, and the last job assembles the
+            dataset.
+        finish: assemble the dataset of an unfinished run's episodes, and make no further episode.
+        notify: called before the first episode with the approximate size and duration.
         referent, images, image_size, demonstration_prompt, perturb: see `recording.RecordingSettings`.
 
     Raises:
-        MemobenchError: nothing to do, seeds of a guarded split, ``out`` holds something else or a damaged dataset,
+        MemobenchError: invalid arguments, seeds of a guarded split, ``out`` holds something else or a damaged dataset,
             another run is writing there, its disk has no room (finished episodes stay), or an episode could not be run
-            at all (which no later run would change).
+            at all, which no later run would change.
     """
     most = episodes if prompted_episodes is None else prompted_episodes
     if not tasks or min(episodes, most, workers) < 1:
@@ -109,28 +98,28 @@ def generate(
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
     if hiding is not None and not demonstration_prompt:
         raise MemobenchError(
-            f"demonstrations of {hiding.name} were asked for without its demonstration prompt, which hides what is to "
-            "be found; leave out --no-demonstration-prompt"
+            f"demonstrations of {hiding.name} were asked for without its demonstration prompt, which hides the object "
+            "to find; leave out --no-demonstration-prompt"
         )
     referent = referent_text(referent, drawn=all(task.drawn for task in tasks))
     settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb)
     plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, repo_id)
     if finish:
         return _finish_early(plan, Path(out))
-    if slurm is None:  # there, each job checks its own machine
+    if slurm is None:  # on Slurm, each job checks its own machine
         KINDS[plan.world].check()
-    return _carry_out(plan, Path(out), workers, slurm=slurm, progress=progress, tell=tell)
+    return _run(plan, Path(out), workers, slurm=slurm, progress=progress, notify=notify)
 
 
 def slurm_of(out: Path, options: tuple[str, ...]) -> Slurm:
-    """Return how `generate` submits to Slurm. Its logs outlive the run, so they have a folder next to the dataset."""
+    """Return Slurm settings for `generate`. Logs outlive the run, so their folder is next to the dataset."""
     out = out.absolute()
     return Slurm(options, NEEDS, out.with_name(f"{out.name}_slurm"))
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """Episodes that a run is asked for, wherever they are made."""
+    """Episodes that a run has to make."""
 
     tasks: tuple[Task, ...]
     episodes: int
@@ -144,16 +133,16 @@ class _Plan:
         if len(set(names)) < len(names):
             raise MemobenchError(f"a task was named twice among {', '.join(names)}; name each once")
         if len({task.world for task in self.tasks}) > 1:
-            raise MemobenchError("tasks of two worlds were asked for; make a dataset of each world by itself")
+            raise MemobenchError("tasks of two worlds were asked for; make a dataset of each world")
 
     @property
     def world(self) -> str:
-        """Of all its scenes."""
+        """World of all scenes."""
         return self.tasks[0].world
 
     @property
     def request(self) -> dict[str, Any]:
-        """Settings that must agree for two runs to be one."""
+        """Settings that an unfinished run must share to be continued."""
         return {
             "tasks": [task.name for task in self.tasks],
             "episodes": self.episodes,
@@ -168,16 +157,16 @@ class _Plan:
 
     @property
     def made_by(self) -> str:
-        """A sentence for the card."""
+        """Sentences for the card."""
         prompts = "" if self.settings.demonstration_prompt else ", demonstration prompts left out"
         more = "" if self.prompted_episodes is None else f" ({self.prompted_episodes} of those with a prompt)"
         seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
         seeds += "" if self.world == MEMOBENCH else f", world {self.world}"
-        moved = ", the arm moved off its way at random in two thirds of them" if self.settings.perturb else ""
+        moved = ", the arm disturbed at random in two thirds of them" if self.settings.perturb else ""
         return f"`memobench generate`, {seeds}, referent {self.settings.referent}{prompts}{moved}. {SCRIPTED}"
 
     def jobs(self, folder: Path) -> list[RecordingJob]:
-        """Return one job per seed of each task, each with a folder of its own in ``folder``."""
+        """Return one job per seed of each task, each with its own folder in ``folder``."""
         seeds = [
             (task, self.seed_base + i)
             for task in self.tasks
@@ -192,31 +181,32 @@ class _Plan:
 # --- the run ---
 
 
-def _carry_out(
+def _run(
     plan: _Plan,
     out: Path,
     workers: int = 1,
     *,
     slurm: Slurm | None = None,
     progress: ProgressCallback | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    notify: Callable[[str], None] = lambda _: None,
 ) -> GenerationSummary:
-    """Make what is missing, then the dataset; on Slurm that is done by a last job, which calls this again."""
-    if is_dataset(out):
-        return _finished(out, plan)
+    """Make the missing episodes, then the dataset; on Slurm a last job calls this again to make the dataset."""
+    manifest = finished_manifest(out, plan.request)
+    if manifest is not None:
+        return summarise(manifest["episodes"], plan.tasks, out)
     check_destination(out)
     with (
-        telling_of_the_disk(out, "finished episodes stay, and the same command goes on from there"),
+        telling_of_the_disk(out, "finished episodes stay, and the same command continues"),
         episodes_folder(out, plan.request) as folder,
     ):
         jobs = plan.jobs(folder)
-        _report_size(plan, jobs, out, workers, tell)
+        _report_size(plan, jobs, out, workers, notify)
         complete = run_jobs(
             jobs,
             workers=workers,
             progress=progress,
             slurm=slurm,
-            finish=partial(_carry_out, plan, out.absolute()),
+            finish=partial(_run, plan, out.absolute()),
         )
         if not complete:
             return GenerationSummary(None, summarise([], plan.tasks, out).tasks, submitted=True)
@@ -224,9 +214,9 @@ def _carry_out(
 
 
 def _finish_early(plan: _Plan, out: Path) -> GenerationSummary:
-    """Make the dataset of the episodes that an unfinished run has left."""
+    """Assemble the dataset of an unfinished run's episodes."""
     if is_dataset(out) or not (out / STAGING).is_dir():
-        raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see what it made")
+        raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see its outcome")
     with telling_of_the_disk(out, "finished episodes stay"), episodes_folder(out, plan.request) as folder:
         jobs = plan.jobs(folder)
         there = [job for job in jobs if job.finished()]
@@ -237,23 +227,22 @@ def _finish_early(plan: _Plan, out: Path) -> GenerationSummary:
 def _assembled(
     plan: _Plan, jobs: Sequence[RecordingJob], out: Path, request: Mapping[str, Any], made_by: str
 ) -> GenerationSummary:
-    """Make the dataset of finished jobs, if one of them has an episode, and remove what it was made of."""
+    """Assemble the dataset of finished jobs, if one of them has an episode, and remove the staging folder."""
     episodes = [staged(job) for job in jobs]
     summary = summarise([{**episode.info, "failure": episode.failure} for episode in episodes], plan.tasks, out)
     if summary.folder is not None:
-        manifest = {"request": request}
-        assemble(episodes, out, repo_id=plan.repo_id, made_by=made_by, manifest=manifest)
+        assemble(episodes, out, repo_id=plan.repo_id, made_by=made_by, manifest={"request": request})
         shutil.rmtree(out / STAGING)
     return summary
 
 
 def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
-    """Return how many demonstrations of a task `generate` is asked for."""
+    """Return the number of demonstrations of a task that `generate` makes."""
     return episodes if task.prompt is None or prompted_episodes is None else prompted_episodes
 
 
 def _check_seeds(seeds: range) -> None:
-    """Refuse demonstrations of scenes on which policies are chosen or measured (`protocol.GUARDED`)."""
+    """Refuse seeds on which policies are chosen or measured (`protocol.GUARDED`)."""
     for name in GUARDED:
         split = SPLITS[name]
         if seeds[0] <= split[-1] and seeds[-1] >= split[0]:
@@ -264,31 +253,14 @@ def _check_seeds(seeds: range) -> None:
             )
 
 
-def _finished(out: Path, plan: _Plan) -> GenerationSummary:
-    """Report a dataset that is finished already; remove the staging folder that a kill in the last moment left."""
-    try:
-        manifest = read_manifest(out)
-        earlier = manifest["request"]
-    except (FileNotFoundError, KeyError):
-        raise MemobenchError(
-            f"{out} already holds a dataset that this command did not make; name another folder"
-        ) from None
-    request = {**plan.request, FINISHED_EARLY: False}
-    earlier = {**earlier, "versions": request["versions"]}  # a finished dataset stays valid under newer versions
-    compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
-    check_whole(out)
-    remove_staging(out)
-    return summarise(manifest["episodes"], plan.tasks, out)
-
-
 def task_hash(task: Task) -> str:
-    """Hash of a task's files: a run must not be continued with an edited task."""
+    """Return a hash of a task's files: a run must not be continued with an edited task."""
     text = task.bddl_text + json.dumps(task.metadata, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _versions() -> dict[str, str]:
-    """Versions on which an episode's numbers depend."""
+    """Return the versions on which an episode's numbers depend."""
     found = {}
     for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av"):
         try:
@@ -302,49 +274,51 @@ def _versions() -> dict[str, str]:
 
 
 def run_size(frames: int, image_size: int | None) -> int:
-    """Return about how many bytes so many frames take; ``image_size`` is None without pictures."""
+    """Return the approximate bytes of a number of frames; ``image_size`` is None without images."""
     area = 0.0 if image_size is None else (image_size / IMAGE_SIZE) ** 2
-    return round(frames * (FRAME_BYTES + PICTURES_BYTES * area))
+    return round(frames * (FRAME_BYTES + IMAGES_BYTES * area))
 
 
-def check_room(out: Path, size: int, there: int, tell: Callable[[str], None], what: str, work: int = 0) -> None:
-    """Report how much of the disk a run will take, and refuse one that cannot fit.
+def check_room(out: Path, size: int, there: int, notify: Callable[[str], None], work: str, extra: int = 0) -> None:
+    """Report the disk space that a run needs, and refuse a run that cannot fit.
 
-    Finished episodes are kept until the dataset that is made of them is whole, so at its end a run needs twice its
-    size.
+    Finished episodes are kept until the dataset is complete, so at its end a run needs twice its size.
 
     Args:
-        out: its destination. size: of the dataset, about. there: bytes of it that are staged already.
-        what: begins the sentence with the amount of work. work: further bytes that are needed meanwhile.
+        out: destination.
+        size: approximate bytes of the dataset.
+        there: bytes of it that are staged already.
+        work: amount of work, which begins the message.
+        extra: bytes of temporary files.
 
     Raises:
         MemobenchError: not even one copy has room.
     """
-    free, most = free_bytes(out), max(2 * size - there, 0) + work
+    free, most = free_bytes(out), max(2 * size - there, 0) + extra
     sizes = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
-    if free < size - there + work:
-        raise MemobenchError(f"{what} would take {sizes}: make room, name a folder on another disk, or ask for less")
-    warning = "; THAT MAY NOT BE ENOUGH: a full disk ends the run, and the same command then goes on" * (free < most)
-    tell(f"{what}: {sizes}{warning}")
+    if free < size - there + extra:
+        raise MemobenchError(f"{work} would take {sizes}: make room, name a folder on another disk, or ask for less")
+    warning = "; THAT MAY NOT BE ENOUGH: a full disk ends the run, and the same command then continues"
+    notify(f"{work}: {sizes}{warning * (free < most)}")
 
 
 def _report_size(
-    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, workers: int, tell: Callable[[str], None]
+    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, workers: int, notify: Callable[[str], None]
 ) -> None:
-    """Report size and time of the missing episodes before they are made."""
+    """Report size and duration of the missing episodes before they are made."""
     missing = [job for job in jobs if not job.folder.exists()]
     if not missing:
         return
-    pictures = plan.settings.image_size if plan.settings.images else None
+    side = plan.settings.image_size if plan.settings.images else None
     frames, left = (
         sum(FRAMES[job.task.suite].get(job.task.memory_type, 600) for job in some) for some in (jobs, missing)
     )
-    seconds = left * (FRAME_SECONDS + PICTURES_SECONDS * ((pictures or 0) / IMAGE_SIZE) ** 2)
+    seconds = left * (FRAME_SECONDS + IMAGES_SECONDS * ((side or 0) / IMAGE_SIZE) ** 2)
     minutes = seconds / 60 / max(min(workers, cores()), 1)
     time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
-    size = run_size(frames, pictures)
-    what = f"{len(missing)} demonstrations of some {left:,} frames, in about {time} with {workers} at a time"
-    check_room(out, size, size - run_size(left, pictures), tell, what)
+    size = run_size(frames, side)
+    work = f"{len(missing)} demonstrations of about {left:,} frames, in about {time} with {workers} at a time"
+    check_room(out, size, size - run_size(left, side), notify, work)
 
 
 # --- the outcome ---
@@ -352,7 +326,7 @@ def _report_size(
 
 @dataclass(frozen=True)
 class Failure:
-    """A seed without a demonstration, and why."""
+    """A seed without a demonstration, and the reason."""
 
     task_name: str
     seed: int
@@ -376,9 +350,9 @@ class GenerationSummary:
     """Outcome of a run.
 
     Attributes:
-        folder: what was made, or None when no episode succeeded, or none is there yet.
-        tasks: one entry per task, in the order asked for.
-        submitted: the episodes are being made on Slurm, whose last job will write the dataset.
+        folder: the dataset, or None if no episode succeeded or none was made yet.
+        tasks: one entry per task, in the requested order.
+        submitted: whether the episodes are being made on Slurm, whose last job will assemble the dataset.
     """
 
     folder: Path | None
@@ -392,12 +366,12 @@ class GenerationSummary:
 
     @property
     def exit_status(self) -> int:
-        """0 when every seed asked for was solved, else 1."""
+        """0 if every requested seed was solved, else 1."""
         return 1 if self.failures else 0
 
 
 def summarise(rows: Sequence[dict[str, Any]], tasks: Sequence[Task], out: Path) -> GenerationSummary:
-    """Return the outcome of each task, from the rows of the manifest."""
+    """Return the outcome of each task from the rows of the manifest."""
     summaries = tuple(_summary(task, [row for row in rows if row["task_name"] == task.name]) for task in tasks)
     made = any(summary.solved for summary in summaries)
     return GenerationSummary(out if made else None, summaries)

@@ -1,4 +1,4 @@
-"""One demonstration: the scripted expert carries out a task from a seed, and everything is recorded."""
+"""Record one demonstration: the scripted expert carries out a task from a seed, perturbed if requested."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.perturbation import Perturbation
 from lerobot_memobench.datasets.staging import EpisodeStage, StagedJob, stage_failure
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
@@ -21,13 +20,13 @@ from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.task import Task
 
 HOLD_FRAMES = 10
-"""Frames kept after success: the last event has a frame, and the expert goes on with what it is at, so that a policy
-which sees less exactly does not stop short of it."""
+"""Frames recorded after success: the last event has a frame, and the expert completes its motion, so that a less exact
+policy does not stop before it."""
 PERTURBATION = 4
-"""Stream of the episode's random numbers that decides how the arm is moved off its way."""
+"""Stream of the episode's random numbers that draws perturbations."""
 PATIENCE = 40
-"""Steps that an episode goes on after the expert is through with its plan: what still falls, slides or has to hold for
-some steps may yet reach the goal. Then it is given up, long before the horizon."""
+"""Steps that an episode continues after the expert has finished its plan: falling or sliding objects, and formulas that
+must hold for some steps, may still reach the goal. Then it is given up, long before the horizon."""
 
 Images = dict[str, NDArray[np.uint8]]
 """Camera to a frame, (H, W, 3)."""
@@ -39,9 +38,10 @@ class RecordingSettings:
 
     Attributes:
         referent: ``"fixed"``, the task's own goal, or ``"random"``, the seed's; of a strict task ``"drawn"``.
-        images: whether the cameras are recorded. image_size: their height and width, pixels.
-        demonstration_prompt: whether the episode begins with the prompt, where the task has one.
-        perturb: move the arm off its way at random (`datasets.perturbation`).
+        images: whether the cameras are recorded.
+        image_size: height and width of their images, pixels.
+        demonstration_prompt: whether the episode begins with the task's prompt, if it has one.
+        perturb: whether the arm is moved off its way at random (`Perturbation`).
     """
 
     referent: str = "fixed"
@@ -51,34 +51,9 @@ class RecordingSettings:
     perturb: bool = False
 
 
-def record_demonstration(task: Task, seed: int, *, variant: int = 0, **settings: Any) -> Demonstration:
-    """Let the scripted expert carry out a task from a seed.
-
-    The result may be a failure (``success`` is False): it is then cut off at the horizon. With
-    ``referent="random"`` the seed decides the variant; ``variant`` picks one when the referent is fixed.
-
-    Args:
-        settings: fields of `RecordingSettings`.
-    """
-    chosen = RecordingSettings(**settings)
-    if variant and chosen.referent != "fixed":
-        raise MemobenchError(
-            f"variant {variant} was asked for together with referent={chosen.referent!r}; choose variants with 'fixed' "
-            "only"
-        )
-    shown: list[Images] = []
-    demo = record(compiled_episode(task.variant(variant), chosen), seed, chosen, shown.append)
-    if not shown:
-        return demo
-    return replace(demo, images={name: np.stack([images[name] for images in shown]) for name in shown[0]})
-
-
 @lru_cache(maxsize=1)
 def compiled_episode(task: Task, settings: RecordingSettings) -> Episode:
-    """Return an episode of a task, to be reset.
-
-    The last task's scene stays compiled: a worker meets a task's seeds one after another.
-    """
+    """Return an episode of a task, to be reset; the last one is cached, because a task's seeds follow each other."""
     return Episode(
         task,
         suite=task.suite,
@@ -89,7 +64,7 @@ def compiled_episode(task: Task, settings: RecordingSettings) -> Episode:
 
 
 def record(episode: Episode, seed: int, settings: RecordingSettings, show: Callable[[Images], object]) -> Demonstration:
-    """Record an episode; its images go to ``show``, frame by frame, and not into the demonstration."""
+    """Record an episode without images; ``show`` is called with the images of each frame."""
     episode.reset(seed)
     sim, fixture_poses = episode.sim, episode.sim.fixture_poses()
     states, proprio, objects, satisfied, actions, executed = [], [], [], [], [], []
@@ -146,7 +121,7 @@ def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
     if episode.fault is not None:
         return episode.fault.why
     if episode.prompt_shown is False:
-        return "the demonstration prompt did not show what it had to"
+        return "the demonstration prompt was incomplete"
     if demo.success:
         return None
     steps = episode.progress.steps
@@ -158,7 +133,7 @@ def _failure_reason(demo: Demonstration, episode: Episode) -> str | None:
 
 @dataclass(frozen=True)
 class RecordingJob(StagedJob):
-    """One seed of one task, to be recorded and staged in ``folder``."""
+    """Record one seed of one task and stage it in ``folder``."""
 
     task: Task
     seed: int
@@ -171,7 +146,7 @@ class RecordingJob(StagedJob):
         return self.task.name
 
     def run(self) -> None:
-        """Make the episode. Runs in any process; the folder is all that it leaves behind."""
+        """Make the episode. Runs in any process; the folder is its only output."""
         where = f"{self.task.name}, seed {self.seed}"
         try:
             episode = compiled_episode(self.task, self.settings)
@@ -190,7 +165,7 @@ class RecordingJob(StagedJob):
 
 
 def _failed_info(demo: Demonstration) -> dict[str, Any]:
-    """Return the fields that are kept of a seed without a demonstration."""
+    """Return the fields that are stored for a seed without a demonstration."""
     return {
         "task_name": demo.task.name,
         "memory_type": demo.task.memory_type,
@@ -201,3 +176,103 @@ def _failed_info(demo: Demonstration) -> dict[str, Any]:
         "frames": len(demo),
         "scene_hash": demo.scene_hash,
     }
+
+
+# --- perturbation ---
+#
+# Recovery data: the arm is moved off its way at random, and the closed-loop expert corrects it. The labels of a frame
+# are the expert's actions; the executed ones are kept for replay. A third of the episodes is not perturbed.
+
+CLEAN = 1 / 3
+"""Share of unperturbed episodes."""
+NOISE = 0.05
+"""Standard deviation of the noise on each of an action's six displacements (1 is 5 cm or 0.5 rad)."""
+PUSH_CHANCE = 0.02
+"""Probability per step that a push begins."""
+PUSH = np.array([0.6, 0.6, 0.6, 0.1, 0.1, 0.3])
+"""Standard deviations of a push, per step: the hand is moved, and turned mostly about the vertical."""
+PUSH_STEPS = (3, 8)
+"""Range of a push's steps, end excluded."""
+MISS_CHANCE = 0.2
+"""Probability that the hand is pushed away when its fingers begin to close: they close on air, and the expert returns.
+A policy trained without such frames carries an empty hand to the target."""
+MISS, MISS_SPREAD = np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]), np.array([0.25, 0.25, 0.25, 0.0, 0.0, 0.0])
+"""Such a push, upwards, and its standard deviations."""
+MISS_STEPS = (6, 10)
+"""Range of its steps, end excluded: about as long as fingers take to close."""
+TWIST_CHANCE = 0.15
+"""Probability that the hand is first turned with open fingers, which then stop at another width than along a side. A
+policy trained without such frames waits for them to close further."""
+TWIST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.25])
+"""Standard deviations of such a push, per step."""
+TWIST_STEPS = (3, 6)
+"""Range of its steps, end excluded."""
+DROP_CHANCE = 0.05
+"""Probability that a grasped object is dropped on its way."""
+DROP_AFTER, DROP_STEPS = (15, 50), 8
+"""Range of steps from closing to the drop, end excluded, and its duration."""
+LATE_CHANCE, LATE_STEPS = 0.2, (3, 16)
+"""Probability that fingers stay closed when they should open, and range of these steps, end excluded. A policy trained
+without such frames waits forever instead of opening."""
+COMING_TO_REST = 0.4
+"""Largest component of a displacement at the home detent with which the expert intends to rest there (2 cm)."""
+
+Array = NDArray[np.float64]
+
+
+class Perturbation:
+    """Perturb the actions of one episode; a function of the generator's numbers only."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._clean = rng.random() < CLEAN
+        self._left = 0
+        self._push: Array = np.zeros(6)
+        self._closed = 0  # steps since the command to close the fingers
+        self._open = range(0)  # values of _closed at which they are opened
+        self._late = 0  # remaining steps in which they stay closed although they should open
+
+    def executed(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
+        """Return the action (7,) to execute instead of the expert's. Call once per step.
+
+        Args:
+            at_detent: whether the hand is in the detent at home; there small actions are not perturbed, because the
+                hand would never come to rest.
+        """
+        if self._clean or (at_detent and np.abs(action[:6]).max() <= COMING_TO_REST):
+            return action
+        opens = self._closed > 0 and action[6] < 0
+        self._closed = self._closed + 1 if action[6] > 0 else 0
+        if opens:
+            self._late = int(self._rng.integers(*LATE_STEPS)) if self._rng.random() < LATE_CHANCE else 0
+        if self._closed == 1:
+            self._grasp()
+        elif not self._left and self._rng.random() < PUSH_CHANCE:
+            self._begin(PUSH * self._rng.normal(size=6), PUSH_STEPS)
+        found = action.astype(np.float64)
+        found[:6] += NOISE * self._rng.normal(size=6)
+        if self._left:
+            found[:6] += self._push
+            self._left -= 1
+        if self._closed in self._open:
+            found[6] = -1.0
+        elif self._late and action[6] < 0:
+            found[6] = 1.0
+            self._late -= 1
+        return found.astype(np.float32)
+
+    def _grasp(self) -> None:
+        """Draw the perturbation of a grasp."""
+        self._open = range(0)
+        draw = self._rng.random()
+        if draw < MISS_CHANCE:
+            self._begin(MISS + MISS_SPREAD * self._rng.normal(size=6), MISS_STEPS)
+        elif draw < MISS_CHANCE + TWIST_CHANCE:
+            self._begin(TWIST * self._rng.normal(size=6), TWIST_STEPS)
+            self._open = range(1, self._left + 1)
+        elif draw < MISS_CHANCE + TWIST_CHANCE + DROP_CHANCE:
+            first = int(self._rng.integers(*DROP_AFTER))
+            self._open = range(first, first + DROP_STEPS)
+
+    def _begin(self, push: Array, steps: tuple[int, int]) -> None:
+        self._push, self._left = push, int(self._rng.integers(*steps))

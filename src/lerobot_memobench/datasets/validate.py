@@ -1,22 +1,31 @@
-"""Validate a dataset: replay every episode, read every file to its end, and name the first difference of each."""
+"""Validate a dataset: replay every episode, read every file, and report the first difference of each.
+
+Replay resets the scene to the episode's seed and applies the recorded actions, in the prompt too; neither expert nor
+environment is used. Everything is compared bit for bit, except images: some frames of each camera are drawn again, and
+must be near to the decoded ones.
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels, persistent_rows
 from lerobot_memobench.datasets.frames import FrameReader, frame_reader
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
+    EXECUTED_ACTION,
     INFO_FILE,
     MANIFEST_FILE,
+    OBJECTS,
     STATS_FILE,
     Written,
     check_clock,
@@ -25,35 +34,48 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     episode_count,
     image_key,
     is_dataset,
+    objects_column,
     read_info,
     read_manifest,
     read_to_end,
 )
-from lerobot_memobench.datasets.lerobot_format.reading import EpisodePlace, check_idling, list_episodes, read_episode
-from lerobot_memobench.datasets.replay import Pictures, replay
+from lerobot_memobench.datasets.lerobot_format.reading import (
+    Columns,
+    EpisodePlace,
+    RecordedEpisode,
+    check_idling,
+    list_episodes,
+    read_episode,
+)
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import check_fetched, file_hash, refusing
+from lerobot_memobench.experts.demonstration_prompt import highlights_at
+from lerobot_memobench.io import check_fetched, cut, file_hash, refusing
 from lerobot_memobench.jobs.processes import process_pool
-from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
+from lerobot_memobench.sim.object_slots import ObjectSlots
+from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task
 
 COMPARED = ("task_name", "seed", "referent", "variant", "success", "scene_hash", "digest")
 """Fields of an episode in the manifest that its record has too."""
 NO_HASHES = (
-    "there are no hashes of files, as in datasets of earlier versions and after LeRobot's dataset tools: damage to a "
-    "picture that can still be decoded and is not drawn again is not found"
+    "it has no hashes of files, as in datasets of earlier versions and after LeRobot's dataset tools: damage to a "
+    "frame that can still be decoded and is not drawn again cannot be found"
 )
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Outcome of replaying one episode, or of checking a file.
+    """Outcome of the check of an episode or a file.
 
     Attributes:
-        subject: ``episode 3`` of the dataset, or a file.
-        disagreement: the first one, as a sentence; None when everything agrees.
-        note: on a file, what is no disagreement.
+        subject: ``episode 3``, or a file.
+        disagreement: the first disagreement, None if everything agrees.
+        note: remark on a file that agrees.
         of_file: whether the subject is a file.
     """
 
@@ -64,50 +86,29 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class _EpisodeCheck:
-    """Episode ``index`` of the dataset in ``folder``, to be replayed in any process."""
+class _Check:
+    """A check of an episode, of a file, or of its agreement with others; runs in any process.
 
-    folder: Path
-    index: int
-    tasks: Mapping[str, Task] | None = None
+    ``check`` returns a disagreement of an episode, or a note on a file, or None, and raises for damage.
+    """
 
-    def run(self) -> Verdict:
-        """Replay it."""
-        name = f"episode {self.index}"
-        try:
-            with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}")):
-                return Verdict(name, self._replay())
-        except MemobenchError as error:  # the other episodes are replayed all the same
-            return Verdict(name, str(error))
-
-    def _replay(self) -> str | None:
-        episode = read_episode(self.folder, self.index)
-        if episode.seed < 0:
-            return "it has no seed, so its scene cannot be made again"
-        task, pictures = (self.tasks or {}).get(episode.task_name), _pictures(self.folder, self.index)
-        found = replay(episode, task=task, pictures=pictures)
-        return None if found is None else str(found)
-
-
-@dataclass(frozen=True)
-class _FileCheck:
-    """A check of a file of the dataset in ``folder``, or of its agreement with others; runs in any process."""
-
-    folder: Path
-    name: str
+    subject: str
+    path: Path
+    of_file: bool
     check: Callable[[], str | None]
 
     def run(self) -> Verdict:
-        """Check it."""
+        """Run the check."""
         try:
-            with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}"), self.folder / self.name):
-                return Verdict(self.name, None, self.check(), of_file=True)
-        except MemobenchError as error:
-            return Verdict(self.name, str(error), of_file=True)
+            with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}"), self.path):
+                found = self.check()
+        except MemobenchError as error:  # the other checks still run
+            return Verdict(self.subject, str(error), of_file=self.of_file)
+        return Verdict(self.subject, None, found, of_file=True) if self.of_file else Verdict(self.subject, found)
 
 
 ValidationProgress = Callable[[int, int, Verdict], None]
-"""Called with how many are done, of how many, and the newest verdict."""
+"""Called with the number of finished checks, their total, and the latest verdict."""
 
 
 def validate(
@@ -120,17 +121,17 @@ def validate(
     """Replay the episodes of a dataset and check its files.
 
     States, success, instruction, numbering, every checkpoint column, subgoal texts, language rows, key frames and the
-    scene must come out exactly; some frames of each camera must be near to what the simulator draws. Every file is read
-    to its end and compared with its hash, statistics with those of the frames, the manifest with the episodes.
-
-    Returns:
-        A verdict for each episode, in their order, then one for each file with a disagreement or a note.
+    scene must be equal; some frames of each camera must be near to those of the simulator. Every file is read to its
+    end and compared with its hash, statistics with those of the frames, and the manifest with the episodes.
 
     Args:
-        folder: of the dataset.
-        workers: processes.
-        tasks: tasks by name that are not those of the catalogue.
-        progress: called after each episode and file.
+        folder: folder of the dataset.
+        workers: number of processes.
+        tasks: name to task, for tasks that are not in the catalogue.
+        progress: called after each check.
+
+    Returns:
+        A verdict for each episode, in order, then one for each file with a disagreement or a note.
 
     Raises:
         MemobenchError: there is no dataset.
@@ -138,7 +139,7 @@ def validate(
     folder = Path(folder).absolute()
     if workers < 1:
         raise MemobenchError(f"{workers} workers were asked for; it must be at least 1")
-    checks: list[_EpisodeCheck | _FileCheck] = [*_episode_checks(folder, tasks), *_file_checks(folder)]
+    checks = [*_episode_checks(folder, tasks), *_file_checks(folder)]
     verdicts: dict[int, Verdict] = {}
 
     def note(number: int, verdict: Verdict) -> None:
@@ -158,8 +159,8 @@ def validate(
     return [verdict for verdict in found if not verdict.of_file or verdict.disagreement or verdict.note]
 
 
-def _pictures(folder: Path, episode: int) -> Pictures | None:
-    """Return what reads the pictures of an episode of a dataset; None where it has none of ours."""
+def images_of(folder: Path, episode: int) -> Images | None:
+    """Return the reader of an episode's images; None if the dataset has none of our cameras."""
     cameras = [camera for camera in CAMERAS if image_key(camera) in read_info(folder)["features"]]
 
     def read(frames: Sequence[int]) -> dict[str, NDArray[np.uint8]]:
@@ -178,49 +179,63 @@ def _reader(folder: Path, camera: str) -> FrameReader:
 
 
 def exit_status(verdicts: Sequence[Verdict]) -> int:
-    """Return 0 when everything agreed, else 1."""
+    """Return 0 if everything agrees, else 1."""
     return 1 if any(verdict.disagreement is not None for verdict in verdicts) else 0
 
 
-def _file_checks(folder: Path) -> Iterator[_FileCheck]:
-    """Yield a check of each file of a dataset, and of the agreement between files."""
+def _file_checks(folder: Path) -> Iterator[_Check]:
+    """Yield the checks of each file of a dataset, and of the agreement between files."""
+
+    def of(name: Path | str, check: Callable[[], str | None]) -> _Check:
+        return _Check(Path(name).as_posix(), folder / name, True, check)
+
     written = None
-    with contextlib.suppress(MemobenchError, FileNotFoundError):  # `check_manifest` names its damage
+    with contextlib.suppress(MemobenchError, FileNotFoundError):  # `check_manifest` reports its damage
         written = read_manifest(folder).get("files")
     for name in sorted({*dataset_files(folder), *(written or {})}):
-        yield _FileCheck(folder, name, partial(check_file, folder / name, (written or {}).get(name)))
+        yield of(name, partial(check_file, folder / name, (written or {}).get(name)))
     if written is None:
-        yield _FileCheck(folder, MANIFEST_FILE, partial(str, NO_HASHES))
-    yield _FileCheck(folder, INFO_FILE.as_posix(), partial(check_whole, folder))
+        yield of(MANIFEST_FILE, partial(str, NO_HASHES))
+    yield of(INFO_FILE, partial(check_whole, folder))
     names = measured(read_info(folder)["features"])
     cameras = [name for name in names if name.startswith(image_key(""))]
     for chosen in ([name for name in names if name not in cameras], *([camera] for camera in cameras)):
-        yield _FileCheck(folder, STATS_FILE.as_posix(), partial(check_statistics, folder, chosen))
+        yield of(STATS_FILE, partial(check_statistics, folder, chosen))
     if (folder / MANIFEST_FILE).exists():
-        yield _FileCheck(folder, MANIFEST_FILE, partial(check_manifest, folder))
+        yield of(MANIFEST_FILE, partial(check_manifest, folder))
 
 
-def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_EpisodeCheck]:
+def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
     if not is_dataset(folder):
         raise MemobenchError(
             f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
-            "when `memobench convert` reads them"
+            "by `memobench convert`"
         )
     check_clock(read_info(folder)["features"], folder)
     places: Sequence[EpisodePlace] = ()
-    with contextlib.suppress(MemobenchError):  # a damaged file: each episode names it below
+    with contextlib.suppress(MemobenchError):  # the check of each episode reports a damaged file
         places = list_episodes(folder)
     check_idling(folder, places)
-    return [_EpisodeCheck(folder, index, tasks) for index in range(episode_count(folder))]
+    count = episode_count(folder)
+    return [_Check(f"episode {k}", folder, False, partial(_replay_episode, folder, k, tasks)) for k in range(count)]
+
+
+def _replay_episode(folder: Path, index: int, tasks: Mapping[str, Task] | None) -> str | None:
+    episode = read_episode(folder, index)
+    if episode.seed < 0:
+        return "it has no seed, so its scene cannot be made again"
+    task, images = (tasks or {}).get(episode.task_name), images_of(folder, index)
+    found = replay(episode, task=task, images=images)
+    return None if found is None else str(found)
 
 
 # --- files ---
 
 
 def check_file(path: Path, written: Written | None) -> str | None:
-    """Read a file to its end and compare it with what was written; return a note where it was written again.
+    """Read a file to its end and compare it with its recorded hash; return a note if it was written again.
 
-    Other bytes in a file of the same size are damage; a tool that encodes or writes again leaves another size.
+    Other bytes in a file of equal size are damage; tools that encode or write a file again change its size.
 
     Raises:
         MemobenchError: it is missing or damaged.
@@ -234,10 +249,10 @@ def check_file(path: Path, written: Written | None) -> str | None:
         return None
     if path.stat().st_size == written["bytes"]:
         raise MemobenchError(
-            f"its size is that in {MANIFEST_FILE}, and its bytes are not: it was damaged or edited; take the dataset "
+            f"its size is as in {MANIFEST_FILE}, but its content differs: it was damaged or edited; take the dataset "
             "from its source again, or generate it"
         )
-    return f"encoded or written again since {MANIFEST_FILE} was: its content is checked, its bytes are not"
+    return f"encoded or written again after {MANIFEST_FILE}: its content was checked, its hash was not"
 
 
 def check_manifest(folder: Path) -> None:
@@ -254,4 +269,223 @@ def check_manifest(folder: Path) -> None:
             if row.get(key) != value and value is not None:
                 raise MemobenchError(f"episode {place.index} has {key}={value!r}, {MANIFEST_FILE} {row.get(key)!r}")
     if rows:
-        raise MemobenchError(f"it names episode {next(iter(rows))}, and the dataset has none of that number")
+        raise MemobenchError(f"it names episode {next(iter(rows))}, which is not in the dataset")
+
+
+# --- replay ---
+
+FRAMES_DRAWN = 8
+"""Frames of each camera that are drawn again: evenly spaced, with the first, the last and the start of execution."""
+MIN_PSNR, MAX_BLOCK_DIFFERENCE, BLOCKS = 26.0, 40.0, 8
+"""A recorded image agrees with a drawn one if its PSNR, dB, is large enough, and no channel of any of 8 × 8 blocks
+differs by too many of 255 levels. Worst values measured at 32 to 256 pixels: H.264 as recorded 28.8 dB and 28 levels,
+AV1 as encoded by LeRobot's tools 28.1 and 33; images of five frames later have a median of 15.8 to 24.8 dB, those of
+the other camera 12."""
+
+Images = Callable[[Sequence[int]], dict[str, NDArray[np.uint8]]]
+"""Frame numbers (n,) to the images of each camera, (n, H, W, 3)."""
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """The first difference; ``frame`` is None for a field of the whole episode."""
+
+    column: str
+    frame: int | None
+    recorded: Any
+    replayed: Any
+
+    def __str__(self) -> str:
+        where = "" if self.frame is None else f" at frame {self.frame}"
+        return f"{self.column}{where}: recorded {_text(self.recorded)}, replayed {_text(self.replayed)}"
+
+
+def replay(
+    recorded: Demonstration | RecordedEpisode, *, task: Task | None = None, images: Images | None = None
+) -> Disagreement | None:
+    """Replay an episode and return the first disagreement, or None.
+
+    Compared are states (if recorded), proprioception, visible objects, instruction, numbering, every label column,
+    language rows, success, key frames, and the hashes of scene and episode. The episode's hash covers the states, which
+    LeRobot's dataset tools remove.
+
+    Args:
+        recorded: the episode.
+        task: replaces the catalogue's task of the episode's name.
+        images: returns recorded images; some of them are compared.
+
+    Raises:
+        MemobenchError: there is no such task, or the actions were removed.
+    """
+    if isinstance(recorded, Demonstration):
+        task, start, wanted, executed = recorded.task, 0, recorded.actions, recorded.applied
+        columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
+    else:
+        published = (task or get_task(recorded.task_name)).in_world(recorded.world)
+        task, start = published.variant(recorded.variant), recorded.start
+        columns, whole = recorded.columns, recorded.whole
+        if "action" not in columns:
+            raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")
+        wanted, executed = columns["action"], columns[EXECUTED_ACTION if EXECUTED_ACTION in columns else "action"]
+    watch = _ImageCheck(recorded.exec_start, len(wanted), images)
+    again = resimulate(task, recorded.seed, executed, recorded.exec_start, watch)
+    again = replace(again, referent=recorded.referent, variant=recorded.variant)
+    if not np.array_equal(wanted, executed):
+        again = replace(again, actions=wanted, executed=again.actions)
+    found = _whole_difference(whole, _whole(again))
+    if found is not None and found.column == "digest" and again.executed is not None:
+        found = replace(found, column="action (it alone is in the episode's hash and not in its states)")
+    frames = np.arange(len(wanted))
+    numbering = {
+        "task": [task.language] * len(wanted),
+        "frame_index": frames,
+        "index": start + frames,
+        "timestamp": (frames / CONTROL_HZ).astype(np.float32),
+    }
+    replayed = numbering | _columns(again, objects_column(columns))
+    return _first_difference(columns, replayed) or watch.difference or found
+
+
+class _ImageCheck:
+    """Draw some frames while an episode is replayed, and keep the first difference."""
+
+    def __init__(self, exec_start: int, length: int, images: Images | None) -> None:
+        self.difference: Disagreement | None = None
+        even = np.linspace(0, length - 1, FRAMES_DRAWN).round().astype(int).tolist()
+        self._frames = sorted({*even, min(max(exec_start, 0), length - 1)})
+        self._recorded = {} if images is None else images(self._frames)
+        height, width = next((frames.shape[1:3] for frames in self._recorded.values()), (IMAGE_SIZE, IMAGE_SIZE))
+        self.settings = RenderSettings(height=height, width=width)
+
+    def compare(self, sim: Simulation, frame: int) -> None:
+        """Compare the present images if the frame is one of those to draw."""
+        if frame not in self._frames or self.difference is not None:
+            return
+        for camera, frames in self._recorded.items():
+            drawn, recorded = sim.render(CAMERAS[camera]), frames[self._frames.index(frame)]
+            difference = _unlike(drawn, recorded)
+            if difference:
+                self.difference = Disagreement(image_key(camera), frame, difference, "the simulator's image")
+                return
+
+
+def _unlike(drawn: NDArray[np.uint8], recorded: NDArray[np.uint8]) -> str:
+    """Return the difference of a recorded image to a drawn one, "" if the encoding explains it."""
+    if drawn.shape != recorded.shape:
+        return f"an image of {recorded.shape[0]}×{recorded.shape[1]} pixels"
+    off = drawn.astype(np.float32) - recorded
+    psnr = 10 * np.log10(255**2 / max(float((off**2).mean()), 1e-9))
+    rows, columns = (np.linspace(0, size, BLOCKS + 1).astype(int)[:-1] for size in off.shape[:2])
+    sums = np.add.reduceat(np.add.reduceat(off, rows, axis=0), columns, axis=1)
+    areas = np.outer(np.diff([*rows, off.shape[0]]), np.diff([*columns, off.shape[1]]))
+    levels = float(np.abs(sums / areas[..., None]).max())
+    agrees = psnr >= MIN_PSNR and levels <= MAX_BLOCK_DIFFERENCE
+    return "" if agrees else f"an image with a PSNR of {psnr:.0f} dB and {levels:.0f} levels off"
+
+
+def resimulate(
+    task: Task, seed: int, actions: NDArray[np.float32], exec_start: int, watch: _ImageCheck | None = None
+) -> Demonstration:
+    """Apply (T, 7) float32 actions in the scene of ``seed``; return the resulting demonstration without images.
+
+    At the end of the prompt the scene returns to its start, except for hidden objects: at frame ``exec_start``, or at
+    the first idle frame, whose action is zeros. ``watch`` compares the images of each frame.
+    """
+    sim = Simulation(task, None if watch is None else watch.settings)
+    sim.reset(seed)
+    start, scene_hash, fixture_poses = sim.snapshot(), sim.scene_hash(), sim.fixture_poses()
+    progress = Progress(task)
+    look = ObjectSlots(sim)
+    states, proprio, satisfied = [], [], []
+    objects: list[NDArray[np.float32]] = []
+    success = False
+    rests = False
+    for frame, action in enumerate(actions):
+        rested, rests = rests, task.idles and frame < exec_start and not action.any()
+        if frame > 0 and not rested and (rests or frame == exec_start):
+            sim.end_prompt(start, () if task.prompt is None else task.prompt.places)
+        if frame > 0 and frame == exec_start:
+            sim.begin_execution()
+        sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
+        if watch is not None:
+            watch.compare(sim, frame)
+        states.append(sim.state())
+        proprio.append(sim.proprio())
+        objects.append(objects[-1] if rests and rested else look.observe())
+        satisfied.append(progress.satisfied)
+        success = success or progress.success
+        if not rests:
+            sim.step(action)
+        if frame >= exec_start:
+            progress.step(sim.holds)
+    return Demonstration(
+        task=task,
+        seed=seed,
+        referent="fixed",
+        variant=task.variant_index,
+        states=np.array(states),
+        actions=np.asarray(actions, dtype=np.float32),
+        proprio=np.array(proprio, dtype=np.float32),
+        images=None,
+        exec_start=exec_start,
+        satisfied=np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints)),
+        success=success,
+        fixture_poses=fixture_poses,
+        scene_hash=scene_hash,
+        objects=np.array(objects),
+    )
+
+
+def _columns(demo: Demonstration, objects: str) -> Columns:
+    """Return states, proprioception and labels by column name; ``objects`` is the column of the objects."""
+    return {
+        "states": demo.states,
+        "observation.state": demo.proprio,
+        objects: demo.objects,
+        **labels(demo).columns(),
+    }
+
+
+def _whole(demo: Demonstration) -> dict[str, Any]:
+    found = labels(demo)
+    return {
+        "memory_type": demo.task.memory_type,
+        "family": demo.task.family,
+        "operations": demo.task.operations,
+        "success": demo.success,
+        "key_frames": found.key_frames.tolist(),
+        "scene_hash": demo.scene_hash,
+        "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
+        "language_persistent": persistent_rows(found),
+        "digest": digest(demo),
+    }
+
+
+def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | None:
+    """Return the first difference of a common column by frame, then by order of the columns."""
+    first: Disagreement | None = None
+    for column, new in replayed.items():
+        if column not in recorded:
+            continue
+        old = recorded[column]
+        if np.shape(old) != np.shape(new):
+            return Disagreement(f"shape of {column}", None, np.shape(old), np.shape(new))
+        differs = [
+            frame
+            for frame, (a, b) in enumerate(zip(old, new, strict=True))
+            if not np.array_equal(np.asarray(a), np.asarray(b))
+        ]
+        if differs and (first is None or first.frame is None or differs[0] < first.frame):
+            first = Disagreement(column, differs[0], old[differs[0]], new[differs[0]])
+    return first
+
+
+def _whole_difference(recorded: dict[str, Any], replayed: dict[str, Any]) -> Disagreement | None:
+    for key, old in recorded.items():
+        if old != replayed[key]:
+            return Disagreement(key, None, old, replayed[key])
+    return None
+
+
+def _text(value: Any) -> str:
+    return cut(np.array2string(value, threshold=12) if isinstance(value, np.ndarray) else repr(value), 200)

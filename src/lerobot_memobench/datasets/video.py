@@ -1,4 +1,4 @@
-"""Camera frames as MP4, as LeRobot stores them, and statistics of their pixels.
+"""Encode camera frames as MP4, as LeRobot stores them, and compute statistics of their pixels.
 
 Encoding: H.264, preset ultrafast, one key frame in ten, CRF 23, no B-frames. Measured on an episode of the
 benchmark (396 frames of 256×256, one encoder thread, on busy cores; third person / wrist):
@@ -12,10 +12,10 @@ H.264, CRF 30, g=2          599 / 527      32.4 (30.2) / 34.7 (30.7)          1,
 this one                    2,011 / 1,722  37.6 (36.4) / 39.3 (34.6)          3,151 / 2,479
 ==========================  =============  =================================  ===================
 
-So both cameras together are smaller than under LeRobot's default, closer to what was rendered, and encoded
-several times as fast. g=10 keeps random access cheap (at most nine small frames to decode before the one
-wanted); H.264 in yuv420p plays in every browser, so the hub's viewer shows it. Frames go from memory into the
-encoder: most of the time of LeRobot's recording loop is spent writing PNG files.
+So both cameras together are smaller than with LeRobot's default, closer to the rendered images, and encoded several
+times as fast. g=10 keeps random access cheap (at most nine small frames are decoded before the requested one); H.264
+in yuv420p plays in every browser, so the hub's viewer shows it. Frames go from memory into the encoder: LeRobot's
+recording loop spends most of its time writing PNG files.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
 
 
 def _encoder() -> RGBEncoderConfig:
-    """Return the module's settings in LeRobot's own form."""
+    """Return the encoder settings as LeRobot's configuration."""
     from lerobot.configs import RGBEncoderConfig
 
     return RGBEncoderConfig(vcodec="h264", preset="ultrafast", g=10, crf=23, extra_options={"bf": 0})
 
 
 class VideoWriter:
-    """A video that is being encoded frame by frame, so that an episode's images are never in memory together.
+    """Encode a video frame by frame, so that an episode's images are never in memory together.
 
-    One thread, so that the bytes do not depend on the machine's cores or on other processes.
+    It uses one thread, so that the bytes do not depend on the machine's cores or on other processes.
     """
 
     def __init__(self, path: Path) -> None:
@@ -53,7 +53,7 @@ class VideoWriter:
         self._stream: Any = None
 
     def add(self, frame: NDArray[np.uint8]) -> None:
-        """Encode one more frame, (H, W, 3) uint8."""
+        """Encode the next frame, (H, W, 3) uint8."""
         import av
 
         if self._container is None:
@@ -67,24 +67,23 @@ class VideoWriter:
         self._container.mux(self._stream.encode(picture))
 
     def close(self) -> None:
-        """Write what the encoder still holds and end the file."""
+        """Flush the encoder and end the file."""
         if self._container is not None:
             self._container.mux(self._stream.encode())
             self._container.close()
             self._container = None
 
     def abandon(self) -> None:
-        """Close the file as it is; it is about to be deleted."""
+        """Close the unfinished file, which will be deleted."""
         if self._container is not None:
             self._container.close()
             self._container = None
 
 
 def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:
-    """Join videos of one encoder, given with their number of frames, without encoding them again.
+    """Join videos of one encoder, given with their numbers of frames, without encoding them again.
 
-    Frame i of the whole is at i / 20 s to the tick: the places follow from the frame counts, not from
-    the durations that the files state.
+    Frame i of the result is at exactly i / 20 s: times follow from frame counts, not from the durations in the files.
     """
     import av
 
@@ -101,7 +100,8 @@ def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:
                     extradata = template.codec_context.extradata
                 if (template.time_base, template.codec_context.extradata) != (time_base, extradata):
                     raise MemobenchError(
-                        f"{part} was encoded in another way than {videos[0][0]}; delete both folders, generate again"
+                        f"{part} and {videos[0][0]} were encoded with different settings; delete both folders and "
+                        "generate again"
                     )
                 for packet in source.demux(template):
                     if packet.dts is None or packet.pts is None:
@@ -114,7 +114,7 @@ def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:
 
 
 def video_info(path: Path) -> dict[str, Any]:
-    """Return what LeRobot keeps about a video in meta/info.json."""
+    """Return LeRobot's description of a video for meta/info.json."""
     import av
     from lerobot.datasets.video_utils import get_video_info
 
@@ -130,17 +130,17 @@ QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 
 
 class ImageHistograms:
-    """Collect statistics of a video's frames while they pass: a histogram of 256 bins per frame and channel.
+    """Collect a histogram of 256 bins per channel of each frame, for statistics of an episode.
 
-    LeRobot takes frames evenly spread over the episode, at least 100; which ones is known only at its end. A
-    frame's histograms are 3 kB, the frame itself 192 kB.
+    LeRobot samples frames evenly over the episode, at least 100, so the sample is known only at its end. The histograms
+    of a frame take 3 kB, the frame itself 192 kB.
     """
 
     def __init__(self) -> None:
         self._counts: list[NDArray[np.int32]] = []
 
     def add(self, frame: NDArray[np.uint8]) -> None:
-        """Count one more frame, (H, W, 3) uint8."""
+        """Add the next frame, (H, W, 3) uint8."""
         import cv2
 
         counts = [cv2.calcHist([frame], [channel], None, [256], [0, 256])[:, 0] for channel in range(3)]
@@ -149,8 +149,7 @@ class ImageHistograms:
     def stats(self) -> Stats:
         """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,).
 
-        Over the frames that LeRobot samples, but exact over their pixels: eight bits need a histogram of 256
-        bins, not of 5,000 adaptive ones.
+        They are over LeRobot's sample of frames, but exact over its pixels: values of eight bits need 256 bins.
         """
         from lerobot.datasets.compute_stats import sample_indices
 

@@ -327,8 +327,8 @@ def pick(
             way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60, give_up=way.stall_check()
         )
         yield from hand.close(way.closing, hand.rotation)
-        # After a miss retry at once, first at the same place. Otherwise policies would learn to lift nothing, or to
-        # change the grasp without a visible reason.
+        # After a miss retry at once, first at the same place. Otherwise policies would learn to lift an empty hand, or
+        # to change the grasp without a visible reason.
         failed += attempt > 0 or not hand.empty
         missed = hand.empty or hand.sim.asset_pose(name)[1][2, 2] < upright - MAX_TIPPING
         held = None if missed else (yield from _lift(hand, name))

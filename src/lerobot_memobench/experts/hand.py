@@ -38,7 +38,7 @@ FLANGE_LENGTH, WRIST_OFFSET = 0.2035, 0.088
 MAX_STRETCH = 0.70
 """Largest distance from shoulder to wrist, m; the arm is straight at 0.719 m."""
 COMFORTABLE_STRETCH = 0.685
-"""Distance from shoulder to wrist up to which reaching costs nothing, m."""
+"""Distance from shoulder to wrist up to which reaching has no cost, m."""
 STRAIGHT_ELBOW_ANGLE = -0.42
 """Elbow angle above which the arm is bent backwards through its straight pose, rad."""
 EMPTY_OPENING = 0.003

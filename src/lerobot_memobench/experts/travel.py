@@ -345,7 +345,7 @@ def travel(
     held: Held | None = None,
     give_up: Callable[[], bool] | None = None,
 ) -> Steps:
-    """Move above a position, over all obstacles on the path; do nothing if the path is free."""
+    """Move above a position, over all obstacles on the path; a free path needs no motion."""
     start, end = hand.position, place()
     lowest, wide, but = _carried_extent(hand, held)
     height = clear_height(hand, start, end, lowest=lowest, wide=wide, but=(target, *but))
@@ -395,7 +395,7 @@ def go_home(hand: Hand, position: Array, rotation: Array) -> Steps:
 
 
 def come_home(hand: Hand, position: Array, rotation: Array) -> Steps:
-    """Return to the home pose and come to rest there; do nothing if the hand is home.
+    """Return to the home pose and come to rest there; a hand at home does not move.
 
     Settling ends after `MAX_SETTLING_STEPS` steps.
     """

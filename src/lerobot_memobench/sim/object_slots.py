@@ -3,7 +3,7 @@
 The observation is a flat float32 vector of a fixed number of slots. A slot is an object, a fixture, or a moving part of
 a fixture (drawer, door, knob), called *thing* here. Only things visible to a camera of the benchmark in the present
 state are included: rays run from both cameras to points of each thing. Slots are sorted by class and position, so they
-carry no identity: exchanging two equal objects changes nothing. They contain no goal, progress or history.
+carry no identity: exchanging two equal objects has no effect. They contain no goal, progress or history.
 
 LIBERO's three drawers share the origin of their cabinet. There the position of a drawer is its handle's, and drawers
 are sorted by height of the closed handles, from the top. The observed heights contain the same information.

@@ -42,7 +42,7 @@ QUALITIES = {"fast": Quality(0), "default": Quality(1024), "high": Quality(2048,
 shadows and the original arm meshes, at ten times the cost."""
 
 SHADOWLESS_BODIES = ("room", "kitchen_table")
-"""Bodies that cast no shadow because nothing is below or behind them."""
+"""Bodies that cast no shadow because no other body is below or behind them."""
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,8 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from lerobot_memobench.datasets.frames import FrameReader, frame_reader, read_frame_table
+from lerobot_memobench.datasets.frames import FrameReader, frame_reader, read_frame_table, read_recorded
 from lerobot_memobench.datasets.lerobot_format.layout import read_info
-from lerobot_memobench.datasets.lookup import read_recorded
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import free_bytes, in_words, telling_of_the_disk, write_file
 from lerobot_memobench.jobs.threads import cores

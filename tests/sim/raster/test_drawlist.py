@@ -74,7 +74,7 @@ def in_world(draw_list: DrawList, model: mujoco.MjModel, what: str) -> np.ndarra
     return turned + data.geom_xpos[0] if what == "position" else turned
 
 
-def test_a_finer_mesh_stands_where_the_scenes_does() -> None:
+def test_finer_mesh_has_the_pose_of_the_coarse_one() -> None:
     """The compiler turns each mesh into its own axes, and one with another corner has others."""
     coarse = wedge(WEDGE, WEDGE_FACES)
     fine = wedge(np.vstack([WEDGE, HORN]), np.vstack([WEDGE_FACES[:3], (1, 2, 4), (2, 3, 4), (3, 1, 4)]))

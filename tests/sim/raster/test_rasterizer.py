@@ -48,9 +48,9 @@ def states(sims: list[Simulation], joint: str, opened: float) -> Iterator[str]:
     ("task", "quality"), [*((task, "default") for task in SCENES), ("turn_on_the_stove_and_turn_it_off", "fast")]
 )
 def test_frames_do_not_depend_on_caches(task: str, quality: str) -> None:
-    """They are those of a renderer that has drawn nothing, and nearly those of one for which nothing stands still.
+    """They equal those of a new renderer, and nearly those of a renderer without static rows.
 
-    Levels of textures are chosen at the ends of what is drawn of a surface, which things in front of it may part.
+    Levels of textures are chosen per visible part of a surface, and objects in front of it may divide it.
     """
     settings = RenderSettings(128, 128, quality)
     sims = [Simulation(get_task(task), settings) for _ in range(2)]
@@ -71,7 +71,7 @@ def test_frames_do_not_depend_on_caches(task: str, quality: str) -> None:
 
 
 @pytest.mark.parametrize("place", [np.nan, np.inf, 1e9])
-def test_a_state_that_is_not_finite_is_refused(place: float) -> None:
+def test_non_finite_state_is_refused(place: float) -> None:
     sim = Simulation(get_task("open_and_close_the_microwave"), RenderSettings(32, 32))
     sim.reset(7)
     expected = sim.render()
@@ -93,7 +93,7 @@ def test_the_cache_of_still_states_is_bounded() -> None:
     assert len(rasterizer._still) == MAX_STILL_STATES
 
 
-def test_a_triangle_that_reaches_behind_the_camera_ends_at_its_level_edge() -> None:
+def test_triangle_partly_behind_the_camera() -> None:
     """It is seen beyond the edge, away from the part behind the camera: here far outside of the picture."""
     corners = np.array([[-0.5, 0.9, 0.01], [0.0, 0.93, -0.05], [0.5, 0.9, 0.01]], np.float32)
     matrix, table = np.eye(4, dtype=np.float32)[[0, 1, 2, 2]], np.zeros((1, 5, 4), np.float32)
@@ -109,11 +109,11 @@ def test_a_triangle_that_reaches_behind_the_camera_ends_at_its_level_edge() -> N
         assert (target.triangle == -1).all()
 
 
-# --- a scene with what the scenes of LIBERO have ---
+# --- a scene with the features of LIBERO's scenes ---
 
 
 def textured_scene() -> mujoco.MjModel:
-    """Return spots, light of parallel rays, cubes and pictures on boxes and a floor, and what can be seen through."""
+    """Return a scene with spots, directional light, cube and flat textures, a mirror and a translucent box."""
     spec, shapes = mujoco.MjSpec(), mujoco.mjtGeom
     spec.visual.headlight.ambient = [0.3, 0.3, 0.3]
     _add_material(spec, "floor", (64, 64), repeat=(3, 3), uniform=True)
@@ -178,7 +178,7 @@ def test_looks_like_mujocos_own_renderer(mujoco_renderer: type[mujoco.Renderer],
     assert (off.max(axis=2) > 16).mean() < 0.03
 
 
-def test_a_mirror_shows_what_is_above_it() -> None:
+def test_mirror() -> None:
     model = textured_scene()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -193,7 +193,7 @@ def test_a_mirror_shows_what_is_above_it() -> None:
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
-def test_a_face_that_reaches_behind_the_camera_ends_where_it_should(tilt: float) -> None:
+def test_face_partly_behind_the_camera(tilt: float) -> None:
     """Its corners are outside of the picture, some behind, and its near edge is level in the picture."""
     spec = mujoco.MjSpec()
     spec.visual.headlight.ambient = [1, 1, 1]

@@ -1,7 +1,7 @@
-"""Put a dataset together from finished episodes.
+"""Assemble a dataset from finished episodes.
 
-It is built in the hidden folder ``.staging`` of its destination and moved up, ``meta`` last: a folder without
-``meta/info.json`` is not a dataset to anybody.
+It is built in the hidden folder ``.staging`` of its destination and moved up, ``meta`` last: without
+``meta/info.json`` a folder is not a dataset.
 """
 
 from __future__ import annotations
@@ -33,11 +33,10 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     image_key,
     objects_column,
 )
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
 from lerobot_memobench.datasets.staging import (
     TEMPORARY,
     StagedEpisode,
-    clean_temporaries,
     flush_to_disk,
     stage_demonstration,
 )
@@ -65,10 +64,9 @@ def write_dataset(
     repo_id: str = DEFAULT_REPO_ID,
     made_by: str = "",
 ) -> Path:
-    """Write demonstrations, in their order, as a dataset in ``out`` (absent or empty); one is in memory at a
-    time.
+    """Write demonstrations, in their order, as a dataset in ``out`` (absent or empty); one is in memory at a time.
 
-    All have images, or none has. ``made_by`` is a sentence for the card.
+    Either all of them have images or none. ``made_by`` is a sentence for the card.
     """
     out = Path(out)
     check_destination(out)
@@ -97,17 +95,26 @@ def assemble(
     manifest: dict[str, Any] | None = None,
     left_out: Sequence[str] = (),
 ) -> Path:
-    """Build the dataset of the staged ``episodes`` in ``out``; failed ones are named, not written.
+    """Build the dataset of the staged ``episodes`` in ``out``; failed ones are listed, but not written.
 
-    Deterministic: the same episodes give the same files. ``manifest`` is added to manifest.json, ``left_out``
-    to the card: what else is missing and why.
+    Deterministic: equal episodes give equal files.
+
+    Args:
+        episodes: staged episodes.
+        out: destination.
+        repo_id: name of the dataset.
+        made_by: sentence for the card.
+        manifest: further content of manifest.json.
+        left_out: reasons for the card why further episodes are missing.
     """
     out = Path(out)
     written = [episode for episode in episodes if episode.failure is None]
     if not written:
         raise MemobenchError(f"there is no successful demonstration to write to {out}; see the failures reported")
     if len({episode.has_images for episode in written}) > 1:
-        raise MemobenchError(f"some episodes for {out} have images and some have none; make them all alike")
+        raise MemobenchError(
+            f"some episodes for {out} have images and some have none; record all of them with equal settings"
+        )
     for episode in written:
         episode.check()
 
@@ -124,7 +131,7 @@ def assemble(
 def _write_lerobot(
     written: Sequence[StagedEpisode], build: Path, repo_id: str, versions: dict[str, str] | None
 ) -> dict[str, dict[str, Any]]:
-    """Write the LeRobotDataset of the episodes into ``build``, ``versions`` of packages noted; return its features."""
+    """Write the LeRobotDataset of the episodes into ``build``, with ``versions`` of packages; return its features."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.io_utils import write_stats
 
@@ -154,7 +161,7 @@ def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
 
 
 def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], build: Path) -> None:
-    """Write the hashes of all files and episodes asked for; failed ones have a reason in place of an index."""
+    """Write the hashes of all files and requested episodes; failed ones have a reason instead of an index."""
     keys = ("task_name", "seed", "referent", "variant", "success", "frames", "scene_hash", "digest")
     rows, index = [], 0
     for episode in episodes:
@@ -176,7 +183,7 @@ def _written_files(folder: Path) -> dict[str, Written]:
 
 
 def _move(build: Path, out: Path) -> None:
-    """Move the finished build into ``out``; only with the last move does ``out`` become a dataset."""
+    """Move the finished build into ``out``, which becomes a dataset with the last move."""
     out.mkdir(parents=True, exist_ok=True)
     flush_to_disk(path for path in build.rglob("*") if path.is_file())
     for name in TOP_LEVEL:
@@ -187,7 +194,6 @@ def _move(build: Path, out: Path) -> None:
             os.replace(build / name, target)
     flush_to_disk([out])
     build.rmdir()
-    clean_temporaries(out / STAGING)
 
 
 # --- frames, states and metadata ---
@@ -222,7 +228,7 @@ def _write_frames(
         columns = _columns(arrays, numbering, record, meta.features)
         data.write(frames_table(columns, episode, meta.features))
         states.write(states_table(arrays["states"], number))
-        # LeRobot normalises no column without statistics: phase and step reach a policy as they do in a rollout.
+        # LeRobot does not normalise columns without statistics: phase and step reach a policy as in a rollout.
         counted = {key: value for key, value in columns.items() if value.dtype.kind in "bif" and key not in CLOCK}
         for key, value in counted.items():
             numbers.setdefault(key, []).append(value)
@@ -257,11 +263,10 @@ def _columns(
 
 
 def numeric_stats(values: NDArray) -> Stats:
-    """Return exact statistics of (T,) or (T, n) numbers over T: each (n,) (n = 1 for (T,)), and ``count``
-    (1,).
+    """Return exact statistics of (T,) or (T, n) numbers over T: each (n,) (n = 1 for (T,)), and ``count`` (1,).
 
-    LeRobot averages the episodes' quantiles; over a whole dataset that is no quantile. pi0.5 normalises by
-    q01 and q99, so they are computed from all frames here.
+    LeRobot averages the quantiles of episodes, which is not a quantile of the dataset. pi0.5 normalises by q01 and q99,
+    so they are computed from all frames.
     """
     flat = values.reshape(len(values), -1)
     blocks = [_stats_of(flat[:, start : start + BLOCK].astype(np.float64)) for start in range(0, flat.shape[1], BLOCK)]
@@ -292,11 +297,11 @@ def _image_statistics(episodes: Sequence[StagedEpisode]) -> dict[str, Stats]:
 
 
 def frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: dict[str, Any]) -> pa.Table:
-    """Return an episode's frames as a table of exactly the type that LeRobot reads.
+    """Return an episode's frames as a table of the type that LeRobot reads.
 
     Args:
         columns: name to one value or row per frame.
-        episode: where they come from; its language rows are added.
+        episode: their episode, whose language rows are added.
         features: LeRobot's description of all columns.
 
     Raises:
@@ -314,8 +319,8 @@ def frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: 
             arrays.append(_array(columns[field.name], field.type))
         else:
             raise MemobenchError(
-                f"{episode.folder} was staged by an older version, without the column {field.name}; delete that folder "
-                "and generate again to make this episode again"
+                f"{episode.folder} was staged by an older version, without the column {field.name}; delete the folder "
+                "and repeat the command to make this episode again"
             )
     return pa.Table.from_arrays(arrays, schema=typed.arrow_schema)
 
@@ -329,11 +334,11 @@ def _array(values: NDArray, kind: pa.DataType) -> pa.Array:
 
 
 def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
-    """The episode's rows, the same on every frame: built once and repeated by index."""
+    """Return the episode's rows, equal at every frame: built once and repeated by index."""
     import datasets
 
     once = datasets.Dataset.from_dict(
-        {LANGUAGE: [episode.language_rows]}, features=datasets.Features({LANGUAGE: feature})
+        {LANGUAGE: [episode.record.language_persistent]}, features=datasets.Features({LANGUAGE: feature})
     ).with_format("arrow")[:]
     return once.column(LANGUAGE).combine_chunks().take(np.zeros(int(episode.info["frames"]), dtype=np.int64))
 
@@ -354,7 +359,7 @@ def states_table(states: NDArray[np.float64], number: int) -> pa.Table:
 
 
 class ParquetFiles:
-    """A sequence of parquet files in LeRobot's chunk and file numbering; each write is a row group."""
+    """Parquet files in LeRobot's chunk and file numbering; each write is a row group."""
 
     def __init__(self, build: Path, template: str) -> None:
         self.build, self.template = build, template
@@ -373,11 +378,11 @@ class ParquetFiles:
         self._writer.write_table(table)
 
     def size(self) -> int:
-        """Bytes in the current file so far."""
+        """Return the present size of the current file, bytes."""
         return self._path.stat().st_size if self._writer is not None and self._path is not None else 0
 
     def next(self, chunks_size: int) -> None:
-        """Go on with the next file."""
+        """Begin the next file."""
         from lerobot.datasets.utils import update_chunk_file_indices
 
         self.close()
@@ -424,7 +429,7 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
 
 
 def _grouped(sizes: Sequence[int], limit: float) -> list[list[int]]:
-    """Consecutive positions whose sizes sum up to at most ``limit`` (a single larger one is alone)."""
+    """Group consecutive positions whose sizes sum up to at most ``limit``; a larger one forms its own group."""
     groups: list[list[int]] = []
     total = 0
     for position, size in enumerate(sizes):

@@ -11,7 +11,7 @@ import numpy as np
 from huggingface_hub import DatasetCardData
 
 from lerobot_memobench.datasets.lerobot_format.layout import read_info, undamaged
-from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
+from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, list_episodes
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.paper import raw_tables
@@ -20,22 +20,21 @@ from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES
 
 CARD_FILE = "README.md"
 MADE_BY = "## How it was made"
-"""Heading of a card of ours; LeRobot's has none."""
+"""Heading in cards of this package, which LeRobot's cards do not have."""
 EDITED = (
-    "A tool without knowledge of this benchmark, such as `lerobot-edit-dataset`, has edited this dataset: its card, "
-    "tables and hashes are made from its frames. Lost are the failed seeds, and the simulator's states: "
-    "`memobench validate` makes those again from seed and actions and compares their hash, but cannot where an episode "
-    "has no seed."
+    "Another tool, such as `lerobot-edit-dataset`, has edited this dataset: its card, tables and hashes are computed "
+    "from its frames. The list of failed seeds and the simulator's states were lost. `memobench validate` computes the "
+    "states again from seed and actions and compares their hash, except for episodes without a seed."
 )
 SCRIPTED = (
-    "Scripted experts act in a MuJoCo simulation; nothing was collected from people or robots. Actions were recorded "
-    "as applied (`executed_action`), so that replaying them from the seed gives the same states."
+    "Scripted experts act in a MuJoCo simulation; no data of people or robots was collected. Actions were recorded as "
+    "applied (`executed_action`), so that replaying them from the seed gives the same states."
 )
 OWN_TERMS = "Apache-2.0: the demonstrations, and `lerobot_memobench`, which made them."
 LIBERO_TERMS = (
-    "The scenes are of LIBERO's assets (Liu et al., 2023). LIBERO has its code under MIT and its datasets under CC BY "
-    "4.0; the packages of its assets say MIT. Name LIBERO where you show the pictures. The additions of "
-    "`lerobot_memobench`, such as actions, labels and tables, is under Apache-2.0."
+    "The scenes consist of LIBERO's assets (Liu et al., 2023). LIBERO's code is under MIT and its datasets are under "
+    "CC BY 4.0; the packages of its assets state MIT. Name LIBERO where you show the images. The additions of "
+    "`lerobot_memobench`, such as actions, labels and tables, are under Apache-2.0."
 )
 AUTHORS_TERMS = (
     "{subject} of MEMOBench's authors are under CC BY-NC 4.0 by the licence of their repository, "
@@ -43,35 +42,37 @@ AUTHORS_TERMS = (
     "for research that is not commercial, and name them (Sun et al.)."
 )
 LIMITATIONS = """\
-- It is one simulated kitchen with one Panda arm and one scripted expert: each task is done in one way, by one
-  instruction, and nothing is known of real pictures.
-- In tasks with a demonstration prompt the texts of subgoals, memory and language rows name what only the prompt shows:
-  which carton, which bowl, which drawer, which order. A policy that reads them where it acts is not tested for memory.
-- Visible objects, states, seeds and checkpoint columns are the simulator's: no camera shows them.
-- Frames of demonstration prompts are demonstrations of what to remember, not of what to do."""
+- One simulated kitchen, one Panda arm and one scripted expert: each task is done in one way and has one instruction.
+  Transfer to real images is untested.
+- In tasks with a demonstration prompt the texts of subgoals, memory and language rows name information that only the
+  prompt shows: the carton, the bowl, the drawer or the order. A policy that reads them during execution is not tested
+  for memory.
+- Visible objects, states, seeds and checkpoint columns come from the simulator and are not visible to cameras.
+- Frames of demonstration prompts show the information to remember, not the actions to take."""
 COLUMNS = {
     "observation.images.image": "third-person camera",
     "observation.images.wrist_image": "wrist camera",
     "observation.state": "end-effector position 3, axis-angle 3, gripper joints 2",
     "action": "OSC pose delta 6 (±1 is ±0.05 m, ±0.5 rad), gripper (−1 opens, +1 closes)",
-    "observation.environment_state": "what the cameras see as objects, 16 slots: see `memobench objects`",
-    "privileged.environment_state": "the same where there are pictures: true poses, which LeRobot's own training takes "
-    "for no input; `memobench_mem` with `perception=objects` reads them, others by `lerobot train obs_type=both`",
-    "executed_action": "what moved the arm: `action`, but where it was moved off its way (`generate --perturb`)",
-    "observation.phase": "0 demonstration prompt, or the robot idles (the policy does not act), 1 execution",
+    "observation.environment_state": "objects visible to the cameras, 16 slots: see `memobench objects`",
+    "privileged.environment_state": "the same in datasets with images: true poses, which LeRobot's own training does "
+    "not use as an input; `memobench_mem` with `perception=objects` reads them, others with `lerobot train "
+    "obs_type=both`",
+    "executed_action": "the applied action; differs from `action` where the arm was perturbed (`generate --perturb`)",
+    "observation.phase": "0 demonstration prompt or idling (the policy does not act), 1 execution",
     "observation.step": "control steps since that phase began; -1 in the execution of strict tasks",
     "checkpoint.index": "number of checkpoints completed in order before this frame",
     "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
     "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",
     "checkpoint.event": "a checkpoint is satisfied for the first time at this frame",
-    "simple_subgoal": "text of the checkpoint being worked on, intermediate level",
-    "grounded_subgoal": "the same at the fine level; once all are done, the last one's text stays",
+    "simple_subgoal": "text of the present checkpoint, intermediate level",
+    "grounded_subgoal": "the same at the fine level; after the last checkpoint its text remains",
     "coarse_subgoal": "the same at the coarse level",
     "memory": "the checkpoints completed in order before this frame, as text (oracle memory); empty at the start",
-    "language_persistent": "LeRobot's language rows for its training recipes: style `subtask`, what to do next, as an "
-    "instruction; style `memory`, what has been done",
-    "episode_info": "JSON at an episode's first frame, else empty: all of the table below, and versions, because "
-    "LeRobot's dataset tools keep the columns of frames alone",
+    "language_persistent": "LeRobot's language rows for its training recipes: style `subtask`, the next step as an "
+    "instruction; style `memory`, the completed steps",
+    "episode_info": "JSON at an episode's first frame, else empty: the fields of the table below, and versions, "
+    "because LeRobot's dataset tools keep only columns of frames",
 }
 EPISODE_COLUMNS = {
     "task_name": "task of the catalogue",
@@ -79,10 +80,10 @@ EPISODE_COLUMNS = {
     "family": "group of similar tasks",
     "operations": "labels of the checkpoints in order, e.g. SUC",
     "seed": "seed of the scene",
-    "referent": "fixed; random: the demonstration prompt decides the goal; drawn: so is every strict task, by seed",
-    "variant": "which admissible referent or order; 0 is the published one",
+    "referent": "fixed; random: the demonstration prompt decides the goal; drawn: the seed decides it (strict tasks)",
+    "variant": "number of the referent or order; 0 is the published one",
     "success": "the goal was reached",
-    "exec_start_index": "frame at which execution starts",
+    "exec_start_index": "first frame of the execution",
     "key_frames": "frame at which each checkpoint was completed in order, −1 if never",
     "scene_hash": "hash of the initial scene",
     "fixture_poses": "JSON, fixture to position and quaternion wxyz",
@@ -91,7 +92,7 @@ EPISODE_COLUMNS = {
 
 
 FAMILIES: dict[str, dict[str, Any]] = {name: raw_tables()["demo_statistics"][name] for name in (*MEMORY_TYPES, "total")}
-"""Rows of the paper's appendix, "Family level statistics"; ``gib`` is the size of its HDF5 files."""
+"""Rows of the paper's appendix, "Family level statistics"; ``gib``: size of its HDF5 files."""
 LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
     (int(low), int(high) + 1 if high else None): count
     for name, count in raw_tables()["length_buckets"].items()
@@ -109,7 +110,7 @@ def write_card(
     made_by: str,
     left_out: Sequence[str] = (),
 ) -> None:
-    """Write ``folder``/README.md: what the dataset is, its columns, how it was made, statistics, licence."""
+    """Write ``folder``/README.md: introduction, making, statistics, columns, limitations, licence."""
     solved = [episode for episode in episodes if episode.failure is None]
     failed = [episode for episode in episodes if episode.failure is not None]
     made = [
@@ -125,7 +126,7 @@ def write_card(
 
 
 def own_card(folder: Path, count: int) -> str | None:
-    """Return the card of a dataset of ``count`` episodes; None where it is not this package's, or of other episodes."""
+    """Return the card of a dataset of ``count`` episodes; None if another program wrote it, or for other episodes."""
     try:
         card = (folder / CARD_FILE).read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -138,8 +139,8 @@ def card_from_frames(folder: Path, rows: Sequence[Mapping[str, Any]], repo_id: s
 
     Args:
         folder: the dataset.
-        rows: the records of its episodes, each with its ``length``.
-        repo_id: its address on the hub; None where it is loaded from a folder.
+        rows: records of its episodes, each with its ``length`` (`records_of`).
+        repo_id: its address on the hub; None if it is loaded from a folder.
     """
     infos = [{**row, "frames": row["length"]} for row in rows]
     loading = _loading(repo_id or "local/demonstrations", None if repo_id else "<this folder>")
@@ -157,10 +158,19 @@ def hub_card(folder: Path, repo_id: str) -> str:
         card = own_card(folder, len(places))
     if card is not None:
         return re.sub(r'LeRobotDataset\("[^"\n]*", root="[^"\n]*"\)', f'LeRobotDataset("{repo_id}")', card)
+    return card_from_frames(folder, records_of(folder, places), repo_id)
+
+
+def records_of(folder: Path, places: Iterable[EpisodePlace]) -> list[dict[str, Any]]:
+    """Return the records of episodes, each with its ``length``, without episodes of other programs.
+
+    Raises:
+        MemobenchError: no episode has a record.
+    """
     rows = [{**place.record.model_dump(), "length": place.length} for place in places if place.record is not None]
     if not rows:
-        raise MemobenchError(f"{folder} has no episode of this benchmark: of each, {STRANGER}")
-    return card_from_frames(folder, rows, repo_id)
+        raise MemobenchError(f"{folder} has no episode of this benchmark: {STRANGER}")
+    return rows
 
 
 def _card(
@@ -174,7 +184,12 @@ def _card(
     """Return the card.
 
     Args:
-        infos: of the episodes, with their ``frames``. size: bytes of the dataset. made: paragraphs on its making.
+        infos: information on the episodes, with their ``frames``.
+        failed: seeds without a demonstration.
+        features: columns of the dataset.
+        size: bytes of the dataset.
+        made: paragraphs on its making.
+        loading: code that loads it.
     """
     licence, section = terms(infos)
     data = DatasetCardData(
@@ -203,7 +218,7 @@ def _card(
 
 
 def _loading(repo_id: str, root: str | None) -> str:
-    """Return the example that loads the dataset: from a folder, or from the hub."""
+    """Return code that loads the dataset from a folder, or from the hub."""
     where = f'"{repo_id}"' if root is None else f'"{repo_id}", root="{root}"'
     return f"""\
 ```python
@@ -219,24 +234,24 @@ def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]
     tasks = {info["task_name"] for info in infos}
     return [
         f"{len(infos)} demonstrations of {len(tasks)} robot manipulation tasks that need memory "
-        f"({', '.join(ordered_types(infos))}), as a LeRobotDataset v3.0 at 20 frames per second. Each task names the "
-        "checkpoints a memory has to keep (Storage), revise (Update) or summarise (Compression); every frame holds "
-        "which of them are done, because the simulator wrote the labels. Benchmark and metrics: MEMOBench; generator, "
-        "environment and policies: `lerobot_memobench`.",
+        f"({', '.join(ordered_types(infos))}), as a LeRobotDataset v3.0 at 20 frames per second. Each task has "
+        "checkpoints that a memory must store (Storage), revise (Update) or summarise (Compression); the simulator "
+        "labels each frame with the completed ones. Benchmark and metrics: MEMOBench; generator, environment and "
+        "policies: `lerobot_memobench`.",
         *_world(infos),
         loading,
-        "`execution` leaves out the frames of demonstration prompts, in which the policy does not act; `lerobot train` "
-        "of `lerobot_memobench` leaves them out by itself. One memory type alone: `episode_filter=lambda episode: "
-        'episode["memory_type"] == "spatial"`. Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to a '
-        "DataLoader of your own: language rows differ in number between episodes. `lerobot-train` does so by itself.",
+        "`execution` leaves out the frames of demonstration prompts, in which the policy does not act, as `lerobot "
+        "train` of `lerobot_memobench` does. To load one memory type, use `episode_filter=lambda episode: "
+        'episode["memory_type"] == "spatial"`. Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to your own '
+        "DataLoader, as `lerobot-train` does: the number of language rows differs between episodes.",
     ]
 
 
 def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a paragraph on the world of the scenes; nothing where it is the package's own."""
+    """Return a paragraph on the world of the scenes, none for the package's own."""
     found = [info for info in infos if info.get("world") == LIBERO]
     missing = sorted({name for info in found for name in info.get("stand_ins") or ()})
-    stand_ins = f" Scans were missing, and boxes stand in for them: {', '.join(missing)}." if missing else ""
+    stand_ins = f" Boxes replace missing scans: {', '.join(missing)}." if missing else ""
     return [f"The scenes are the paper's, of LIBERO's assets (`world={LIBERO}`).{stand_ins}"] if found else []
 
 
@@ -246,14 +261,14 @@ def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
             ["column", "type", "meaning"],
             [[f"`{key}`", _type(ft), COLUMNS[key]] for key, ft in features.items() if key in COLUMNS],
         ),
-        "LeRobot's own columns are there too: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
+        "Further columns are LeRobot's own: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
         "`task_index`.",
         "Per episode, in `meta/episodes` (after LeRobot's dataset tools: `episodes=episodes_where(folder, "
         'memory_type="spatial")` with `from lerobot_memobench.datasets.lerobot_format.reading import episodes_where`):',
         markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
         "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
         "numbers are exact over all frames, those of images over sampled frames. `observation.phase` and "
-        "`observation.step` have none: LeRobot then leaves them as they are, as they arrive in a rollout.",
+        "`observation.step` have none, so that LeRobot does not normalise them and they are as in a rollout.",
     ]
 
 
@@ -264,21 +279,21 @@ def _type(feature: dict[str, Any]) -> str:
 
 def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
     if not failed:
-        return f"All {asked} seeds asked for were solved; none was left out."
+        return f"All {asked} requested seeds were solved."
     lines = [f"- {e.info['task_name']}, seed {e.info['seed']}: {e.failure}" for e in failed]
-    return f"**{len(failed)} of {asked} seeds asked for have no demonstration here:**\n\n" + "\n".join(lines)
+    return f"**{len(failed)} of {asked} requested seeds have no demonstration:**\n\n" + "\n".join(lines)
 
 
 # --- the licence ---
 
 
 def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
-    """Return a dataset's licence, as the hub names it, and the section of its card on it.
+    """Return a dataset's licence, as the hub names it, and the licence section of its card.
 
-    They follow from the world of the scenes and from who recorded the demonstrations.
+    They depend on the world of the scenes and on the source of the demonstrations.
 
     Args:
-        infos: of its episodes (`staging.Info`).
+        infos: information on its episodes (`staging.episode_info`).
     """
     infos = list(infos)
     there = [info for info in infos if info.get("world") == LIBERO]
@@ -293,7 +308,7 @@ def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
 
 
 def _shows_scans(info: Mapping[str, Any]) -> bool:
-    """Whether a scan of the authors' is in an episode's scene: every object of a spatial task is one, or a stand-in."""
+    """Return whether an episode's scene has a scan of the authors: each object of a spatial task is one or a box."""
     name = info["task_name"]
     if info["memory_type"] != "spatial" or suite_of(name) is None:
         return False
@@ -311,7 +326,7 @@ def _statistics(written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisod
         _lengths_table(written),
         f"{size / sum(info['frames'] for info in written):,.0f} bytes per frame.",
         _prompts(written),
-        "How many episodes have which length, in steps (paper: appendix, distribution of lengths):",
+        "Number of episodes by length, in steps (paper: appendix, distribution of lengths):",
         _buckets_table(written),
         _tasks_table(written, failed),
     ]
@@ -323,7 +338,7 @@ def _prompts(infos: Sequence[dict[str, Any]]) -> str:
         lengths = [info["exec_start_index"] for info in infos if info["memory_type"] == name]
         if any(lengths):
             parts.append(f"{np.mean(lengths):.1f} in {name} tasks")
-    return f"Of these steps the demonstration prompt takes, on average, {' and '.join(parts)}." if parts else ""
+    return f"The demonstration prompt takes, on average, {' and '.join(parts)} of these steps." if parts else ""
 
 
 def _size(folder: Path) -> int:
@@ -333,7 +348,7 @@ def _size(folder: Path) -> int:
 
 
 def ordered_types(infos: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the memory types of episodes, each once: the paper's in its order, then a user's own."""
+    """Return the distinct memory types of episodes: the paper's in its order, then others."""
     there = {info["memory_type"] for info in infos}
     return [name for name in FAMILIES if name in there] + sorted(there - set(FAMILIES))
 
@@ -349,7 +364,7 @@ def _lengths_table(infos: Sequence[dict[str, Any]]) -> str:
 
 
 def _figures(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return of episodes what `FAMILIES` holds of the paper's."""
+    """Return the statistics of episodes, with the keys of `FAMILIES`."""
     lengths = np.array([info["frames"] for info in infos])
     return {
         "tasks": len({info["task_name"] for info in infos}),

@@ -1,10 +1,9 @@
-"""A dataset's folder: names of files and columns, its metadata, and whether all of it is there and whole."""
+"""Layout of a dataset's folder: names of files and columns, metadata, and checks for missing or damaged files."""
 
 from __future__ import annotations
 
 import glob
 import hashlib
-import math
 import os
 import shlex
 import traceback
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
 from annotated_types import Ge, Le
+from pydantic import BaseModel, ConfigDict
 
 from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
 from lerobot_memobench.errors import MemobenchError
@@ -36,41 +36,39 @@ INFO_FILE = Path("meta") / "info.json"
 STATS_FILE = Path("meta") / "stats.json"
 TASKS_FILE = Path("meta") / "tasks.parquet"
 TOP_LEVEL = ("videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
-"""Moved into place in this order; with `meta` the folder becomes a dataset, without it the manifest is the last."""
+"""In the order in which they are moved into place; with `meta` the folder becomes a dataset."""
 EPISODE_INFO = "episode_info"
-"""The frames' column; empty but at an episode's first frame."""
+"""Column of frames with the episode's record at its first frame, empty elsewhere."""
 LANGUAGE = "language_persistent"
 """LeRobot's column of language rows."""
 OBJECTS = "observation.environment_state"
-"""Visible objects, in datasets without pictures: LeRobot takes a column of this name for an input."""
+"""Column of visible objects in datasets without images; LeRobot uses a column of this name as an input."""
 PRIVILEGED = "privileged.environment_state"
-"""The same in datasets with pictures, so that LeRobot's own commands train on no object poses there."""
+"""The same in datasets with images, so that LeRobot's own commands do not train on object poses there."""
 EXECUTED_ACTION = "executed_action"
-"""The action that moved the arm; `action` is the expert's, which differs where the arm was moved off its way. LeRobot
-takes every column that begins with `action` for something to be learned."""
+"""The action that moved the arm; `action` is the expert's, which differs in perturbed episodes. LeRobot learns every
+column whose name begins with `action`, so this name does not."""
 PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "finger_left", "finger_right"]
 ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
 ADVICE = "the dataset is damaged; generate it or take it from its source again"
-NO_MANIFEST = "it is no manifest that this package wrote; take the dataset from its source again"
+NO_MANIFEST = "this package did not write it like that; take the dataset from its source again"
 EARLIER_FORMATS = ("v1.6", "v2.0", "v2.1")
-MOST_NUMBERS = 50_000_000
-"""Limit of numbers of a feature in one frame: a picture of 4096 x 4096. LeRobot allocates memory for all of them."""
 
 
 def is_dataset(folder: Path) -> bool:
-    """Whether ``folder`` holds a finished LeRobotDataset."""
+    """Return whether ``folder`` holds a finished LeRobotDataset."""
     return (folder / INFO_FILE).is_file()
 
 
 def check_destination(out: Path) -> None:
-    """Raise unless ``out`` is absent, empty, or holds nothing but an unfinished run."""
+    """Raise unless ``out`` is absent, empty, or holds only an unfinished run."""
     if is_dataset(out):
         raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
     if ":" in str(out) and not out.is_absolute():
-        raise MemobenchError(f"{out} holds a colon, which Arrow reads as an address; name it by its whole path")
+        raise MemobenchError(f"{out} contains a colon, which Arrow reads as an address; use an absolute path")
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
-    # Files that an interrupted move left next to the staging folder are replaced.
+    # Files of an interrupted move next to the staging folder are replaced.
     strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
     if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
         raise MemobenchError(
@@ -79,7 +77,7 @@ def check_destination(out: Path) -> None:
 
 
 def dataset_files(folder: Path) -> list[str]:
-    """Return the files of the dataset in ``folder`` by their paths in it, without card, manifest and caches."""
+    """Return the paths of a dataset's files below ``folder``, without card, manifest and caches."""
     folders = [folder / name for name in TOP_LEVEL if not Path(name).suffix]
     found = [path for part in folders for path in part.rglob("*") if path.is_file()]
     return sorted(path.relative_to(folder).as_posix() for path in found)
@@ -89,31 +87,29 @@ def dataset_files(folder: Path) -> list[str]:
 
 
 def image_key(camera: str) -> str:
-    """Return the column name of a camera; the env's observations arrive at a policy under the same name."""
+    """Return the column name of a camera, which is also the name of its observation."""
     return f"observation.images.{camera}"
 
 
 def objects_column(names: Collection[str]) -> str:
-    """Return which of a dataset's columns holds the objects.
-
-    Datasets with pictures of earlier versions have them under LeRobot's name.
-    """
+    """Return the column of objects among ``names``; datasets with images of earlier versions use LeRobot's name."""
     return PRIVILEGED if PRIVILEGED in names else OBJECTS
 
 
 def check_clock(names: Collection[str], where: Path | str) -> None:
-    """Refuse a dataset of an earlier version: its prompts would be taken for execution.
+    """Refuse a dataset of an earlier version, whose prompts would be read as execution.
 
     Args:
-        names: its columns. where: its folder.
+        names: its columns.
+        where: its folder.
 
     Raises:
-        MemobenchError: it has the column ``phase`` of that version, and not today's.
+        MemobenchError: it has the column ``phase`` of that version instead of the present ones.
     """
     if {"phase", "simple_subgoal"} <= set(names) and not set(CLOCK) <= set(names):
         raise MemobenchError(
-            f"{where} was made by an earlier version: it has the column phase, and not {' and '.join(CLOCK)}; generate "
-            "or convert it again"
+            f"{where} was made by an earlier version: it has the column phase instead of {' and '.join(CLOCK)}; "
+            "generate or convert it again"
         )
 
 
@@ -152,7 +148,7 @@ def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, 
 
 
 class Info(TypedDict):
-    """A dataset as a whole. Each of its episodes is read, so their number is bounded."""
+    """``meta/info.json``. The number of episodes is bounded, because each is read."""
 
     codebase_version: str
     total_episodes: Annotated[int, Ge(0), Le(10_000_000)]
@@ -165,7 +161,7 @@ def read_info(folder: Path) -> dict[str, Any]:
     """Return ``meta/info.json`` of the dataset in ``folder``.
 
     Raises:
-        MemobenchError: there is none, it is none of LeRobot's, or a feature is too large.
+        MemobenchError: there is none, it is damaged, or of an earlier format.
     """
     try:
         found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
@@ -173,17 +169,10 @@ def read_info(folder: Path) -> dict[str, Any]:
         raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
     if found["codebase_version"] in EARLIER_FORMATS:
         raise MemobenchError(
-            f"{folder} is in LeRobot's format {found['codebase_version']}, and v3.0 is read; convert it in place, from "
+            f"{folder} is in LeRobot's format {found['codebase_version']}, expected v3.0; convert it in place, from "
             f"v2.1: python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/converted "
             f"--root={shlex.quote(str(folder))} --push-to-hub=false"
         )
-    for name, feature in found["features"].items():
-        shape = feature.get("shape")
-        sizes = [size for size in shape if isinstance(size, int)] if isinstance(shape, list) else []
-        if abs(math.prod(sizes)) > MOST_NUMBERS:
-            raise MemobenchError(
-                f"{folder / INFO_FILE} has more than {MOST_NUMBERS:,} numbers of {name[:80]} per frame; {ADVICE}"
-            )
     return found
 
 
@@ -213,7 +202,7 @@ def _row_count(folder: Path) -> int:
 
 
 class Asked(TypedDict):
-    """An episode that was asked for."""
+    """A requested episode."""
 
     task_name: str
     seed: Whole
@@ -221,28 +210,37 @@ class Asked(TypedDict):
 
 
 class Made(Asked):
-    """An episode that is there."""
+    """An episode of the dataset."""
 
     failure: None
     frames: Count
 
 
 class Failed(Asked):
-    """One that is not, and why."""
+    """An episode that could not be made, and the reason."""
 
     failure: str
 
 
-class LeftOut(TypedDict):
-    """A `Problem` of a conversion."""
+class Problem(BaseModel):
+    """A part of a converted file, and the reason why it was left out, or a note on it.
+
+    Attributes:
+        group: group of the file, "" for the file as a whole.
+    """
+
+    model_config = ConfigDict(frozen=True)
 
     file: str
     group: str
     reason: str
 
+    def __str__(self) -> str:
+        return f"{self.file}{', ' + self.group if self.group else ''}: {self.reason}"
+
 
 class Written(TypedDict):
-    """A file as it was written."""
+    """Size and hash of a file when it was written."""
 
     bytes: Count
     sha256: str
@@ -253,8 +251,8 @@ class Manifest(TypedDict):
 
     episodes: list[Made | Failed]
     request: NotRequired[dict[str, Any]]
-    left_out: NotRequired[list[LeftOut]]
-    notes: NotRequired[list[LeftOut]]
+    left_out: NotRequired[list[Problem]]
+    notes: NotRequired[list[Problem]]
     files: NotRequired[dict[str, Written]]
 
 
@@ -270,10 +268,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def without_pattern(folder: Path) -> Path:
-    """Return a path of a dataset's folder for LeRobot, which takes names such as ``obj [v2]`` for patterns of `glob`.
+    """Return a path of a dataset's folder for LeRobot, which reads names such as ``obj [v2]`` as patterns of `glob`.
 
-    It is the folder itself, or a link to it in the cache: the same at every call, since LeRobot keeps a copy of the
-    tables for each path.
+    It is the folder itself, or a link to it in the cache. The link is the same at every call, because LeRobot caches
+    the tables by path.
     """
     place = str(folder.absolute())
     if glob.escape(place) == place or not folder.is_dir():
@@ -285,21 +283,21 @@ def without_pattern(folder: Path) -> Path:
     return link
 
 
-# --- is it whole? ---
+# --- damage ---
 
 
 def undamaged(folder: Path) -> AbstractContextManager[None]:
-    """As `refusing`, for reading the dataset in ``folder``."""
+    """Turn errors of reading the dataset in ``folder``, or one of its files, into `MemobenchError` (`io.refusing`)."""
     return refusing(lambda why: MemobenchError(f"{folder} cannot be read ({why}); {ADVICE}"), folder)
 
 
 def check_whole(folder: Path) -> None:
-    """Raise unless the dataset in ``folder`` has all of its frames, as far as that can be checked without reading them.
+    """Check that a dataset has all of its frames, without reading them.
 
-    Checked are the ends of tables and their numbers of rows, and the boxes of videos and their numbers of frames.
+    The check covers ends and row counts of tables, and boxes and frame counts of videos.
 
     Raises:
-        MemobenchError: naming the first file that is cut off or gone, or what is missing of all.
+        MemobenchError: naming the first file that is truncated or missing, or the table with missing rows.
     """
     info = read_info(folder)
     counts = {"data": info.get("total_frames"), "meta/episodes": info["total_episodes"]}
@@ -316,7 +314,7 @@ def check_whole(folder: Path) -> None:
 
 
 def _video_lengths(folder: Path, info: dict[str, Any], cameras: list[str]) -> dict[Path, int]:
-    """Return how many frames each video must have, from its last one in meta/episodes."""
+    """Return the number of frames of each video, according to meta/episodes."""
     import pyarrow.parquet as pq
 
     found: dict[Path, int] = {}
@@ -332,7 +330,7 @@ def _video_lengths(folder: Path, info: dict[str, Any], cameras: list[str]) -> di
 
 
 def _check_video(path: Path, frames: int) -> None:
-    """Raise unless a video's boxes fill its file, and its header has at least so many frames."""
+    """Raise unless a video's boxes fill its file, and its header states at least ``frames`` frames."""
     import av
 
     check_fetched(path)
@@ -353,28 +351,26 @@ def _check_video(path: Path, frames: int) -> None:
 
 
 def damaged_file(folder: Path) -> str | None:
-    """Read all of a dataset; return a sentence that names the first file that cannot be, None where all can."""
-    for name in (STATS_FILE, TASKS_FILE):
-        if not (folder / name).is_file():
-            return f"{folder / name} is missing; {ADVICE}"
-    try:
-        read_json(folder / STATS_FILE, dict[str, dict[str, Any]], ADVICE, nan=True)
-    except MemobenchError as error:
-        return str(error)
+    """Read a whole dataset; return a message that names the first unreadable file, None if all can be read."""
     tables = sorted([*folder.glob("data/**/*.parquet"), *folder.glob("meta/**/*.parquet")])
-    for path in [*tables, *sorted(folder.glob("videos/**/*.mp4"))]:
+    for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *sorted(folder.glob("videos/**/*.mp4"))]:
         try:
-            read_to_end(path)
+            if not path.is_file():
+                return f"{path} is missing; {ADVICE}"
+            if path.suffix == ".json":
+                read_json(path, dict[str, dict[str, Any]], ADVICE, nan=True)
+            else:
+                read_to_end(path)
         except MemobenchError as error:
             return str(error)
     return None
 
 
 def read_to_end(path: Path) -> None:
-    """Read all values of a table, or decode all pictures of a video.
+    """Read all values of a table, or decode all frames of a video.
 
     Raises:
-        MemobenchError: one of them cannot be read.
+        MemobenchError: a part of it cannot be read.
     """
     import av
     import pyarrow.parquet as pq
@@ -389,15 +385,15 @@ def read_to_end(path: Path) -> None:
             stream.codec_context.options = {"err_detect": "explode"}
             decoded = sum(1 for _ in container.decode(stream))
             if stream.frames and decoded != stream.frames:
-                raise MemobenchError(f"{path} has {stream.frames} frames, and {decoded} can be decoded; {ADVICE}")
+                raise MemobenchError(f"{path} has {stream.frames} frames, but only {decoded} can be decoded; {ADVICE}")
 
 
 @contextmanager
 def naming_damage(folder: Path | None) -> Iterator[None]:
-    """Name the damaged file of a dataset where LeRobot's own error does not; None: no dataset is known.
+    """Replace an error of LeRobot in reading a dataset by a `MemobenchError` that names the damaged file.
 
-    Raises:
-        MemobenchError: in the place of such an error.
+    Args:
+        folder: the dataset; None if it is unknown, then errors pass.
     """
     try:
         yield

@@ -1,17 +1,19 @@
-"""Read a dataset of this package back: the record of each episode, and an episode's frames.
+"""Read a dataset of this package: the record of each episode, and an episode's frames.
 
-LeRobot's dataset tools may have edited it since; what they leave is read from the frames (`record.EpisodeRecord`).
+LeRobot's dataset tools may have edited it; the records are then read from the frames (`EpisodeRecord`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lerobot_memobench.datasets.lerobot_format.layout import (
     EPISODE_INFO,
@@ -22,8 +24,8 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     is_dataset,
     undamaged,
 )
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord, from_frames, from_meta
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import Count, Malformed, Number, Whole, first_fault, parsed
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, World
 
@@ -32,10 +34,10 @@ if TYPE_CHECKING:
 
 Columns = dict[str, Any]
 STRANGER = (
-    "it has neither task nor seed: another program made it, or LeRobot's tools edited a dataset that was written "
-    f"before its frames had the column {EPISODE_INFO}, and dropped the fields of meta/episodes; generate it again"
+    "it has neither task nor seed: another program made it, or LeRobot's tools edited a dataset of an earlier version, "
+    f"without the column {EPISODE_INFO}, and dropped the fields of meta/episodes; generate it again"
 )
-"""Message on an episode without a record."""
+"""Message for an episode without a record."""
 WHOLE = {
     "memory_type",
     "family",
@@ -46,7 +48,96 @@ WHOLE = {
     "fixture_poses",
     "digest",
 }
-"""Fields of a record that follow from task, seed and actions."""
+"""Fields of a record that are determined by task, seed and actions."""
+
+
+# --- the record of an episode ---
+
+
+class EpisodeRecord(BaseModel):
+    """Fields of an episode as a whole: its task, seed, placement, hashes.
+
+    A dataset stores it twice: in ``meta/episodes``, which ``LeRobotDataset(…, episode_filter=…)`` reads, and as JSON in
+    the frames' column `EPISODE_INFO`, at each episode's first frame. LeRobot's dataset tools (``lerobot-edit-dataset``)
+    keep the columns of frames, but drop unknown columns of ``meta/episodes`` and unknown files.
+
+    Attributes:
+        seed: seed of the scene; -1 if unknown.
+        key_frames: one per checkpoint, -1 if it was not completed.
+        fixture_poses: fixture to position and quaternion wxyz.
+        digest: sha256 of states, actions and labels; None in datasets of earlier versions.
+        world: world of its scene; None for the package's own.
+        stand_ins: classes whose missing scans were replaced by boxes; None in the package's own world.
+        versions: versions of the packages on which the numbers depend; None if unknown.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    task_name: str
+    memory_type: str
+    family: str = ""
+    operations: str = ""
+    seed: Whole
+    referent: str = "fixed"
+    variant: Count
+    success: bool | None = None
+    exec_start_index: Count
+    key_frames: list[Whole]
+    scene_hash: str | None = None
+    fixture_poses: dict[str, list[Number]] | None = None
+    digest: str | None = None
+    world: World | None = None
+    stand_ins: list[str] | None = None
+    versions: dict[str, str] | None = None
+
+    def in_frames(self) -> str:
+        """Return the text of the first frame's column."""
+        return self.model_dump_json(exclude_none=True)
+
+    def in_meta(self) -> dict[str, Any]:
+        """Return the columns of ``meta/episodes``."""
+        elsewhere = {} if self.world is None else {"world": self.world, "stand_ins": json.dumps(self.stand_ins or [])}
+        return self.model_dump(exclude={"versions", "world", "stand_ins"}) | {
+            "key_frames": np.array(self.key_frames, dtype=np.int64),
+            "fixture_poses": json.dumps(self.fixture_poses),
+            **elsewhere,
+        }
+
+
+def from_frames(text: str, where: str) -> EpisodeRecord:
+    """Return the record in the text of an episode's first frame.
+
+    Args:
+        text: JSON.
+        where: dataset and episode, for the message.
+
+    Raises:
+        MemobenchError: the text is no record.
+    """
+    try:
+        value = parsed(text)
+        try:
+            return EpisodeRecord.model_validate(value)
+        except ValidationError as error:
+            raise Malformed(first_fault(error.errors(include_url=False), value)) from None
+    except Malformed as error:
+        raise MemobenchError(
+            f"{where}: its column {EPISODE_INFO} is not as this package writes it ({error}); take the dataset from its "
+            "source again"
+        ) from None
+
+
+def from_meta(row: Mapping[str, Any]) -> EpisodeRecord | None:
+    """Return the record in a row of ``meta/episodes``; None if it is missing or incomplete."""
+    values = {key: row[key] for key in EpisodeRecord.model_fields if row.get(key) is not None}
+    try:
+        in_json = {key: json.loads(values.get(key, "null")) for key in ("fixture_poses", "stand_ins")}
+        return EpisodeRecord.model_validate(values | in_json)
+    except (ValidationError, ValueError, TypeError):
+        return None
+
+
+# --- episodes ---
 
 
 @dataclass(frozen=True)
@@ -54,11 +145,11 @@ class EpisodePlace:
     """An episode in a dataset.
 
     Attributes:
-        index: its number in the dataset.
-        start: its first frame in the dataset's global index.
-        length: frames.
-        record: None where this package wrote none.
-        instructions: of its frames, each once.
+        index: number in the dataset.
+        start: first frame in the dataset's global index.
+        length: number of frames.
+        record: None if this package wrote none.
+        instructions: distinct instructions of its frames.
     """
 
     index: int
@@ -69,7 +160,7 @@ class EpisodePlace:
 
 
 def list_episodes(folder: Path) -> list[EpisodePlace]:
-    """Return each of a dataset's episodes with its record, in their order.
+    """Return a dataset's episodes with their records, in order.
 
     Raises:
         MemobenchError: the folder is no dataset, or a record in it is damaged.
@@ -84,15 +175,17 @@ def list_episodes(folder: Path) -> list[EpisodePlace]:
 def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
     """Return the numbers of a dataset's episodes with all ``wanted`` fields, for LeRobot's ``episodes``.
 
-    ``LeRobotDataset(…, episodes=episodes_where(folder, memory_type="spatial"))`` is what LeRobot's ``episode_filter``
-    does, also after LeRobot's dataset tools have dropped the columns that such a filter needs.
+    ``LeRobotDataset(…, episodes=episodes_where(folder, memory_type="spatial"))`` selects like LeRobot's
+    ``episode_filter``, and also works after LeRobot's dataset tools have dropped the columns that the filter needs.
 
     Raises:
-        MemobenchError: a word that a record (`EpisodeRecord`) does not have, or no such episode.
+        MemobenchError: an unknown field (see `EpisodeRecord`), or no such episode.
     """
     unknown = sorted(set(wanted) - set(EpisodeRecord.model_fields))
     if unknown:
-        raise MemobenchError(f"found {unknown[0]!r}, expected one of {', '.join(EpisodeRecord.model_fields)}")
+        raise MemobenchError(
+            f"{unknown[0]!r} is no field of an episode; expected one of {', '.join(EpisodeRecord.model_fields)}"
+        )
     records = {place.index: place.record for place in list_episodes(Path(folder)) if place.record is not None}
     found = [n for n, record in records.items() if all(getattr(record, k) == v for k, v in wanted.items())]
     if not found:
@@ -102,7 +195,7 @@ def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
 
 
 def check_suite_of(folder: Path, suite: str) -> None:
-    """Refuse a LeRobotDataset that holds a task of another suite; tasks outside the catalogue belong to none.
+    """Refuse a LeRobotDataset with a task of another suite; tasks outside the catalogue belong to none.
 
     Raises:
         MemobenchError: naming the first such task.
@@ -112,15 +205,15 @@ def check_suite_of(folder: Path, suite: str) -> None:
         found = suite_of(name)
         if found not in (None, suite):
             raise MemobenchError(
-                f"{folder} holds demonstrations of {name!r}, a task of the {found} suite; say --suite {found}"
+                f"{folder} holds demonstrations of {name!r}, a task of the {found} suite; use --suite {found}"
             )
 
 
 def check_idling(folder: Path, places: Iterable[EpisodePlace] | None = None) -> None:
-    """Refuse a LeRobotDataset with strict demonstrations of earlier goals, or from before the robot idled.
+    """Refuse a LeRobotDataset with strict demonstrations of earlier versions: of other goals, or without idling.
 
     Args:
-        places: its episodes; None: they are listed.
+        places: its episodes; read from the folder by default.
 
     Raises:
         MemobenchError: naming the first such episode.
@@ -136,23 +229,26 @@ def check_idling(folder: Path, places: Iterable[EpisodePlace] | None = None) -> 
         if place.instructions and asked not in place.instructions:
             raise MemobenchError(
                 f"episode {place.index} of {folder} ({record.task_name}, seed {record.seed}) has the instruction "
-                f"{place.instructions[0]!r}, and this version {asked!r}: the goals of strict tasks have changed; "
-                "generate the demonstrations again"
+                f"{place.instructions[0]!r}, expected {asked!r}: the goals of strict tasks have changed; generate the "
+                "demonstrations again"
             )
         begins = [first_execution_step(task, record.seed, prompt) for prompt in (True, False)]
         if found not in begins:
             raise MemobenchError(
                 f"episode {place.index} of {folder} ({record.task_name}, seed {record.seed}) begins its execution at "
-                f"step {found} and not, as now, at {begins[0]}: strict demonstrations from before the robot idled show "
-                "by the step how much is done; generate them again"
+                f"step {found}, expected {begins[0]}: in strict demonstrations of earlier versions the step reveals "
+                "the progress; generate them again"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedEpisode:
-    """An episode of a dataset on disk: ``columns`` per frame and ``whole``, the fields of the episode.
+    """An episode of a dataset on disk.
 
-    The instruction of each frame is the column ``task``; ``start`` is the first frame in the dataset's global index.
+    Attributes:
+        columns: values per frame; the column ``task`` is the instruction.
+        whole: fields of the episode as a whole.
+        start: first frame in the dataset's global index.
     """
 
     task_name: str
@@ -170,7 +266,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
     """Read an episode of a dataset that this package made; without states/, its columns lack ``states``.
 
     Raises:
-        MemobenchError: no dataset, no such episode, or one that this package did not make.
+        MemobenchError: there is no dataset or no such episode, or another program made it.
     """
     root = Path(root)
     _check(root)
@@ -190,7 +286,9 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
         whole[LANGUAGE] = columns[LANGUAGE][0]
         changed = next((frame for frame, rows in enumerate(columns[LANGUAGE]) if rows != whole[LANGUAGE]), None)
         if changed is not None:
-            raise MemobenchError(f"{LANGUAGE} at frame {changed} is another than at frame 0, expected one per episode")
+            raise MemobenchError(
+                f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode"
+            )
     _name_tasks(root, columns)
     return RecordedEpisode(
         record.task_name,
@@ -206,7 +304,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
 
 
 def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | None], length: int) -> None:
-    """Raise where the two records of an episode, or its frames, contradict each other."""
+    """Raise if the two records of an episode, or its frames, contradict each other."""
     in_meta = from_meta(row)
     for key in EpisodeRecord.model_fields if in_meta is not None else ():
         here, there = getattr(record, key), getattr(in_meta, key)
@@ -214,13 +312,15 @@ def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | 
             raise MemobenchError(f"meta/episodes has {key}={there!r}, the frames' column {EPISODE_INFO} {here!r}")
     again = next((frame for frame, text in enumerate(texts) if frame and text), None)
     if again is not None:
-        raise MemobenchError(f"{EPISODE_INFO} at frame {again} is {texts[again]!r}, expected nothing but at frame 0")
+        raise MemobenchError(
+            f"{EPISODE_INFO} at frame {again} is {texts[again]!r}, expected an empty text except at frame 0"
+        )
     if row["length"] != length:
         raise MemobenchError(f"meta/episodes has length={row['length']}, but it has {length} frames")
 
 
 def _name_tasks(root: Path, columns: Columns) -> None:
-    """Put each frame's instruction, as ``task``, in the place of its number."""
+    """Replace the number of each frame's instruction by the instruction, as ``task``."""
     from lerobot.datasets.io_utils import load_tasks
 
     with undamaged(root / "meta" / "tasks.parquet"):
@@ -231,11 +331,11 @@ def _name_tasks(root: Path, columns: Columns) -> None:
 
 def _check(folder: Path) -> None:
     if not is_dataset(folder):
-        raise MemobenchError(f"{folder} is no dataset (there is no meta/info.json); name one that was generated")
+        raise MemobenchError(f"{folder} is no dataset (there is no meta/info.json); name the folder of a generated one")
 
 
 def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]]:
-    """The rows of meta/episodes, or that of one episode, in their order and without statistics."""
+    """Return the rows of meta/episodes, or that of one episode, in order and without statistics."""
     own = ("episode_index", "length", "dataset_from_index", "tasks", *EpisodeRecord.model_fields)
     chosen = None if episode_index is None else [("episode_index", "==", episode_index)]
     return _read(folder / "meta" / "episodes", own, chosen).sort_by("episode_index").to_pylist()
@@ -249,7 +349,7 @@ def _place(folder: Path, row: dict[str, Any], text: str | None) -> EpisodePlace:
 
 
 def _read(folder: Path, names: tuple[str, ...] | None, chosen: list[tuple[str, str, int]] | None) -> pa.Table:
-    """Those of the columns that are there (None: all), of all files: merged ones need not have the same."""
+    """Return the existing ones among the columns (None: all) of all files; files of merged datasets may differ."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -260,12 +360,12 @@ def _read(folder: Path, names: tuple[str, ...] | None, chosen: list[tuple[str, s
             columns = None if names is None else [name for name in names if name in there]
             tables.append(pq.read_table(path, columns=columns, filters=chosen))
     if not tables:
-        raise MemobenchError(f"{folder} holds no parquet file: the dataset is not whole; fetch or generate it again")
+        raise MemobenchError(f"{folder} holds no parquet file: the dataset is incomplete; fetch or generate it again")
     return pa.concat_tables(tables, promote_options="permissive")
 
 
 def _read_columns(root: Path, episode_index: int) -> Columns:
-    """An episode's frames and, where they are, its states."""
+    """Return the columns of an episode's frames and, if stored, its states."""
     chosen = [("episode_index", "==", episode_index)]
     table = _read(root / "data", None, chosen).sort_by("frame_index")
     columns: Columns = {}

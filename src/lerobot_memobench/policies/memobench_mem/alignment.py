@@ -23,8 +23,7 @@ from einops import rearrange
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
-from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, MEMORY_COLUMN, holds_texts
-from lerobot_memobench.datasets.lookup import FrameLookup
+from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, MEMORY_COLUMN, FrameLookup, holds_texts
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SHUFFLE_SEED, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.losses import joint, mean_over_ranks, world_size

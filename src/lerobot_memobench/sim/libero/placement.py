@@ -3,7 +3,7 @@
 Episode k of the paper's evaluation has seed 7 + k. All draws of a scene come from one `RandomState`, in this order:
 
 1. seven normal numbers, the arm's noise, which LIBERO multiplies by zero;
-2. for each (Open|Close|TurnOn|TurnOff x) of `:init`, a position of its joints, in two rounds of which the last counts:
+2. for each (Open|Close|TurnOn|TurnOff x) of `:init`, a position of its joints, in two rounds, the second one is used:
    LIBERO's environment loads the model at its creation and at its reset;
 3. for each (On x <region of the table>) of `:init`: a range, x and y, repeated while the object overlaps placed ones,
    then the angles of its rotations;

@@ -1,10 +1,26 @@
-"""Read and check files in the published layout."""
+"""Read demonstrations in the published HDF5 layout: one file per task (paper, appendix on data collection).
+
+::
+
+    data                       bddl_file_name, bddl_file_content, env_info, problem_info (attributes)
+    data/demo_k                num_samples, model_file, meta_data (attributes)
+    data/demo_k/states         (T, D) float64
+    data/demo_k/actions        (T, 7)
+    data/demo_k/obs/agentview_image, robot0_eye_in_hand_image    (T, 256, 256, 3) uint8
+
+``meta_data`` is the task's metadata as JSON, with ``key_frame`` (for each checkpoint the frame at which it was
+completed in order) and ``timestep_exec_start_idx`` (the frame at which execution starts) filled in. Frame t shows
+the observation before ``actions[t]``.
+
+Files of earlier versions of this package have further attributes: of ``data`` ``task_metadata``; of a demonstration
+those of `Extras`.
+"""
 
 from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,26 +41,23 @@ if TYPE_CHECKING:
     import h5py
 
 IMAGE_NAMES = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
-"""Camera of this package -> dataset of the published layout."""
+"""Camera of this package -> array of the published layout."""
 LIBERO_NAMES = {"image": "agentview_rgb", "wrist_image": "eye_in_hand_rgb"}
-"""The same in LIBERO's own files, after which a file of the published layout may be named as well."""
+"""Camera of this package -> array of LIBERO's own files, whose names are also accepted."""
 FILE_OBJECT = re.compile(r"<(_io\.\w+|open file) .*>")
-Image = NDArray[np.uint8]
 NO_SEED = -1
-"""Seed of a demonstration without one."""
+"""Seed of a demonstration without a recorded seed."""
 SUFFIX = "_demo.hdf5"
-SUFFIXES = (".hdf5", ".h5")
-SLICE = 32
-"""Frames read at a time."""
+FRAMES_PER_READ = 32
 LARGEST = 1e10
-"""MuJoCo takes a state with a larger number for an unstable simulation, and puts the initial one in its place."""
+"""MuJoCo treats a state with a larger number as unstable and replaces it by the initial state."""
 
 
 class Extras(BaseModel):
-    """Attributes that earlier versions of this package added to a demonstration; the defaults are those of others.
+    """Attributes that earlier versions of this package added to a demonstration; the defaults apply to other files.
 
     Attributes:
-        success: None in files of others.
+        success: None in files of other programs.
         fixture_poses: JSON, fixture to pose (7,).
         satisfied_intervals: JSON, checkpoint to [start, stop) pairs.
     """
@@ -59,53 +72,25 @@ class Extras(BaseModel):
     digest: str | None = None
 
 
-@dataclass(frozen=True)
-class Problem:
-    """Something that cannot be used: ``file``, ``group`` ("" for the file as a whole) and why."""
-
-    file: str
-    group: str
-    reason: str
-
-    def __str__(self) -> str:
-        return f"{self.file}{', ' + self.group if self.group else ''}: {self.reason}"
-
-
 class Unusable(MemobenchError):
-    """A file or group that is not in the layout; the message is the reason alone."""
+    """A file or group that is not in the layout. The message is the reason; callers add file and group."""
 
 
-def usable_or_named() -> AbstractContextManager[None]:
-    """As `refusing`: an unusable file or group does not end the others."""
+def unusable_on_error() -> AbstractContextManager[None]:
+    """Turn every error of a block into `Unusable`, so that a bad file or group does not end the conversion."""
     return refusing(lambda why: Unusable(f"its content cannot be used ({why})"))
-
-
-def find_files(source: Path) -> list[Path]:
-    """Return the HDF5 files of a path: itself, or all below it, sorted.
-
-    Raises:
-        MemobenchError: there is none.
-    """
-    if source.is_file():
-        return [source]
-    found = sorted(path for path in source.rglob("*") if path.suffix in SUFFIXES and path.is_file())
-    if not found:
-        raise MemobenchError(
-            f"found no HDF5 file ({', '.join(SUFFIXES)}) at {source}; name a file, a folder of them, or a zip archive"
-        )
-    return found
 
 
 @dataclass(frozen=True, eq=False)
 class PublishedDemo:
-    """A group that was checked, without its images.
+    """A checked group without its images.
 
     Attributes:
         states: (T, D) float64.
         actions: (T, 7) float32.
         metadata: ``meta_data``.
-        model_file: MJCF, or "" where there is none.
-        extras: the attributes that earlier versions of this package added.
+        model_file: MJCF, or "" where it is missing.
+        extras: attributes of earlier versions of this package.
         image_size: (height, width).
     """
 
@@ -119,9 +104,10 @@ class PublishedDemo:
 
 
 class PublishedFile:
-    """A file in the published layout, being read; a context.
+    """Open a file in the published layout; a context.
 
-    Every check names what was found. ``Unusable`` raised on opening concerns the file, by ``read`` a group.
+    Raises:
+        Unusable: naming the first difference to the layout. Raised on opening it concerns the file, by `read` a group.
     """
 
     def __init__(self, path: Path) -> None:
@@ -130,23 +116,20 @@ class PublishedFile:
         self.path = path
         try:
             self._file: h5py.File = h5py.File(path, "r")
-        except FileNotFoundError:
-            raise Unusable("there is no such file") from None
         except OSError as error:
-            raise Unusable(_not_opened(path, error)) from None
+            raise Unusable(_open_error(path, error)) from None
         try:
             data = self._file.get("data")
             if not isinstance(data, h5py.Group):
-                raise Unusable(f"it has no group 'data' (found {', '.join(self._file) or 'nothing'})")
+                raise Unusable(f"it has no group 'data' (found {', '.join(self._file) or 'none'})")
             self._data: h5py.Group = data
             _check_layout(data)
             self.bddl_name = text_attribute(data, "bddl_file_name", required=True)
             self.bddl_text = text_attribute(data, "bddl_file_content", required=True)
-        except Unusable:
-            self._file.close()
-            raise
         except Exception as error:
             self._file.close()
+            if isinstance(error, Unusable):
+                raise
             raise Unusable(f"it is damaged ({first_line(error)})") from None
 
     def __enter__(self) -> PublishedFile:
@@ -159,13 +142,13 @@ class PublishedFile:
 
     @cached_property
     def task_metadata(self) -> dict[str, Any] | None:
-        """The task's metadata as this package stores it; None in files of others."""
+        """The task's metadata as earlier versions of this package store it; None in other files."""
         stored = text_attribute(self._data, "task_metadata")
         return None if stored is None else json_object(stored, "task_metadata")
 
     @property
     def lacks_its_text(self) -> bool:
-        """Whether the name of an open file was stored in place of the task's text."""
+        """Whether the task's text is replaced by the name of an open file."""
         return names_a_file_object(self.bddl_text)
 
     def attribute(self, name: str) -> str | None:
@@ -177,15 +160,15 @@ class PublishedFile:
         return sorted(self._data, key=lambda name: (demo_number(name) is None, demo_number(name) or 0, name))
 
     def announced(self) -> int | None:
-        """Return ``num_demos``, the number of demonstrations that the file claims, None where there is none."""
+        """Return ``num_demos``, the stated number of demonstrations, None where it is missing."""
         value = self._data.attrs.get("num_demos")
         return int(value) if isinstance(value, int | np.integer) else None
 
     def read(self, group: str) -> PublishedDemo:
-        """Read and check one demonstration, all but its pixels.
+        """Read and check one demonstration, except its pixels.
 
         Raises:
-            Unusable: with the first difference to the layout.
+            Unusable: naming the first difference to the layout.
         """
         try:
             return self._read(group)
@@ -211,7 +194,9 @@ class PublishedFile:
             for image in image_names(group["obs"]).values()
         }
         _check_length(group, {"states": states, "actions": actions, **images})
-        image_size = _image_size(images.values())
+        sizes = {image.shape[1:3] for image in images.values()}
+        if len(sizes) > 1:
+            raise Unusable(f"its cameras have different sizes: {', '.join(map(str, sorted(sizes)))}")
         return PublishedDemo(
             group=name,
             states=finite("states", states[:]),
@@ -219,36 +204,35 @@ class PublishedFile:
             metadata=json_object(text_attribute(group, "meta_data", required=True), "meta_data"),
             model_file=text_attribute(group, "model_file") or "",
             extras=read_extras(group),
-            image_size=image_size,
+            image_size=sizes.pop(),
         )
 
-    def images(self, group: str, *, upside_down: bool = False) -> Iterator[dict[str, Image]]:
-        """Yield both cameras' frames, (H, W, 3) uint8, one after the other; ``SLICE`` of them are in memory.
+    def images(self, group: str, *, upside_down: bool = False) -> Iterator[dict[str, NDArray[np.uint8]]]:
+        """Yield both cameras' frames, (H, W, 3) uint8, in order; ``FRAMES_PER_READ`` are in memory at a time.
 
         Args:
             group: a name of ``groups()``.
-            upside_down: the file's images are stored as robosuite's renderer gives them: turn them up.
+            upside_down: the images are stored bottom row first, as robosuite renders them; flip them.
         """
         obs = self._data[group]["obs"]
         names = image_names(obs)
-        length = len(obs[names["image"]])
-        for start in range(0, length, SLICE):
+        for start in range(0, len(obs[names["image"]]), FRAMES_PER_READ):
             try:
-                block = {camera: obs[name][start : start + SLICE] for camera, name in names.items()}
+                block = {camera: obs[name][start : start + FRAMES_PER_READ] for camera, name in names.items()}
             except Exception as error:
                 raise Unusable(f"its images cannot be read from frame {start} on ({first_line(error)})") from None
             for offset in range(len(block["image"])):
                 frame = {camera: frames[offset] for camera, frames in block.items()}
-                if upside_down:
-                    frame = {camera: np.ascontiguousarray(picture[::-1]) for camera, picture in frame.items()}
-                yield frame
+                yield {c: np.ascontiguousarray(image[::-1]) for c, image in frame.items()} if upside_down else frame
 
 
 # --- parts of a file, each checked ---
 
 
-def _not_opened(path: Path, error: OSError) -> str:
-    """Return why a file is not opened: HDF5 answers a lock and a pointer as it answers damage."""
+def _open_error(path: Path, error: OSError) -> str:
+    """Return why a file cannot be opened. HDF5 reports locks and Git LFS pointers like damage."""
+    if isinstance(error, FileNotFoundError):
+        return "there is no such file"
     try:
         check_fetched(path)
     except (MemobenchError, OSError) as reason:
@@ -259,7 +243,7 @@ def _not_opened(path: Path, error: OSError) -> str:
 
 
 def _missing(group: h5py.Group, name: str) -> str:
-    """Return a sentence on an array or a group that is not there."""
+    """Return the reason why an array or group is missing."""
     import h5py
 
     link = group.get(name, getlink=True)
@@ -269,7 +253,7 @@ def _missing(group: h5py.Group, name: str) -> str:
 
 
 def _check_layout(data: h5py.Group) -> None:
-    """Refuse a file of LIBERO or robomimic, which have similar layouts, and name the missing parts."""
+    """Refuse a file of LIBERO or robomimic, whose layouts are similar, and name the missing parts."""
     import h5py
 
     first = next((data.get(name) for name in data if demo_number(name) is not None), None)
@@ -281,9 +265,8 @@ def _check_layout(data: h5py.Group) -> None:
     layout = "LIBERO's" if "agentview_rgb" in obs else "robomimic's" if "env_args" in data.attrs else None
     if layout is not None:
         raise Unusable(
-            f"it is in {layout} layout, which lacks {', '.join(['the checkpoints (meta_data)', *lacks])}: without them "
-            "nothing is known of memory; train on it by LeRobot's own datasets, or describe its task as "
-            "docs/develop/add_a_task.md shows"
+            f"it is in {layout} layout, which lacks {', '.join(['the checkpoints (meta_data)', *lacks])}; train on it "
+            "with LeRobot's own datasets, or describe its task as docs/develop/add_a_task.md shows"
         )
 
 
@@ -303,21 +286,13 @@ def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None
         raise Unusable(f"num_samples is {count}, but its arrays have {length} frames")
 
 
-def _image_size(images: Iterable[h5py.Dataset]) -> tuple[int, int]:
-    """Return (height, width) of all cameras."""
-    sizes = {image.shape[1:3] for image in images}
-    if len(sizes) > 1:
-        raise Unusable(f"its cameras have different sizes: {', '.join(map(str, sorted(sizes)))}")
-    return sizes.pop()
-
-
 def names_a_file_object(text: str) -> bool:
-    """Whether a text is what Python prints of an open file, which LIBERO's script stores in the place of its text."""
+    """Return whether a text is Python's representation of an open file, which LIBERO's script stores by mistake."""
     return FILE_OBJECT.fullmatch(text.strip()) is not None
 
 
 def image_names(obs: h5py.Group) -> dict[str, str]:
-    """Return the cameras' arrays in a group of observations: the published names, or LIBERO's where they are there."""
+    """Return camera to array of a group of observations: the published names, or LIBERO's."""
     published = any(name in obs for name in IMAGE_NAMES.values())
     return LIBERO_NAMES if not published and any(name in obs for name in LIBERO_NAMES.values()) else IMAGE_NAMES
 
@@ -329,32 +304,30 @@ def demo_number(name: str) -> int | None:
 
 
 def text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
-    """Return a text, None where there is none and none is required."""
+    """Return a text attribute, or None where it is missing and not required."""
     value = _plain(group.attrs.get(key))
-    if value is None:
-        if required:
-            raise Unusable(f"the attribute {key!r} is missing")
-        return None
-    if not isinstance(value, str):
+    if value is None and required:
+        raise Unusable(f"the attribute {key!r} is missing")
+    if value is not None and not isinstance(value, str):
         raise Unusable(f"the attribute {key!r} is of type {type(group.attrs[key]).__name__}, expected text")
     return value
 
 
-def json_object(text: str, what: str) -> dict[str, Any]:
-    """Return the JSON object that ``text`` holds; ``what`` it is goes into the message."""
+def json_object(text: str, name: str) -> dict[str, Any]:
+    """Return the JSON object in ``text``; ``name`` is its name in messages."""
     if names_a_file_object(text):
-        raise Unusable(f"{what} holds {text[:60]!r}, the name of a Python object instead of its text")
+        raise Unusable(f"{name} holds {text[:60]!r}, the name of a Python object instead of its text")
     try:
         value = parsed(text)
     except Malformed as error:
-        raise Unusable(f"{what} is no valid JSON: {error}") from None
+        raise Unusable(f"{name} is no valid JSON: {error}") from None
     if not isinstance(value, dict):
-        raise Unusable(f"{what} holds a {type(value).__name__}, expected a JSON object")
+        raise Unusable(f"{name} holds a {type(value).__name__}, expected a JSON object")
     return value
 
 
 def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: Any) -> h5py.Dataset:
-    """Return an array of one of the types and of a shape in which None means any length."""
+    """Return an array of one of the types; None in ``shape`` accepts any length."""
     import h5py
 
     found = group.get(name)
@@ -363,23 +336,17 @@ def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: 
     if found.dtype not in [np.dtype(dtype) for dtype in dtypes]:
         expected = " or ".join(str(np.dtype(dtype)) for dtype in dtypes)
         raise Unusable(f"{name} has type {found.dtype}, expected {expected}")
-    matches = len(found.shape) == len(shape) and all(
-        want is None or have == want for have, want in zip(found.shape, shape, strict=True)
-    )
-    if not matches:
-        want = ", ".join("any" if n is None else str(n) for n in shape)
-        raise Unusable(f"{name} has shape {found.shape}, expected ({want})")
+    if len(found.shape) != len(shape) or any(n not in (None, m) for n, m in zip(shape, found.shape, strict=True)):
+        expected = ", ".join("any" if n is None else str(n) for n in shape)
+        raise Unusable(f"{name} has shape {found.shape}, expected ({expected})")
     return found
 
 
 def finite(name: str, values: NDArray) -> NDArray:
-    """Return (T, n) numbers after checking that none is infinite, missing, or too large."""
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    """Return (T, n) numbers after checking that all are finite and below `LARGEST`."""
+    bad = np.flatnonzero(~(np.abs(values) <= LARGEST).all(axis=1))
     if bad.size:
-        raise Unusable(f"{name} holds a value that is not finite at frame {bad[0]}")
-    bad = np.flatnonzero((np.abs(values) > LARGEST).any(axis=1))
-    if bad.size:
-        raise Unusable(f"{name} holds a value beyond {LARGEST:g} at frame {bad[0]}, more than the simulator takes")
+        raise Unusable(f"{name} holds a value at frame {bad[0]} that is not finite or beyond {LARGEST:g}")
     return values
 
 
@@ -392,7 +359,7 @@ def read_extras(group: h5py.Group) -> Extras:
     """Return the `Extras` of a group.
 
     Raises:
-        Unusable: one of them is of another type, or no JSON.
+        Unusable: an attribute is of another type, or no JSON.
     """
     found = {key: _plain(group.attrs[key]) for key in Extras.model_fields if key in group.attrs}
     try:
@@ -403,21 +370,9 @@ def read_extras(group: h5py.Group) -> Extras:
 
 
 def _plain(value: Any) -> Any:
-    """Return an attribute as a Python value: HDF5 has numbers of many types, and texts as bytes or arrays of one."""
+    """Return an attribute as a Python value. HDF5 has numbers of many types, and texts as bytes or arrays of one."""
     if isinstance(value, np.ndarray) and value.shape == (1,):
         value = value[0]
     if isinstance(value, np.generic):
         value = value.item()
     return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
-
-
-# --- truth as intervals ---
-
-
-def truth_from_intervals(intervals: Sequence[Sequence[Sequence[int]]], length: int) -> NDArray[np.bool_]:
-    """Return the truth (T, K) of K checkpoints from the [start, stop) pairs where each is true."""
-    truth = np.zeros((length, len(intervals)), dtype=np.bool_)
-    for k, pairs in enumerate(intervals):
-        for start, stop in pairs:
-            truth[start:stop, k] = True
-    return truth

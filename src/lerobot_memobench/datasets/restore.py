@@ -1,25 +1,30 @@
 """Restore a demonstration from a group of the published layout: its task, its execution, its checkpoints.
 
-The layout holds states, not what the arm felt or which predicates held. Proprioception and visible objects are read
-off them in the simulator, in the world that they are of; where a stranger's demonstration prompt highlights something
-is not known. Checkpoint columns come from the key frames; where one is missing (-1) its predicate is evaluated on the
-states, with the latches and orders that a rollout has.
+The layout holds states, but neither proprioception nor the truth of predicates. Proprioception and visible objects are
+computed in the simulator from the states, in the world in which they were recorded. Highlights of demonstration prompts
+of other programs are unknown. Checkpoint columns come from the key frames; where one is missing (-1) its predicate is
+evaluated on the states, with the latches and orders of a rollout.
+
+The order of the joints in a state is that of the attribute ``model_file``, an MJCF text of another program. Only its
+bodies and joints are compiled, so it cannot reference files or plugins.
 """
 
 from __future__ import annotations
 
 import json
 import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
-from lerobot_memobench.datasets.hdf5.model_file import ModelFile, Pose, joints_of, parse
-from lerobot_memobench.datasets.hdf5.reading import SUFFIX, PublishedDemo, PublishedFile, Unusable, truth_from_intervals
+from lerobot_memobench.datasets.hdf5 import SUFFIX, PublishedDemo, PublishedFile, Unusable, first_line
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name
@@ -32,16 +37,21 @@ from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import BDDL_FILE, LIBERO, MEMOBENCH, MEMORY_TYPES, METADATA_FILE, Task, World
 
 States = NDArray[np.float64]
+Pose = NDArray[np.float64]
+"""Position and quaternion wxyz, (7,)."""
 
 BASE = "robot0_base"
 BASE_TOLERANCE = 1e-3
-"""How far the arm's base may be from ours, m: pictures, actions and proprioception are of one place."""
+"""Largest distance of the arm's base from ours, m."""
 NEAR_TABLE = 0.1
-"""How far above or below the table's top a fixture's origin may be, m; LIBERO's are up to 30 mm above it."""
+"""Largest height of a fixture's origin above or below the table's top, m; LIBERO's are up to 30 mm above it."""
 UNKNOWN = "tasks"
 """Folder of a task with an unknown memory type."""
 OURS = "memobench"
-"""Name of the models that earlier versions of this package wrote of its own world."""
+"""Model name in files that earlier versions of this package wrote of its own world."""
+
+
+# --- demonstrations ---
 
 
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
@@ -57,8 +67,8 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     frames = key_frames(task, demo, exec_start)
     extras = demo.extras
     written = extras.satisfied_intervals
-    asked = written is None and (not frames or min(frames) < 0)
-    read_off = _read_off(sim, task, states, fixture_poses, exec_start, ours=is_ours(demo), asked=asked)
+    evaluate = written is None and (not frames or min(frames) < 0)
+    columns = _read_states(sim, task, states, fixture_poses, exec_start, ours=is_ours(demo), evaluate=evaluate)
     try:
         restored = Demonstration(
             task=task,
@@ -67,21 +77,21 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
             variant=extras.variant,
             states=states,
             actions=demo.actions,
-            proprio=read_off.proprio,
+            proprio=columns.proprio,
             images=None,
             exec_start=exec_start,
             satisfied=(
                 truth_from_intervals(written, len(demo.states))
                 if written is not None
-                else _known_or_read_off(frames, read_off.satisfied)
+                else _known_or_evaluated(frames, columns.satisfied)
             ),
             success=(
-                (read_off.success or (bool(frames) and min(frames) >= 0)) if extras.success is None else extras.success
+                (columns.success or (bool(frames) and min(frames) >= 0)) if extras.success is None else extras.success
             ),
             fixture_poses=fixture_poses,
             scene_hash=extras.scene_hash,
             stand_ins=sim.stand_ins,
-            objects=read_off.objects,
+            objects=columns.objects,
         )
         found = digest(restored)
     except MemobenchError as error:
@@ -94,44 +104,47 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
 def _placed(sim: Simulation, demo: PublishedDemo) -> tuple[States, dict[str, Pose]]:
     """Return states and poses of the fixtures in the simulation's scene."""
     if not is_ours(demo) or demo.extras.fixture_poses is None:
-        return place(sim, ModelFile(_model_text(demo)), demo.states)
+        return place(sim, compile_scene(demo.model_file), demo.states)
     if demo.states.shape[1] != sim.state_dim:
         raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {sim.task.name}")
     return demo.states, {name: np.array(pose) for name, pose in demo.extras.fixture_poses.items()}
 
 
-def _model_text(demo: PublishedDemo) -> str:
-    if not demo.model_file.strip():
-        raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is not known")
-    return demo.model_file
-
-
 def is_ours(demo: PublishedDemo) -> bool:
-    """Whether an earlier version of this package wrote a demonstration, with truth and success."""
+    """Return whether an earlier version of this package wrote a demonstration, with truth and success."""
     return demo.extras.success is not None
 
 
 def world_of(demo: PublishedDemo) -> World:
-    """Return the world of a demonstration's scenes: this package's own where it wrote them, else LIBERO's.
+    """Return the world of a demonstration's scenes: this package's own if it wrote them, else LIBERO's.
 
     Raises:
         Unusable: its model file is missing, or no XML.
     """
-    ours = is_ours(demo) or parse(_model_text(demo)).get("model") == OURS
+    ours = is_ours(demo) or parse_scene(demo.model_file).get("model") == OURS
     return MEMOBENCH if ours else LIBERO
 
 
-def _known_or_read_off(frames: list[int], satisfied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the (T, K) truth: from its key frame on where that is known, else as the states show it."""
+def _known_or_evaluated(frames: list[int], satisfied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the (T, K) truth: from the key frame on if it is known, else as evaluated on the states."""
     known = np.arange(len(satisfied))[:, None] >= np.array(frames)
     return np.where(np.array(frames, dtype=int) >= 0, known, satisfied)
+
+
+def truth_from_intervals(intervals: Sequence[Sequence[Sequence[int]]], length: int) -> NDArray[np.bool_]:
+    """Return the truth (T, K) of K checkpoints from their [start, stop) pairs."""
+    truth = np.zeros((length, len(intervals)), dtype=np.bool_)
+    for k, pairs in enumerate(intervals):
+        for start, stop in pairs:
+            truth[start:stop, k] = True
+    return truth
 
 
 def execution_start(task: Task, demo: PublishedDemo) -> int:
     """Return the frame at which execution starts.
 
-    Where ``timestep_exec_start_idx`` is missing (-1) it is 0 for a task without demonstration prompt, else the last
-    frame at which the scene is back exactly where it began.
+    If ``timestep_exec_start_idx`` is missing (-1) it is 0 for a task without demonstration prompt, else the last frame
+    whose state equals the first one.
     """
     value = demo.metadata.get("timestep_exec_start_idx", -1)
     values = value if isinstance(value, list) else [value]
@@ -148,13 +161,13 @@ def execution_start(task: Task, demo: PublishedDemo) -> int:
     if back.size:
         return int(back[-1])
     raise Unusable(
-        "timestep_exec_start_idx is -1 for a task with a demonstration prompt, and no later frame shows the scene back "
-        "at its start: write the frame at which execution starts into meta_data"
+        "timestep_exec_start_idx is -1 for a task with a demonstration prompt, and no later frame shows the scene in "
+        "its start state: write the frame at which execution starts into meta_data"
     )
 
 
 def key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
-    """Return ``key_frame``, one per checkpoint (-1 where unknown), after checking it."""
+    """Return the checked ``key_frame``, one per checkpoint, -1 where unknown."""
     frames = demo.metadata.get("key_frame", [-1] * len(task.checkpoints))
     if (
         not isinstance(frames, list)
@@ -171,8 +184,8 @@ def key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
 
 
 @dataclass(frozen=True)
-class ReadOff:
-    """Columns read off states: proprioception (T, 8), objects (T, SIZE), truth of the checkpoints (T, K), success."""
+class StateColumns:
+    """Columns computed from states: proprioception (T, 8), objects (T, SIZE), truth of checkpoints (T, K), success."""
 
     proprio: NDArray[np.float32]
     objects: NDArray[np.float32]
@@ -180,7 +193,7 @@ class ReadOff:
     success: bool
 
 
-def _read_off(
+def _read_states(
     sim: Simulation,
     task: Task,
     states: States,
@@ -188,9 +201,9 @@ def _read_off(
     exec_start: int,
     *,
     ours: bool,
-    asked: bool,
-) -> ReadOff:
-    """Show the states to the simulator one after the other; evaluate goals and checkpoints where they are ``asked``."""
+    evaluate: bool,
+) -> StateColumns:
+    """Set the states in the simulator in order and read columns; ``evaluate``: whether to evaluate the formulas."""
     hold_steps = HOLD_STEPS // UPSTREAM_EVALUATIONS if task.world == LIBERO else HOLD_STEPS
     evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)], hold_steps)
     look = ObjectSlots(sim)
@@ -204,18 +217,17 @@ def _read_off(
         objects.append(look.observe())
         if frame == exec_start:
             sim.begin_execution()
-        if asked and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
+        if evaluate and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
             goal, *satisfied[frame] = evaluator.step(sim.holds)
             success = success or goal
-    return ReadOff(np.array(proprio, dtype=np.float32), np.array(objects), satisfied, success)
+    return StateColumns(np.array(proprio, dtype=np.float32), np.array(objects), satisfied, success)
 
 
 def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
-    """Raise when the frames are not in the order of their time, which may start again where the prompt ends.
+    """Raise if the frames are not in the order of their time, which may restart at the end of the prompt.
 
-    That is where the execution starts, or where the scene is first as it then is: the robot idles in between.
-
-    Only a time that runs evenly is taken for a clock: other writers leave zeros or something else there.
+    The end of the prompt is the start of the execution, or, if the robot idles before it, the first frame of idling.
+    Only an evenly running time is checked: other programs leave zeros or other numbers there.
     """
     time = states[:, 0]
     ticks = np.unique(np.round(time, 5))
@@ -233,62 +245,171 @@ def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
 
 @lru_cache(maxsize=1)
 def _simulation(task: Task) -> Simulation:
-    """The last task's simulation stays: a file's demonstrations come one after another."""
+    """Return a task's simulation; the last one is cached, because a file's demonstrations follow each other."""
     sim = Simulation(task)
     sim.reset(0)
     return sim
 
 
-# --- the scene ---
+# --- the scene of a model file ---
+
+KEPT = {
+    "body": ("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis"),
+    "joint": ("type", "pos", "axis", "ref"),
+    "freejoint": (),
+}
+"""Element of a worldbody -> attributes that are compiled."""
+LEFT_OUT = ("inertial", "camera", "light", "geom", "site")
+BY_DEFAULTS = ("class", "childclass")
+"""Attributes that refer to defaults elsewhere in the file; MuJoCo removes them from scenes that it saves."""
+LARGEST_NUMBER = 1e6
+JOINT_TYPES = ("free", "ball", "slide", "hinge")
+"""In MuJoCo's order."""
+WIDTHS = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
+"""Joint type -> numbers of positions and velocities."""
 
 
-def place(sim: Simulation, scene: ModelFile, states: States) -> tuple[States, dict[str, Pose]]:
+@dataclass(frozen=True)
+class Joint:
+    """A joint: its type, the name of the body that it moves, and its positions and velocities in a state."""
+
+    kind: str
+    body: str
+    position: slice
+    velocity: slice
+
+
+def joints_of(model: mujoco.MjModel) -> dict[str, Joint]:
+    """Return a model's joints by name, in the order of its states."""
+    found = {}
+    for index in range(model.njnt):
+        joint = model.joint(index)
+        kind = JOINT_TYPES[int(joint.type[0])]
+        at, speed = 1 + int(joint.qposadr[0]), 1 + model.nq + int(joint.dofadr[0])
+        wide, fast = WIDTHS[kind]
+        body = model.body(int(joint.bodyid[0])).name
+        found[joint.name] = Joint(kind, body, slice(at, at + wide), slice(speed, speed + fast))
+    return found
+
+
+def parse_scene(text: str) -> ElementTree.Element:
+    """Return the root of an MJCF text.
+
+    Raises:
+        Unusable: it is missing, or no XML.
+    """
+    if not text.strip():
+        raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is unknown")
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise Unusable(f"model_file is no XML ({error})") from None
+
+
+def compile_scene(text: str) -> mujoco.MjModel:
+    """Return the bodies and joints of a model file, compiled with placeholder inertias.
+
+    Raises:
+        Unusable: the text is no scene, or a place in it cannot be read.
+    """
+    root = parse_scene(text)
+    world = root.find("worldbody")
+    if root.tag != "mujoco" or world is None:
+        raise Unusable("model_file is no MJCF: it has no <mujoco> with a <worldbody>")
+    scene = ElementTree.Element("mujoco")
+    ElementTree.SubElement(scene, "compiler", {"inertiafromgeom": "false", "autolimits": "false", **_angles(root)})
+    _copy_bodies(world, ElementTree.SubElement(scene, "worldbody"))
+    try:
+        model = mujoco.MjModel.from_xml_string(ElementTree.tostring(scene, encoding="unicode"))
+    except (ValueError, mujoco.FatalError) as error:
+        raise Unusable(f"MuJoCo cannot compile model_file ({first_line(error)})") from None
+    numbers = np.concatenate([model.body_pos.ravel(), model.body_quat.ravel(), model.jnt_pos.ravel(), model.qpos0])
+    if not (np.abs(numbers) <= LARGEST_NUMBER).all():
+        raise Unusable(f"model_file has a number that is not finite or beyond {LARGEST_NUMBER:g}")
+    return model
+
+
+def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> None:
+    """Copy bodies and joints, with the attributes of `KEPT`."""
+    for element in source:
+        tag, name = element.tag, element.get("name", "")
+        if tag in LEFT_OUT:
+            continue
+        if tag not in KEPT:
+            raise Unusable(f"model_file has a <{str(tag)[:40]}> in its worldbody, which is not supported there")
+        unread = next((key for key in BY_DEFAULTS if key in element.attrib), None)
+        if unread is not None:
+            raise Unusable(
+                f"model_file's {tag} {name[:200]!r} has the attribute {unread!r}, which is not read; store the scene "
+                "as MuJoCo saves it"
+            )
+        kept = {key: element.attrib[key] for key in ("name", *KEPT[tag]) if key in element.attrib}
+        copy = ElementTree.SubElement(target, tag, kept)
+        if tag == "body":
+            ElementTree.SubElement(copy, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
+            _copy_bodies(element, copy)
+
+
+def _angles(root: ElementTree.Element) -> dict[str, str]:
+    """Return the attributes of a scene's <compiler> that give the unit and order of angles."""
+    angles = {"angle": "degree", "eulerseq": "xyz"}
+    for compiler in root.iterfind("compiler"):
+        angles.update((key, value) for key, value in compiler.attrib.items() if key in angles)
+    return angles
+
+
+def _body_of(scene: mujoco.MjModel, instance: str) -> str:
+    """Return the name of the body of an object or fixture: its own, or with robosuite's suffix ``_main``."""
+    for name in (f"{instance}_main", instance):
+        if mujoco.mj_name2id(scene, mujoco.mjtObj.mjOBJ_BODY, name) >= 0:
+            return name
+    raise Unusable(f"model_file has no body {instance!r}, which its task has")
+
+
+def place(sim: Simulation, scene: mujoco.MjModel, states: States) -> tuple[States, dict[str, Pose]]:
     """Return states (T, D) of a model file's scene as states of a simulation's, and the poses of its fixtures.
 
     Raises:
         Unusable: the scene lacks a joint or a body, has one beyond the task, or is another one.
     """
-    _check_joints(sim, scene)
-    if states.shape[1] != scene.state_dim:
-        raise Unusable(f"states have width {states.shape[1]}, expected {scene.state_dim} of the joints of model_file")
-    scene.body_of(BASE)
-    _check_base(sim, scene)
+    theirs, ours = joints_of(scene), joints_of(sim.model)
+    _check_joints(sim.task.name, ours, theirs)
+    width = 1 + scene.nq + scene.nv
+    if states.shape[1] != width:
+        raise Unusable(f"states have width {states.shape[1]}, expected {width} of the joints of model_file")
+    expected = np.array(sim.model.body(BASE).pos)
+    found = np.array(scene.body(_body_of(scene, BASE)).pos)
+    if np.abs(expected - found).max() > BASE_TOLERANCE:
+        raise Unusable(
+            f"model_file has the arm's base {BASE!r} at {found.round(3).tolist()}, expected "
+            f"{expected.round(3).tolist()}: it is of another scene than the benchmark's"
+        )
     placed = np.zeros((len(states), sim.state_dim))
     placed[:, 0] = states[:, 0]
-    for name, ours in joints_of(sim.model).items():
-        theirs = scene.joints[name]
-        placed[:, ours.position], placed[:, ours.velocity] = states[:, theirs.position], states[:, theirs.velocity]
+    for name, joint in ours.items():
+        placed[:, joint.position] = states[:, theirs[name].position]
+        placed[:, joint.velocity] = states[:, theirs[name].velocity]
     return placed, {name: _fixture_pose(scene, name) for name in sim.fixture_poses()}
 
 
-def _check_joints(sim: Simulation, scene: ModelFile) -> None:
-    """Raise unless both scenes have the same joints, in whatever order."""
-    ours = joints_of(sim.model)
+def _check_joints(task_name: str, ours: dict[str, Joint], theirs: dict[str, Joint]) -> None:
+    """Raise unless both scenes have the same joints, in any order."""
     for name, joint in ours.items():
-        found = scene.joints.get(name)
-        if found is None:
-            raise Unusable(f"model_file has no joint {name!r}, which task {sim.task.name} has")
-        if found.kind != joint.kind:
-            raise Unusable(f"model_file's joint {name!r} is of type {found.kind!r}, expected {joint.kind!r}")
-    beyond = next((name for name in scene.joints if name not in ours), None)
+        if name not in theirs:
+            raise Unusable(f"model_file has no joint {name!r}, which task {task_name} has")
+        if theirs[name].kind != joint.kind:
+            raise Unusable(f"model_file's joint {name!r} is of type {theirs[name].kind!r}, expected {joint.kind!r}")
+    beyond = next((name for name in theirs if name not in ours), None)
     if beyond is not None:
-        body = scene.joints[beyond].body
         raise Unusable(
-            f"model_file moves the body {body!r} by the joint {beyond!r}, which task {sim.task.name} does not have"
+            f"model_file moves the body {theirs[beyond].body!r} by the joint {beyond!r}, which task {task_name} does "
+            "not have"
         )
 
 
-def _check_base(sim: Simulation, scene: ModelFile) -> None:
-    theirs, ours = (np.array(model.body(BASE).pos) for model in (scene.model, sim.model))
-    if np.abs(ours - theirs).max() > BASE_TOLERANCE:
-        raise Unusable(
-            f"model_file has the arm's base {BASE!r} at {theirs.round(3).tolist()}, expected {ours.round(3).tolist()}: "
-            "it is of another scene than the benchmark's"
-        )
-
-
-def _fixture_pose(scene: ModelFile, name: str) -> Pose:
-    pose = scene.rest_pose(name)
+def _fixture_pose(scene: mujoco.MjModel, name: str) -> Pose:
+    body = scene.body(_body_of(scene, name))
+    pose = np.concatenate([body.pos, body.quat])
     if abs(pose[2] - TABLE_TOP) > NEAR_TABLE:
         raise Unusable(
             f"model_file has {name!r} at {pose[:3].round(3).tolist()}, not on the table at {TABLE_TOP} m: it is the "
@@ -327,7 +448,7 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
 
 
 def _bddl_text(file: PublishedFile, name: str) -> str:
-    """Return the task's BDDL: the file's, or the catalogue's where the file has the name of an open file instead."""
+    """Return the task's BDDL: the file's, or the catalogue's if the file stores the name of an open file instead."""
     if not file.lacks_its_text:
         return file.bddl_text
     if name not in task_names(suite=None):
@@ -339,10 +460,7 @@ def _bddl_text(file: PublishedFile, name: str) -> str:
 
 
 def unlike_the_catalogue(task: Task) -> str | None:
-    """Return in what a task differs from the catalogue's of its name, which everything else finds by that name.
-
-    None where it is the same, or the catalogue has none.
-    """
+    """Return the differences of a task to the catalogue's task of its name; None if there are none or no such task."""
     if task.name not in task_names(suite=None):
         return None
     known = get_task(task.name)
@@ -373,9 +491,9 @@ def task_name(file: PublishedFile) -> str:
     return file.path.name.removesuffix(SUFFIX).removesuffix(file.path.suffix)
 
 
-def _folder_name(text: str, what: str) -> str:
+def _folder_name(text: str, role: str) -> str:
     try:
-        return file_name(text, what)
+        return file_name(text, role)
     except MemobenchError as error:
         raise Unusable(str(error)) from None
 

@@ -101,7 +101,7 @@ def test_a_damaged_scan_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         build_scene(get_task(TOMATO).in_world("libero"))
 
 
-def test_a_scan_cannot_reference_files_outside_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scan_references_outside_its_folder_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scan_folder(tmp_path, "biscuit", ("a",))
     path = tmp_path / "biscuit/a/usd/MJCF/a.xml"
     (path.parent.parent / "outside.obj").write_text("v 0 0 0\n")
