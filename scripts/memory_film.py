@@ -30,7 +30,7 @@ from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.tasks.catalogue import BOWL, get_task
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task
 
 POLICIES = {
     "expert": (),
@@ -100,7 +100,7 @@ def evaluate(name: str, folder: Path) -> dict[int, Rollout]:
     from lerobot_memobench.run.plan import plan_line
     from lerobot_memobench.run.run import run_evaluation
 
-    words = ["env=memobench", *POLICIES[name], f"tasks={BOWL}", "referent=random", f"horizon={HORIZON}"]
+    words = ["env=memobench", *POLICIES[name], f"tasks={DEMO_TASK}", "referent=random", f"horizon={HORIZON}"]
     words += [f"obs_type={OBJECTS}", f"episodes={EPISODES}", "videos=0", f"output_dir={folder}"]
     plan = plan_line([*words, "batch_size=1", "eval.use_async_envs=false"])
     with recorded_actions() as taken:
@@ -120,7 +120,7 @@ def first_difference(found: dict[str, dict[int, Rollout]]) -> int:
 def play(seed: int, record: dict[str, Any], actions: Sequence[NDArray[np.float32]]) -> list[Shot]:
     """Go through a recorded episode again and draw it; it must end as the evaluation's did."""
     episode = Episode(
-        get_task(BOWL), referent="random", horizon=HORIZON, render=RenderSettings(2 * SIDE, 2 * SIDE, "high")
+        get_task(DEMO_TASK), referent="random", horizon=HORIZON, render=RenderSettings(2 * SIDE, 2 * SIDE, "high")
     )
     episode.reset(seed)
     shots = [shot(episode)]
@@ -151,7 +151,7 @@ def frames(takes: dict[str, list[Shot]]) -> Iterator[Image.Image]:
 
 def compose(now: dict[str, Shot]) -> Image.Image:
     """Return a picture of the film: instruction and phase, and each take between its name and its checkpoints."""
-    task = get_task(BOWL)
+    task = get_task(DEMO_TASK)
     film = Image.new("RGB", (len(now) * (SIDE + GAP) - GAP, HEADER + TITLE + SIDE + FOOTER), BACKGROUND)
     draw = ImageDraw.Draw(film)
     large, medium = (ImageFont.load_default(size=size) for size in (LARGE, MEDIUM))
@@ -177,7 +177,7 @@ def compose(now: dict[str, Shot]) -> Image.Image:
 def checkpoints(draw: ImageDraw.ImageDraw, corner: tuple[int, int], one: Shot) -> None:
     """Draw a box per memory checkpoint, with the letter and name of its operation; a tick once it is reached."""
     x, y = corner
-    for checkpoint, done in zip(get_task(BOWL).checkpoints, one.done, strict=True):
+    for checkpoint, done in zip(get_task(DEMO_TASK).checkpoints, one.done, strict=True):
         colour = OPERATION_COLOURS[checkpoint.operation]
         draw.rounded_rectangle((x, y, x + 28, y + 28), 5, fill=colour if done else None, outline=colour, width=3)
         if done:

@@ -444,8 +444,8 @@ def test_every_field_of_the_log_is_explained() -> None:
     for kind in (
         episode_log.EpisodeRecord,
         episode_log.CheckpointRecord,
-        evaluation_file.WholeProtocol,
-        evaluation_file.WholeCard,
+        evaluation_file.Protocol,
+        evaluation_file.Card,
         evaluation_file.CardEpisode,
     ):
         assert all(says for _, says, _ in reference.typed_rows(kind)), kind

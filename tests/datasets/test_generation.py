@@ -20,7 +20,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_d
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.slurm import run_part
-from lerobot_memobench.tasks.catalogue import BOWL, get_task
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task
 from tests.support.kills import hashes as tree_hash
 from tests.support.sbatch import Sbatch
 
@@ -178,7 +178,7 @@ def test_two_runs_at_once(tasks, recorded, tmp_path):
 
 
 def test_tasks_with_a_prompt_have_a_number_of_their_own(tasks, recorded, tmp_path):
-    shown = replace(tasks[1], prompt=get_task(BOWL).prompt)
+    shown = replace(tasks[1], prompt=get_task(DEMO_TASK).prompt)
     summary = run([tasks[0], shown], tmp_path / "ds", episodes=1, prompted_episodes=3, images=False)
     assert [(task.name, task.episodes) for task in summary.tasks] == [("task_a", 1), ("task_b", 3)]
     assert recorded == [("task_a", 10_000), *(("task_b", 10_000 + i) for i in range(3))]

@@ -59,7 +59,7 @@ from lerobot_memobench.io import Count, count_of, free_bytes, in_words, read_jso
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
-from lerobot_memobench.sim.worlds import KINDS
+from lerobot_memobench.sim.worlds import WORLDS
 from lerobot_memobench.tasks.task import World
 
 UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
@@ -277,7 +277,7 @@ def _checked_world(demo: PublishedDemo, others: World | None) -> World:
     world = world_of(demo)
     if world != (others or world):
         raise Unusable(f"its scenes are of world={world}, those before of {others}; convert each by itself")
-    KINDS[world].check()
+    WORLDS[world].check()
     return world
 
 
