@@ -290,8 +290,8 @@ def schemas_page() -> str:
     wanted = [
         ("episodes.jsonl: one line per rollout", episode_log.EpisodeRecord),
         ("Checkpoints of a line", episode_log.CheckpointRecord),
-        ("evaluation.json", evaluation_file.WholeCard),
-        ("Its protocol", evaluation_file.WholeProtocol),
+        ("evaluation.json", evaluation_file.Card),
+        ("Its protocol", evaluation_file.Protocol),
         ("Policy of a card", evaluation_file.Policy),
         ("Checkpoint of a card", evaluation_file.Checkpoint),
         ("One start", evaluation_file.Start),

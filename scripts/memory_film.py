@@ -30,9 +30,9 @@ from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.tasks.catalogue import BOWL, get_task
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task
 
-TASK = BOWL
+TASK = DEMO_TASK
 POLICIES = {
     "expert": (),
     "with memory": ("policy=memobench_small",),

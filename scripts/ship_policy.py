@@ -23,11 +23,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.datasets.lerobot_format.layout import read_manifest
-from lerobot_memobench.envs.acting import ELSEWHERE
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON
 from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder, shipped_policies
+from lerobot_memobench.policies.lerobot_config import ELSEWHERE
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.run.card import encoded, training_facts
 from lerobot_memobench.run.machine import git

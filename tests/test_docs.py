@@ -427,8 +427,8 @@ def test_all_fields_of_log_and_card_have_a_meaning() -> None:
     for kind in (
         episode_log.EpisodeRecord,
         episode_log.CheckpointRecord,
-        evaluation_file.WholeProtocol,
-        evaluation_file.WholeCard,
+        evaluation_file.Protocol,
+        evaluation_file.Card,
         evaluation_file.CardEpisode,
     ):
         assert all(meaning for _, meaning, _ in reference.typed_rows(kind)), kind

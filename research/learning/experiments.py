@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from lerobot_memobench.protocol import EVALUATION_SEED
-from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED
 
 MEMORY, MEMORYLESS = "memory", "no memory"
@@ -78,7 +78,7 @@ def experiment(name: str, perception: str = OBJECTS, suite: str = PUBLISHED) -> 
 
 
 EXPERIMENTS: dict[str, Experiment] = {
-    "bowl": Experiment((BOWL,), episodes=120, steps=1600, pixel_steps=2000, seeds=3),
+    "bowl": Experiment((DEMO_TASK,), episodes=120, steps=1600, pixel_steps=2000, seeds=3),
     "prompted": Experiment(prompted(), episodes=240, steps=12_000, arms=ALIGNED),
     "joint": Experiment(
         tuple(task_names()),

@@ -15,7 +15,7 @@ from PIL import Image, ImageColor
 from lerobot_memobench.envs.episode_log import MERGED_FILE, write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_rollouts
-from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task, task_names
 from research.alignment.study import ALIGNMENTS
 from research.learning import stages as stages_module
 from research.learning import study as study_module
@@ -55,7 +55,7 @@ def test_a_command_that_fails_is_told_and_gone_on_with(tmp_path: Path) -> None:
     assert spent.wall_s == kept["wall_s"] > 0
 
 
-def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10, task: str = BOWL) -> None:
+def write_rollouts(folder: Path, solved: int, wrong: int, episodes: int = 10, task: str = DEMO_TASK) -> None:
     from tests.support.logs import rollout
 
     kinds = ("reference_drift", "wrong_place", "miscount")
@@ -79,12 +79,12 @@ def test_outcomes_tell_wrong_referents_places_and_counts_apart(tmp_path: Path) -
     for seed, (solved, wrong) in enumerate([(9, 1), (5, 3)]):
         write_rollouts(tmp_path / str(seed), solved, wrong)
     found = outcomes_of([read_rollouts(tmp_path / "0")[0], read_rollouts(tmp_path / "1")[0]])
-    assert set(found) == {"all", "object", BOWL}
+    assert set(found) == {"all", "object", DEMO_TASK}
     for outcome in found.values():
         assert outcome.success.value == pytest.approx(0.7)
         assert outcome.of_seeds == pytest.approx((0.9, 0.5))
         assert (outcome.wrong, outcome.others) == (4, 2)
-    assert found[BOWL].success.n == 20
+    assert found[DEMO_TASK].success.n == 20
 
 
 def test_the_figure_of_two_evaluations_tells_differences_on_what_both_have(
@@ -129,13 +129,13 @@ def test_an_experiment_runs_its_parts_in_order(tmp_path: Path, monkeypatch: pyte
     memoryless = [word for word in ran[2] if word not in ran[1]]
     assert "policy.memory_fusion=none" in memoryless
     assert all("seed=7" in words and "referent=random" in words for words in ran[5:])
-    assert f"| {BOWL}, {MEMORY} | 20 | 90.0 |" in text
-    assert f"| {BOWL}, {MEMORYLESS} | 20 | 30.0 |" in text
+    assert f"| {DEMO_TASK}, {MEMORY} | 20 | 90.0 |" in text
+    assert f"| {DEMO_TASK}, {MEMORYLESS} | 20 | 30.0 |" in text
     assert f"| {MEMORYLESS} minus {MEMORY} | 10 | -60.0 | " in text
     assert "| training | 4 | 1.0 | 6.0 |" in text
     assert f"{MEMORY}: policy inputs: not recorded" in text
     assert (tmp_path / "out" / "learning.md").read_text() == text
-    assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][BOWL]["wrong"] == 12
+    assert json.loads((tmp_path / "out" / "learning.json").read_text())[MEMORYLESS][DEMO_TASK]["wrong"] == 12
     with Image.open(tmp_path / "out" / "learning.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3)
     memory, memoryless = ((pixels == ImageColor.getrgb(colour)).all(axis=1).sum() for colour in COLOURS[:2])
@@ -224,7 +224,7 @@ def test_prompts_are_learned_from_more_demonstrations_by_an_aligned_memory(
     assert ["align=semantic" in words for words in ran[1:]] == [True, False]
 
 
-@pytest.mark.parametrize(("task", "referent", "strict"), [(BOWL, "random", False), (STRICT_TASK, "drawn", True)])
+@pytest.mark.parametrize(("task", "referent", "strict"), [(DEMO_TASK, "random", False), (STRICT_TASK, "drawn", True)])
 def test_rollouts_are_of_the_demonstrations_kind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, task: str, referent: str, strict: bool
 ) -> None:
@@ -253,11 +253,11 @@ def test_the_command_takes_how_many_demonstrations(
 def test_the_command_takes_some_of_the_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Experiment] = []
     monkeypatch.setattr(study_module, "learn", lambda which, *_, **__: asked.append(which) or "")
-    for told in (["--tasks", "object"], ["--tasks", f"{BOWL},temporal"], []):
+    for told in (["--tasks", "object"], ["--tasks", f"{DEMO_TASK},temporal"], []):
         assert main(["prompted", "--out", str(tmp_path / "out"), *told]) == 0
     object_tasks, named, all_of_them = (which.tasks for which in asked)
     assert object_tasks == tuple(task_names("object")) == all_of_them[:5]
-    assert named == (BOWL, *task_names("temporal"))
+    assert named == (DEMO_TASK, *task_names("temporal"))
     assert main(["prompted", "--out", str(tmp_path / "out"), "--tasks", "objekt"]) == 2
 
 

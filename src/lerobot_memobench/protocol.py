@@ -1,4 +1,4 @@
-"""Hold every constant of the benchmark, once: time, seeds, pictures, vectors (paper, section 5.1)."""
+"""Constants of the benchmark: time, seeds, pictures, vectors (paper, section 5.1)."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from __future__ import annotations
 CONTROL_HZ = 20
 """Control steps, and therefore frames, per second."""
 HORIZON = 1200
-"""Control steps of an execution before an episode is cut off."""
+"""Maximum number of control steps of an execution."""
 PROTOCOLS = BY_PAPER, UPSTREAM = ("paper", "upstream")
-"""Whose evaluation it is: the paper's text, or the script that its authors published (`envs.settings`)."""
+"""Values of the setting ``protocol``: the evaluation of the paper's text, or of the authors' published script."""
 UPSTREAM_HORIZON = 990
-"""Control steps of an execution there: LIBERO's simulator ends after 1,000, of which 10 are the stabilisation's."""
+"""Maximum number of control steps of an execution in the script: LIBERO's limit of 1,000 minus 10 of stabilisation."""
 UPSTREAM_EVALUATIONS = 2
-"""Evaluations of the goal per control step there: for the reward, and for the end of the episode."""
+"""Evaluations of the goal per control step in the script: one for the reward, one for the end of the episode."""
 PROMPT_HORIZON = 1500
-"""Control steps after which a demonstration prompt ends, whatever it still had to show. Hiding two things takes some
-750; with one of them grasped at the fifth try more than 1000."""
+"""Maximum number of control steps of a demonstration prompt. Hiding two objects takes some 750, and more than 1000 if
+one of them is grasped at the fifth attempt."""
 IDLE_STEPS = 1800
-"""Control steps that the robot idles at most before the execution of a strict task: the seed draws how many, uniformly
-from 0 on. So a policy that counts its calls cannot conclude from the count what has been done."""
+"""Maximum number of control steps that the robot of a strict task idles before the execution. The seed draws the number
+uniformly from 0, so a policy cannot infer its progress by counting calls."""
 PROMPT, EXECUTION = 0, 1
-"""Values of ``phase``: a demonstration prompt plays or the robot idles, and actions have no effect; the policy acts."""
+"""Values of ``phase``. In `PROMPT` the prompt plays or the robot idles, and actions have no effect."""
 OBS_PHASE, OBS_STEP = CLOCK = ("observation.phase", "observation.step")
-"""A policy's names for an episode's phase and for the control steps since it began. A dataset has columns of these
-names: both are float32, (B,) in a batch, and raw, in training as in a rollout."""
+"""A policy's names of the phase and of the control steps since it began; also columns of a dataset. Both are float32,
+(B,) in a batch, and not normalised."""
 NO_CLOCK, ENDED = -1, -2
-"""Values of ``step`` in the execution of a strict task: it runs, it has ended. A policy that could read a clock would
-need no memory: it would begin each event at a time that names it."""
+"""Values of ``step`` in the execution of a strict task: running, ended. With a clock a policy would need no memory: it
+could start each event at a fixed time."""
 
 # -- seeds
 
@@ -40,18 +40,18 @@ SPLITS = {
     "detector test": range(40_000, 60_000),
     SEALED: range(100_007, 100_057),
 }
-"""What the seeds of scenes are for. The paper's were looked at between trainings: for what is developed here, they are
-validation too. The sealed ones are looked at once per release (`memobench test-sealed`)."""
+"""Seeds of scenes, by purpose. The paper's seeds were used between trainings, so for policies developed here they are
+validation seeds too. The sealed ones are used once per release (`memobench test-sealed`)."""
 GUARDED = (SEALED, PAPER, VALIDATION)
-"""Splits of which no demonstration is made: policies are chosen or measured on them."""
+"""Splits without demonstrations, because policies are selected or evaluated on them."""
 EVALUATION_SEED, EVALUATION_EPISODES = SPLITS[PAPER].start, len(SPLITS[PAPER])
-"""Episode i of an evaluation has the scene of seed 7 + i, unless another split is asked for; 50 episodes of a task."""
+"""Episode i of an evaluation has the scene of seed 7 + i by default; 50 episodes per task."""
 EVIDENCE_EPISODES = 36
-"""Episodes of each task where each scene is run with each variant: whole scenes, for 2, 3, 6, 9 or 12 variants."""
+"""Episodes per task of an evidence evaluation: a multiple of 2, 3, 6, 9 and 12 variants."""
 DEMONSTRATION_SEED, VALIDATION_SEED = SPLITS["demonstrations"].start, SPLITS[VALIDATION].start
-"""Demonstration i of a task has the scene of seed 10,000 + i; settings are chosen on seeds from 20,000 on."""
+"""Demonstration i of a task has the scene of seed 10,000 + i; settings are selected on seeds from 20,000."""
 UNSEEDED = (1_000_000_000, 2_000_000_000)
-"""Between these lie the seeds of episodes for which nobody named one, far above all others."""
+"""Range of the seeds of episodes that are reset without a seed, above all other seeds."""
 
 # -- pictures
 
@@ -70,4 +70,4 @@ PROPRIO_DIM = 8
 # -- software
 
 PUBLISHED_MUJOCO = "3.9.0"
-"""MuJoCo of the published figures. Under others scenes start and move slightly otherwise."""
+"""MuJoCo version of the published figures. Scenes start and move slightly differently in other versions."""

@@ -1,6 +1,6 @@
-"""Make the environment ``memobench`` and the policies ``memobench_*`` known to LeRobot.
+"""Register the environment ``memobench`` and the policies ``memobench_*`` with LeRobot.
 
-The configuration modules register themselves when imported; they import neither simulator nor model code.
+Importing a configuration module registers it, without loading simulator or models.
 """
 
 import lerobot_memobench.envs.configuration_memobench

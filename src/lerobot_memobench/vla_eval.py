@@ -1,6 +1,7 @@
 """The benchmark for vla-evaluation-harness (vla-eval): ``lerobot_memobench.vla_eval:MEMOBench`` in its YAML.
 
-Its model servers are evaluated on our tasks, seeds and protocol. Only vla-eval imports this module.
+It evaluates the harness's model servers with the tasks, seeds and protocol of this benchmark. Only vla-eval imports
+this module.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.acting import Acting
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import Acting
 from lerobot_memobench.envs.evaluation_file import check_protocol
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import PIXEL_INPUT
@@ -44,7 +45,7 @@ except ImportError as error:
 logger = logging.getLogger(__name__)
 
 NAMES = {"image": ("agentview", "video_history"), "wrist_image": ("wrist", "wrist_video_history")}
-"""Our name of a camera -> the harness's names of its picture and of its part of the demonstration prompt."""
+"""Camera -> the harness's names of its picture and of its video of the demonstration prompt."""
 STATES, STATE_HISTORY, STEP = "states", "state_history", "step"
 SUCCESS, STEPS_KEY = "success", "n_action_steps"
 DECIDED = {
@@ -53,38 +54,37 @@ DECIDED = {
     "prompt_in": "send_video_history",
     "obs_type": "send_state and send_wrist_image",
 }
-"""Settings of `EnvSettings` that follow from an argument."""
+"""Setting of `EnvSettings` -> the argument that determines it."""
 
 
 class MEMOBench(StepBenchmark):
-    """The tasks of one suite: episode i of each has the scene of seed ``seed`` + i, as everywhere in the benchmark.
+    """The tasks of one suite; episode i of each task has the scene of seed ``seed`` + i.
 
     Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3) upright; ``states`` float32 (8,):
     end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) of
-    `MemobenchEnv`. The first one of an episode with a demonstration prompt holds it too: ``video_history`` and
-    ``wrist_video_history``, lists of pictures, ``state_history``, a list of states, and ``episode_restart``. Frames in
-    which a strict task's robot idles are left out: they all are what the first observation shows.
+    `MemobenchEnv`. The first observation of an episode with a demonstration prompt also contains ``video_history`` and
+    ``wrist_video_history``, lists of pictures, ``state_history``, a list of states, and ``episode_restart``. Frames of
+    an idling robot are omitted, because they equal the first observation.
 
     Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`.
 
-    Result: ``success``, and ``MSR``, ``MUR``, ``MCR``, each the share of the operation's memory checkpoints that the
-    episode satisfied; a task without checkpoints of the operation has no such metric, and the harness averages over
-    those that do.
+    Result: ``success``, and ``MSR``, ``MUR``, ``MCR``: the share of satisfied memory checkpoints of each operation. A
+    task without checkpoints of an operation omits the metric, and the harness averages over the other tasks.
 
     Args:
-        tasks: `all`, memory types, task names or their numbers, separated by commas or as a list.
-        seed: of episode 0.
-        history_every: steps between the frames of the prompt that are sent.
-        n_action_steps: actions executed of each answer, open-loop. A pause begins and ends between two answers.
-        send_wrist_image: whether that picture is sent; of this and the next two the harness takes a model server's
-            wish from its greeting.
-        send_state: whether the arm's state is.
-        send_video_history: whether the prompt is.
-        mirror: send pictures mirrored left to right, as the harness's LIBERO does.
-        log_dir: folder of the episode log, which ``memobench report`` reads; none is written when None.
-        label: what the model server serves, in your words, for the log.
-        settings: others of `EnvSettings` by name, such as ``suite``, ``referent``, ``horizon`` or ``evidence``. A
-            ``max_steps`` of the harness that is lower than the horizon ends episodes unlogged.
+        tasks: `all`, memory types, task names or numbers, separated by commas or as a list.
+        seed: seed of episode 0.
+        history_every: interval of the sent frames of the prompt, control steps.
+        n_action_steps: actions executed per answer, open-loop. A pause starts and ends between two answers.
+        send_wrist_image: whether the wrist camera is sent. The harness sets this and the next two arguments from the
+            hello message of a model server.
+        send_state: whether the arm's state is sent.
+        send_video_history: whether the demonstration prompt is sent.
+        mirror: mirror pictures left to right, as the harness does for LIBERO.
+        log_dir: folder of the episode log for ``memobench report``; None for no log.
+        label: name of the model server's policy in the log.
+        settings: other fields of `EnvSettings`, such as ``suite``, ``referent``, ``horizon`` or ``evidence``. If the
+            harness's ``max_steps`` is lower than the horizon, it ends episodes without a log line.
     """
 
     _ALL_RECORD_FIELDS = frozenset({"reward", SUCCESS, "checkpoints_completed", "action", "state"})
@@ -92,7 +92,7 @@ class MEMOBench(StepBenchmark):
 
     @classmethod
     def configure_render(cls, mode: str) -> dict[str, str]:
-        """Set nothing: pictures are drawn on the CPU in each mode."""
+        """Return no variables: the CPU renders in each mode."""
         return {}
 
     def __init__(
@@ -120,12 +120,12 @@ class MEMOBench(StepBenchmark):
                 raise MemobenchError(f"{name} is {number!r}; expected a whole number from {least} on")
         if seed in SPLITS[SEALED]:
             raise MemobenchError(
-                f"seed {seed} is of the sealed test, whose runs are counted: `memobench test-sealed "
-                "policy=memobench_remote dialect=vla_eval` runs it with your model server"
+                f"seed {seed} belongs to the sealed test; run it by `memobench test-sealed policy=memobench_remote "
+                "dialect=vla_eval`, which counts its runs"
             )
         prompt_in = STEPS if send_video_history else RESET
         for name in DECIDED.keys() & settings.keys():
-            raise MemobenchError(f"{name} is {settings[name]!r}; this benchmark decides it, use {DECIDED[name]}")
+            raise MemobenchError(f"{name} is {settings[name]!r}, but follows from other arguments; set {DECIDED[name]}")
         self._settings = EnvSettings().changed(
             **settings, seed_base=seed, replan_steps=n_action_steps, prompt_in=prompt_in
         )
@@ -138,17 +138,17 @@ class MEMOBench(StepBenchmark):
         self._log_dir = log_dir
         policy = {} if label is None else {"type": "vla_eval", "identity": f"vla_eval {label}"}
         self._acting = Acting(policy, PIXEL_INPUT)
-        if log_dir is not None:  # now, not when the first episode has been simulated
+        if log_dir is not None:  # fail before the first episode
             check_protocol(Path(log_dir), self._settings.protocol_block | self._acting.protocol)
         self._env: MemobenchEnv | None = None
         self._history: dict[str, list[NDArray[Any]]] = {}
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """Return the chosen tasks; their suites are the memory types, as in LeRobot."""
+        """Return the chosen tasks; a suite of the harness is a memory type, as in LeRobot."""
         return [{"name": name, "suite": memory_type} for name, (memory_type, _) in self._tasks.items()]
 
     def reset(self, task: dict[str, Any]) -> dict[str, Any]:
-        """Start the episode ``task["episode_idx"]`` and play its prompt; return the first frame of the execution.
+        """Start the episode ``task["episode_idx"]``, play its prompt and return the first execution frame.
 
         Raises:
             MemobenchError: the episode cannot be run.
@@ -165,14 +165,14 @@ class MEMOBench(StepBenchmark):
             self._env.need_observation(shows and (step + 1) % self._history_every == 0)
             observation, *_, info = self._env.step(np.zeros(ACTION_DIM, np.float32))
         if "fault" in info:
-            self._env.step(np.zeros(ACTION_DIM, np.float32))  # the step that writes it into the log
+            self._env.step(np.zeros(ACTION_DIM, np.float32))  # writes the log line
             raise MemobenchError(info["fault"])
         self._env.need_observation(True)
         self._recorder.record_video(_video_frame(observation))
         return observation
 
     def _remember(self, observation: dict[str, Any]) -> None:
-        """Keep a frame of the prompt for the first observation."""
+        """Add a frame of the prompt to the first observation."""
         for name in self._cameras:
             self._history.setdefault(NAMES[name][1], []).append(self._picture(observation, name))
         if self._send_state:
@@ -182,26 +182,26 @@ class MEMOBench(StepBenchmark):
         return MemobenchEnv(str(folder), self._settings, log_dir=self._log_dir, acting=self._acting)
 
     def step(self, action: dict[str, Any]) -> StepResult:
-        """Execute the first actions of an answer, up to the episode's end.
+        """Execute the first actions of an answer, or fewer if the episode ends.
 
         Raises:
-            MemobenchError: the model server answered something else.
+            MemobenchError: the answer has the wrong form, or too few actions.
         """
         env, actions = self._running(), _actions(action)
         if len(actions) < self._n_action_steps:
             raise MemobenchError(
-                f"the model server answers {len(actions)} actions at a time, fewer than the {self._n_action_steps} to "
-                f"be executed; set n_action_steps to {len(actions)} or less"
+                f"the model server returned {len(actions)} actions, fewer than n_action_steps={self._n_action_steps}; "
+                f"set n_action_steps to {len(actions)} or less"
             )
-        for one in actions[: self._n_action_steps]:
-            observation, reward, terminated, truncated, info = env.step(one)
+        for each in actions[: self._n_action_steps]:
+            observation, reward, terminated, truncated, info = env.step(each)
             done = terminated or truncated
             self._recorder.record_video(_video_frame(observation))
             self._recorder.record_step(
                 reward=reward,
                 success=info["is_success"],
                 checkpoints_completed=info["checkpoints_completed"],
-                action=one,
+                action=each,
                 state=observation["agent_pos"],
             )
             if done:
@@ -209,7 +209,7 @@ class MEMOBench(StepBenchmark):
         return StepResult(obs=observation, reward=reward, done=done, info=info)
 
     def make_obs(self, raw_obs: dict[str, Any], task: dict[str, Any]) -> dict[str, Any]:
-        """Return the observation as it is sent; the prompt goes with the first one only."""
+        """Return the observation to send; the first one contains the prompt."""
         found: dict[str, Any] = {
             "images": {NAMES[name][0]: self._picture(raw_obs, name) for name in self._cameras},
             "task_description": self._running().task_description,
@@ -227,10 +227,13 @@ class MEMOBench(StepBenchmark):
         return np.ascontiguousarray(picture[:, ::-1]) if self._mirror else picture
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
-        """Return success and what the episode gives to MSR, MUR and MCR; see the class."""
+        """Return success and the episode's MSR, MUR and MCR; see the class."""
         env = self._running()
         if not step_result.done:
-            logger.warning("%s: the harness's max_steps ended an episode, which is not logged; set horizon", env.task)
+            logger.warning(
+                "%s: max_steps ended an episode, which is not logged; set horizon instead",
+                env.task,
+            )
         record = env.record()
         values = {metric: value_of(record, metric) for metric in PROCESS_METRICS}
         return {
@@ -240,11 +243,11 @@ class MEMOBench(StepBenchmark):
         }
 
     def get_metric_keys(self) -> dict[str, str]:
-        """Return what the harness averages over episodes."""
+        """Return the metrics that the harness averages over episodes."""
         return dict.fromkeys((SUCCESS, *PROCESS_METRICS), "mean")
 
     def get_metadata(self) -> dict[str, Any]:
-        """Return the harness's bound of steps, the horizon with all pauses, and suite, world and protocol."""
+        """Return the maximum number of steps (horizon and pauses), suite, world and protocol."""
         own = self._settings
         return {"max_steps": longest(own), "suite": own.suite, "world": own.world, "protocol": own.protocol}
 
@@ -253,27 +256,27 @@ class MEMOBench(StepBenchmark):
         return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
-        """Return the conventions of what is sent."""
+        """Return the conventions of the observation."""
         pictures = {NAMES[name][0]: IMAGE_RGB for name in self._cameras}
         return {**pictures, "language": LANGUAGE, **({"state": STATE_EEF_POS_AA_GRIP} if self._send_state else {})}
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
-        """Return the action of a real-time tick without an answer: stay, with the gripper as it was."""
+        """Return the action of a real-time tick without an answer: no motion, and the last gripper command."""
         hold = np.zeros(ACTION_DIM, np.float32)
         hold[-1] = -1.0 if last_action is None else _actions(last_action)[-1, -1]
         return {"actions": hold}
 
     def render(self) -> NDArray[np.uint8]:
-        """Return both cameras under what is being remembered and done."""
+        """Return both cameras under instruction and checkpoints."""
         return self._running().render()
 
     def _running(self) -> MemobenchEnv:
         if self._env is None:
-            raise MemobenchError("no episode has begun; call start_episode with one of get_tasks()")
+            raise MemobenchError("no episode is running; call start_episode with one of get_tasks()")
         return self._env
 
     def cleanup(self) -> None:
-        """Let the scene go."""
+        """Release the scene."""
         if self._env is not None:
             self._env.close()
             self._env = None
@@ -288,12 +291,12 @@ def _actions(answer: dict[str, Any]) -> NDArray[np.float32]:
         actions = np.empty((0, 0), np.float32)
     if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
         raise MemobenchError(
-            f"the model server answered actions of shape {np.shape(found)}; expected numbers of shape ({ACTION_DIM},) "
-            f"or (steps, {ACTION_DIM}): six of the end effector's displacement and one of the gripper"
+            f"the model server returned actions of shape {np.shape(found)}; expected numbers of shape ({ACTION_DIM},) "
+            f"or (steps, {ACTION_DIM}): end-effector displacement (6) and gripper (1)"
         )
     return actions
 
 
 def _video_frame(observation: dict[str, Any]) -> NDArray[np.uint8]:
-    """Return both cameras beside each other."""
+    """Return both cameras side by side."""
     return np.concatenate([observation["pixels"][name] for name in CAMERAS], axis=1)

@@ -19,7 +19,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_d
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.slurm import run_part
-from lerobot_memobench.tasks.catalogue import BOWL, get_task
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task
 from tests.support.kills import hashes as tree_hash
 from tests.support.kills import killed_at
 from tests.support.sbatch import Sbatch
@@ -159,7 +159,7 @@ def test_second_run_in_one_folder_is_refused(tasks, recorded, tmp_path):
 
 
 def test_number_of_prompted_episodes(tasks, recorded, tmp_path):
-    shown = replace(tasks[1], prompt=get_task(BOWL).prompt)
+    shown = replace(tasks[1], prompt=get_task(DEMO_TASK).prompt)
     summary = run([tasks[0], shown], tmp_path / "ds", episodes=1, prompted_episodes=3, images=False)
     assert [(task.name, task.episodes) for task in summary.tasks] == [("task_a", 1), ("task_b", 3)]
     assert recorded == [("task_a", 10_000), *(("task_b", 10_000 + i) for i in range(3))]

@@ -1,261 +1,794 @@
-"""The environment as LeRobot steps it: determinism in batches, prompt phase, freezing, logging, bad input."""
+"""Contract of the environment: suites, worlds and observation kinds x reset, step, log, resume and batches; faults."""
 
 from __future__ import annotations
 
+import copy
 import errno
+import json
+import logging
 import os
+import pickle
+import shutil
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from lerobot.configs import FeatureType
+from lerobot.envs import env_to_policy_features, preprocess_observation
 
+import lerobot_memobench.envs
+from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.datasets.demonstration import labels
+from lerobot_memobench.datasets.recording import record_demonstration
+from lerobot_memobench.envs import memobench_env
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.episode import Episode, first_execution_step
+from lerobot_memobench.envs.episode_log import MOST_EPISODES, differences, read_episodes, read_log
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.video import VideoRecorder
+from lerobot_memobench.envs.observations import CHECKPOINTS, SPARSE
+from lerobot_memobench.envs.pacing import longest
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, OBS_TYPES, PIXELS, RESET, STEPS
+from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EXECUTION, PROMPT, PROMPT_HORIZON
-from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.evaluation.html.write import frame_count
+from lerobot_memobench.evaluation.metrics import failure_of, seed_base
+from lerobot_memobench.evaluation.report import write_report
+from lerobot_memobench.protocol import ENDED, EXECUTION, IDLE_STEPS, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
+from lerobot_memobench.run.card import first_variant_mismatch
+from lerobot_memobench.run.merging import merge_and_report
+from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.object_slots import ObjectSlots
+from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.memory_text import NOTHING_YET, with_memory
+from tests.support.libero import needs_assets
 
-DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 STOVE = "turn_on_the_stove_and_turn_it_off"
+DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
-SEEDS = [7, 8, 9, 10]
+STRICT_HIGHLIGHT = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+STRICT_STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
+SEEDS = [20_000, 20_001, 20_002]
+REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
+NEW_ROLLOUT = {"lerobot_new_rollout": True}
 
 
-def make(name: str, **settings: Any) -> MemobenchEnv:
-    return MemobenchEnv(name, **settings)
+def make(name: str = STOVE, **settings: Any) -> MemobenchEnv:
+    return MemobenchEnv(name, **{"obs_type": OBJECTS, "seed_base": 20_000, "render": "fast", **settings})
 
 
-def actions(seed: int, steps: int) -> np.ndarray:
-    """Return the actions (steps, 7) of a seed's episode, the same in every batch."""
-    return np.random.default_rng(seed).uniform(-1, 1, (steps, 7)).astype(np.float32)
-
-
-def vector(name: str, batch: int, log_dir: Path, use_async: bool = False, **settings: Any) -> gym.vector.VectorEnv:
-    config = MemobenchEnvConfig(tasks=name, log_dir=str(log_dir), **settings)
-    envs = config.create_envs(batch, use_async)
-    (suite,) = envs.values()
-    (env,) = suite.values()
+def vector(log: Path, rows: int = 3, use_async: bool = False, **settings: Any) -> gym.vector.VectorEnv:
+    chosen = {"tasks": STOVE, "obs_type": OBJECTS, "seed_base": 20_000, "render": "fast", "horizon": 3, **settings}
+    if "task_dir" in settings:
+        del chosen["tasks"]
+    config = MemobenchEnvConfig(log_dir=str(log), **chosen)
+    ((env,),) = (suite.values() for suite in config.create_envs(rows, use_async).values())
     return env
 
 
+def actions(seed: int, steps: int) -> np.ndarray:
+    """Return the actions (steps, 7) of a seed's episode, equal in every batch."""
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, 7)).astype(np.float32)
+
+
+def flat(observation: dict[str, Any]) -> dict[str, np.ndarray]:
+    pixels = observation.get("pixels", {})
+    return {name: np.array(value) for name, value in {**observation, **pixels}.items() if name != "pixels"}
+
+
+def check_equal(found: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert flat(found).keys() == flat(expected).keys()
+    for name, value in flat(expected).items():
+        np.testing.assert_array_equal(flat(found)[name], value, err_msg=name)
+
+
+def play(env: Any, seed: int, steps: int = 3) -> list[dict[str, Any]]:
+    """Return the observations of the first execution frames; ends at the horizon."""
+    observation, _ = env.reset(seed=seed)
+    while observation["phase"][0] == PROMPT:
+        observation, *_ = env.step(REST)
+    found = [observation]
+    for action in actions(seed, steps):
+        found.append(env.step(action)[0])
+    return found
+
+
+@pytest.fixture
+def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("something is rendered")
+
+    for name in ("get_renderer", "get_rasterizer"):
+        monkeypatch.setattr(f"lerobot_memobench.sim.simulation.{name}", refuse)
+
+
+# --- the contract ---
+
+CONTRACT = {
+    "published-pixels": (STOVE, "memobench", PIXELS),
+    "published-objects": (DRAWER, "memobench", OBJECTS),
+    "published-both": (STOVE, "memobench", BOTH),
+    "prompted-objects": (HIGHLIGHT, "memobench", OBJECTS),
+    "strict-both": (STRICT_HIGHLIGHT, "memobench", BOTH),
+    "libero-both": pytest.param(STOVE, "libero", BOTH, marks=needs_assets),
+}
+
+
+@pytest.mark.parametrize(("name", "world", "obs_type"), CONTRACT.values(), ids=CONTRACT)
+def test_contract_of_reset_step_log_and_resume(tmp_path: Path, name: str, world: str, obs_type: str) -> None:
+    task = get_task(name)
+    settings = {"obs_type": obs_type, "world": world, "render": "fast", "seed_base": 20_000, "horizon": 3}
+    if task.idles:
+        settings["prompt_in"] = RESET
+    env = MemobenchEnv(name, log_dir=str(tmp_path), replan_steps=20, **settings)
+    for part in (*env.observation_space.spaces.values(), *env.observation_space.spaces.get("pixels", {}).values()):
+        assert isinstance(part, gym.spaces.Dict) or part.is_bounded()
+    features = env_to_policy_features(MemobenchEnvConfig(obs_type=obs_type))
+    assert sum(each.type is FeatureType.VISUAL for each in features.values()) == (0 if obs_type == OBJECTS else 2)
+    assert ("observation.environment_state" in features) == (obs_type != PIXELS)
+
+    frames = play(env, 20_001)
+    assert all(env.observation_space.contains(frame) for frame in frames)
+    assert (frames[0]["step"], frames[0]["phase"]) == ([NO_CLOCK if task.idles else 0], [EXECUTION])
+    assert frames[-1]["step"] == [ENDED if task.idles else 3]
+    record, after = env.record(), env.scene_hash()
+    assert env.render().shape == (320, 512, 3)
+    again = play(env, 20_001)
+    for frame, expected in zip(again, frames, strict=True):
+        check_equal(frame, expected)
+    assert env.scene_hash() == after
+    play(env, 20_002)
+    assert env.scene_hash() != after
+    env.reset(seed=20_003)  # not finished: no line
+    env.close()
+
+    lines = read_episodes(tmp_path)
+    assert [line["episode"] for line in lines] == [1, 2]
+    assert {key: value for key, value in lines[0].items() if key != "wall_s"} == {
+        key: value for key, value in record.items() if key != "wall_s"
+    }
+    assert lines[0].items() >= {"task": name, "memory_type": task.memory_type, "seed": 20_001, "steps": 3}.items()
+    assert (lines[0]["success"], lines[0]["failure"], lines[0]["replan_steps"]) == (False, "cut_off", 20)
+    assert [each["first_step"] for each in lines[0]["checkpoints"]] == [None] * len(task.checkpoints)
+    assert lines[0].get("world", "memobench") == world
+    assert lines[0].get("suite", "published") == task.suite
+    block = protocol_of(tmp_path)
+    assert (block["obs_type"], block["world"], block["suite"]) == (obs_type, world, task.suite)
+
+    config = {**settings, "suite": task.suite, "replan_steps": 20, "prompt_in": env.settings.prompt_in}
+    resumed = vector(tmp_path, 2, tasks=name, resume=True, **config)
+    observation, _ = resumed.reset(seed=[20_000, 20_001], options=NEW_ROLLOUT)
+    assert not any(value[1].any() for value in flat(observation).values()), "a logged row is blank"
+    assert flat(observation)["agent_pos"][0].any()
+    *_, truncated, info = resumed.step(np.zeros((2, 7), np.float32))
+    assert truncated.tolist() == [False, True]
+    assert not info["is_success"].any()
+    resumed.close()
+    with pytest.raises(MemobenchError, match="horizon: 3 and 4"):
+        vector(tmp_path, 2, tasks=name, resume=True, **{**config, "horizon": 4})
+
+
 def roll(env: gym.vector.VectorEnv, seeds: list[int], steps: int) -> tuple[list[str], dict[str, Any]]:
-    """Return hashes and the last observation of episodes stepped together."""
     env.reset(seed=seeds)
-    plans = np.stack([actions(seed, steps) for seed in seeds], axis=1)
-    for plan in plans:
+    for plan in np.stack([actions(seed, steps) for seed in seeds], axis=1):
         observation, *_ = env.step(plan)
-    return list(env.call("scene_hash")), observation
+    return list(env.call("scene_hash")), preprocess_observation(observation)
 
 
-def check_batches(name: str, tmp_path: Path, steps: int, seeds: list[int], **settings: Any) -> None:
-    alone = vector(name, 1, tmp_path / "alone", **settings)
-    hashes, images = [], []
-    for seed in seeds:
-        (found,), observation = roll(alone, [seed], steps)
-        hashes.append(found)
-        images.append(observation["pixels"]["wrist_image"][0].copy())
+def check_batches(tmp_path: Path, modes: tuple[bool, ...], steps: int, **settings: Any) -> None:
+    """Check that rows of a batch equal single episodes, and that they freeze at their end."""
+    settings["horizon"] = steps
+    alone = vector(tmp_path / "alone", 1, **settings)
+    single = [roll(alone, [seed], steps) for seed in SEEDS]
     alone.close()
-    assert len(set(hashes)) == len(seeds)
-    for use_async in (False, True):
-        env = vector(name, len(seeds), tmp_path / f"async_{use_async}", use_async, **settings)
+    assert len({hashes[0] for hashes, _ in single}) == len(SEEDS)
+    for use_async in modes:
+        env = vector(tmp_path / f"async_{use_async}", len(SEEDS), use_async, **settings)
         try:
-            together, observation = roll(env, seeds, steps)
-            assert together == hashes, f"async {use_async}"
-            np.testing.assert_array_equal(observation["pixels"]["wrist_image"], np.stack(images))
+            hashes, observation = roll(env, SEEDS, steps)
+            assert hashes == [each for found, _ in single for each in found], f"async {use_async}"
+            for key, value in observation.items():
+                rows = np.concatenate([each[key].numpy() for _, each in single])
+                np.testing.assert_array_equal(value.numpy(), rows, err_msg=key)
+            env.step(np.ones((len(SEEDS), 7), np.float32))
+            assert list(env.call("scene_hash")) == hashes, "ended rows are frozen"
         finally:
             env.close()
+        assert len(read_episodes(tmp_path / f"async_{use_async}")) == len(SEEDS)
 
 
-def test_batch_of_one_and_two_sync_and_async(tmp_path: Path) -> None:
-    check_batches(DRAWER, tmp_path, 12, SEEDS[:2])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", task_names())
-def test_batches_of_all_tasks(name: str, tmp_path: Path) -> None:
-    check_batches(name, tmp_path, 30, SEEDS)
-
-
-OF_EACH_FAMILY = [
-    "check_the_top_drawer_a_given_number_of_times",
-    "turn_the_stove_on_and_off_once_then_put_the_frying_pan_on_it",
-    "find_the_charger_hidden_in_one_of_the_drawers",
-    "find_the_charger_or_the_cap_hidden_in_two_of_the_drawers",
-    "put_only_the_milk_pointed_out_in_the_prompt_video_on_the_plate",
-    "assemble_strictly_in_the_order_demonstrated_in_the_prompt_video",
-]
+def test_rows_of_a_batch_equal_single_episodes(tmp_path: Path) -> None:
+    check_batches(tmp_path, (False,), 6, tasks=DRAWER, obs_type=BOTH)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", task_names(suite="strict"))
-def test_batches_of_strict_tasks(name: str, tmp_path: Path) -> None:
-    """The prompt is played in the reset: what is compared is the execution, after things were hidden."""
-    seeds = SEEDS if name in OF_EACH_FAMILY else SEEDS[:2]
-    check_batches(name, tmp_path, 12, seeds, suite="strict", prompt_in="reset")
+@pytest.mark.parametrize("name", task_names(suite=None))
+def test_batches_in_processes_of_all_tasks(name: str, tmp_path: Path) -> None:
+    check_batches(tmp_path, (False, True), 12, tasks=name, suite=get_task(name).suite, prompt_in=RESET, obs_type=BOTH)
 
 
-def test_prompt_plays_whatever_the_policy_does() -> None:
-    """Actions have no effect during the prompt; afterwards the scene is what it was, and only then does time count."""
-    ends = []
+def test_phase_and_step_get_the_shape_of_a_training_batch(tmp_path: Path) -> None:
+    env = vector(tmp_path, 2)
+    observation, _ = env.reset(seed=SEEDS[:2])
+    env.close()
+    before, _ = MemobenchEnvConfig().get_env_processors()
+    batch = before(preprocess_observation(observation))
+    for name, value in (("phase", EXECUTION), ("step", 0)):
+        found = batch[f"observation.{name}"]
+        assert (found.shape, found.dtype, found.tolist()) == ((2,), torch.float32, [value, value])
+
+
+# --- prompt and idling ---
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_prompt_ignores_actions_and_restores_the_scene() -> None:
+    runs = []
     for seed in (1, 2):
-        env = make(HIGHLIGHT, horizon=3)
+        env, hashes, lit = make(HIGHLIGHT, horizon=2, reward=CHECKPOINTS), [], 0
         rng = np.random.default_rng(seed)
-        observation, info = env.reset(seed=7)
-        start = env.scene_hash()
-        first_image = observation["pixels"]["image"].copy()
-        assert info["phase"] == PROMPT
-        hashes = []
+        observation, info = env.reset(seed=20_000)
+        start, objects = env.scene_hash(), ObjectSlots(env.episode.sim)
+        assert (observation["phase"], info["phase"]) == ([PROMPT], PROMPT)
         while observation["phase"] == [PROMPT]:
-            observation, _, terminated, truncated, info = env.step(rng.uniform(-1, 1, 7).astype(np.float32))
-            assert not terminated
-            assert not truncated
+            np.testing.assert_array_equal(observation["environment_state"], objects.observe())
+            slots = observation["environment_state"].reshape(SLOTS, WIDTH)
+            lit += bool(slots[:, STARTS["highlighted"]].any())
+            observation, reward, terminated, truncated, _ = env.step(rng.uniform(-1, 1, 7).astype(np.float32))
+            assert (reward, terminated, truncated) == (0.0, False, False)
             hashes.append(env.scene_hash())
-            assert len(hashes) <= PROMPT_HORIZON
-        assert observation["step"] == [0], "how long a prompt was would tell what it showed"
-        assert env.scene_hash() == start
-        np.testing.assert_array_equal(observation["pixels"]["image"], first_image)
-        for step in range(3):
-            assert env.episode.exec_steps == step
-            observation, _, terminated, truncated, info = env.step(np.zeros(7, np.float32))
-        assert truncated
-        assert env.record()["prompt_steps"] == len(hashes)
-        assert env.record()["steps"] == 3
-        ends.append(hashes)
-        env.close()
-    assert ends[0] == ends[1]
-    assert len(set(ends[0])) > 20, "the prompt shows nothing"
+        assert lit
+        assert not observation["environment_state"].reshape(SLOTS, WIDTH)[:, STARTS["highlighted"]].any()
+        assert observation["step"] == [0], "the length of the prompt is not observable"
+        assert hashes[-1] == start
+        assert [env.step(REST)[3] for _ in range(2)] == [False, True]
+        assert (env.record()["prompt_steps"], env.record()["steps"]) == (len(hashes), 2)
+        runs.append(hashes)
+    assert runs[0] == runs[1]
+    assert len(set(runs[0])) > 20, "the prompt shows a motion"
 
 
-def test_a_prompt_within_reset_changes_nothing_but_who_sees_it(tmp_path: Path) -> None:
-    """Log, film and the first execution frame are those of a prompt that was stepped through."""
-    shown, records, films = [], [], []
-    for where in ("steps", "reset"):
+@pytest.mark.parametrize("name", [HIGHLIGHT, STRICT_HIGHLIGHT])
+def test_prompt_in_reset_gives_the_same_execution_log_and_video(tmp_path: Path, name: str) -> None:
+    task = get_task(name)
+    idle = {seed: first_execution_step(task, seed, True) - (task.prompt_steps or 0) for seed in range(20_000, 20_600)}
+    seed = next(seed for seed, steps in idle.items() if not task.idles or 10 <= steps <= 60)
+    frames, records, videos = [], [], []
+    for where in (STEPS, RESET):
         log = tmp_path / where
-        env = make(HIGHLIGHT, prompt_in=where, horizon=3, log_dir=str(log), videos=1)
-        observation, info = env.reset(seed=7)
-        if where == "reset":
-            assert env._max_episode_steps == 3
-            assert info["phase"] == EXECUTION
-        while observation["phase"] == [PROMPT]:
-            observation, *_ = env.step(np.ones(7, np.float32))
-        shown.append(observation | {"scene": env.scene_hash()})
-        for action in actions(7, 3):
-            env.step(action)
+        env = make(name, obs_type=BOTH, prompt_in=where, horizon=3, log_dir=str(log), videos=-1)
+        prompt = 0 if where == RESET else PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
+        assert env._max_episode_steps == 3 + prompt + (IDLE_STEPS if task.idles and where == STEPS else 0)
+        assert (env.reset(seed=seed)[1]["phase"] == EXECUTION) == (where == RESET)
+        frames.append(play(env, seed))
         env.close()
         (record,) = read_episodes(log)
         records.append({key: value for key, value in record.items() if key != "wall_s"})
-        films.append((log / "videos" / f"{HIGHLIGHT}.0.mp4").read_bytes())
-    for key in ("agent_pos", "phase", "step"):
-        np.testing.assert_array_equal(shown[0][key], shown[1][key])
-    for camera, picture in shown[0]["pixels"].items():
-        np.testing.assert_array_equal(picture, shown[1]["pixels"][camera])
-    assert shown[0]["scene"] == shown[1]["scene"]
+        (video,) = log.rglob("*.mp4")
+        videos.append(video.read_bytes())
+    for step, expected in zip(frames[1], frames[0], strict=True):
+        check_equal(step, expected)
     assert records[0] == records[1]
-    assert records[0]["prompt_steps"] == 66
-    assert films[0] == films[1]
+    assert videos[0] == videos[1]
 
 
-def test_highlight_is_seen_in_the_prompt_only() -> None:
-    env = make(HIGHLIGHT)
-    observation, _ = env.reset(seed=7)
-    still = observation["pixels"]["image"].astype(int)
-    most = 0.0
+@pytest.mark.parametrize("name", [STRICT_STOVE, STRICT_HIGHLIGHT])
+def test_idling_simulates_and_renders_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = {"step": 0, "render": 0}
+
+    def counting(method: str) -> Callable[..., Any]:
+        call = getattr(Simulation, method)
+
+        def counted(sim: Simulation, *args: Any) -> Any:
+            calls[method] += 1
+            return call(sim, *args)
+
+        return counted
+
+    for method in calls:
+        monkeypatch.setattr(Simulation, method, counting(method))
+    task = get_task(name)
+    length = task.prompt_steps or 0
+    seed = next(s for s in range(20_000, 20_600) if 30 <= first_execution_step(task, s, True) - length <= 90)
+    env = make(name, obs_type=BOTH, horizon=1)
+    observation, _ = env.reset(seed=seed)
+    calls["step"] = 0
+    frames, scenes, rendered = [observation], [env.scene_hash()], [calls["render"]]
     while observation["phase"] == [PROMPT]:
-        observation, *_ = env.step(np.zeros(7, np.float32))
-        most = max(most, float((np.abs(observation["pixels"]["image"] - still).max(axis=2) > 20).mean()))
-    assert most > 0.003
-    np.testing.assert_array_equal(observation["pixels"]["image"], still)
-    env.close()
+        observation, *_ = env.step(np.full(7, 0.7, np.float32))
+        frames.append(observation)
+        scenes.append(env.scene_hash())
+        rendered.append(calls["render"])
+    begins = first_execution_step(task, seed, True)
+    assert [int(frame["step"][0]) for frame in frames] == [*range(begins), NO_CLOCK]
+    simulated = calls["step"]
+    assert (simulated == 0) == (task.prompt is None)
+    assert simulated <= begins - 30
+    assert len(set(scenes[simulated:])) == 1
+    assert rendered[simulated] == rendered[begins - 1] == rendered[begins] - 2
+    for part in ("environment_state", "agent_pos"):
+        np.testing.assert_array_equal(frames[simulated][part], observation[part])
+    assert env.step(REST)[3]
+    assert env.record()["prompt_steps"] == begins
 
 
-@pytest.mark.parametrize("use_async", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_rows_freeze_when_their_episode_ends(tmp_path: Path, use_async: bool) -> None:
-    env = vector(DRAWER, 2, tmp_path, use_async, horizon=2)
-    try:
-        env.reset(seed=[7, 8])
-        for _ in range(2):
-            _, _, terminated, truncated, _ = env.step(np.zeros((2, 7), np.float32))
-        assert truncated.all()
-        assert not terminated.any()
-        before = env.call("scene_hash")
-        for _ in range(3):
-            env.step(np.ones((2, 7), np.float32))
-        assert env.call("scene_hash") == before
-    finally:
-        env.close()
-    assert len(read_episodes(tmp_path)) == 2
+# --- rewards, instruction, evidence ---
 
 
-def test_the_first_episodes_are_recorded_or_all(tmp_path: Path) -> None:
-    for settings, recorded in (({}, []), ({"videos": 2}, [0, 1]), ({"videos": -1}, [-1, 0, 1, 2])):
-        folder = tmp_path / str(len(recorded))
-        env = make(STOVE, log_dir=str(folder), horizon=1, render="fast", **settings)
-        for seed in (6, 7, 8, 9):
-            env.reset(seed=seed)
-            env.step(np.zeros(7, np.float32))
-        env.close()
-        assert {video.name for video in folder.rglob("*.mp4")} == {f"{STOVE}.{number}.mp4" for number in recorded}
+def expert_rewards(env: MemobenchEnv) -> tuple[dict[int, float], int, dict[str, Any]]:
+    """Return the non-zero rewards of an expert episode by step, its number of steps and the last info."""
+    observation, info = env.reset(seed=7)
+    rewards, over = [], False
+    while not over:
+        observation, reward, terminated, truncated, info = env.step(observation["expert_action"])
+        rewards.append(float(reward))
+        over = terminated or truncated
+    return {step: reward for step, reward in enumerate(rewards, 1) if reward}, len(rewards), info
 
 
-def test_a_video_that_cannot_be_written_leaves_the_log_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was run before is there with its videos; the episode at hand is not in the log, so that it is run again."""
-    env = make(STOVE, log_dir=str(tmp_path), videos=-1, horizon=3, render="fast")
+def test_checkpoints_are_rewarded_once_and_in_order() -> None:
+    env = make(reward=CHECKPOINTS, expert_action=True)
+    rewards, steps, info = expert_rewards(env)
+    first, last = env.episode.progress.ordered_step
+    assert info["is_success"]
+    assert first < last == steps
+    assert rewards == {first: pytest.approx(1 / 3), last: pytest.approx(2 / 3)}
+    cut = make(reward=CHECKPOINTS, expert_action=True, horizon=first + 1)
+    rewards, _, info = expert_rewards(cut)
+    assert (list(rewards), info["checkpoints_completed"], info["is_success"]) == ([first], 1, False)
 
-    def run(seed: int) -> None:
+
+@pytest.mark.parametrize(("kind", "paid"), [(SPARSE, 1.0), (CHECKPOINTS, 1 / 3)])
+def test_success_terminates_with_its_reward(monkeypatch: pytest.MonkeyPatch, kind: str, paid: float) -> None:
+    env = make(reward=kind)
+    env.reset(seed=7)
+    assert env.step(REST)[1:3] == (0.0, False)
+    monkeypatch.setattr(Episode, "success", True)
+    _, reward, terminated, _, info = env.step(REST)
+    assert (terminated, info["checkpoints_completed"], reward) == (True, 0, pytest.approx(paid))
+
+
+SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"
+
+
+@pytest.mark.parametrize(("name", "referent"), [(STOVE, "fixed"), pytest.param(SWAP, "random", marks=pytest.mark.slow)])
+def test_oracle_instruction_equals_the_dataset_frame_by_frame(name: str, referent: str) -> None:
+    demo = record_demonstration(get_task(name), 10_000, images=False, referent=referent)
+    texts = [with_memory(demo.task.language, memory) for memory in labels(demo).memory]
+    assert len(set(texts)) == 1 + len(demo.task.checkpoints)
+    last = max(frame for frame, text in enumerate(texts) if text != texts[-1]) + 1  # the environment ends at success
+    env = make(name, oracle_memory=True, expert_action=True, referent=referent)
+    observation, _ = env.reset(seed=10_000)
+    found = [env.task_description]
+    for _ in range(last - 1):
+        observation, *_ = env.step(observation["expert_action"])
+        found.append(env.task_description)
+    assert found == texts[:last]
+    env.reset(seed=10_000)
+    assert env.task_description.endswith(NOTHING_YET)
+    plain = make(name, referent=referent)
+    plain.reset(seed=10_000)
+    assert plain.task_description == demo.task.language
+
+
+def test_evidence_runs_each_scene_with_each_variant(tmp_path: Path) -> None:
+    settings = {"prompt_in": RESET, "horizon": 1}
+    env = make(STRICT_HIGHLIGHT, log_dir=str(tmp_path / "each"), evidence=True, **settings)
+    for seed in range(20_000, 20_003):
         env.reset(seed=seed)
-        for action in actions(seed, 3):
-            env.step(action)
+        env.step(REST)
+    records = read_episodes(tmp_path / "each")
+    found = [(r["episode"], r["seed"], r["variant"]) for r in records]
+    assert found == [(0, 20_000, 0), (1, 20_000, 1), (2, 20_001, 0)]
+    assert [(r["choice"], r["variants"], r["chance"]) for r in records] == [(None, 2, 0.5)] * 3
+    assert first_variant_mismatch(records) is None
+    assert first_variant_mismatch([{**records[0], "variant": 1}]) is not None
+    drawn = make(STRICT_HIGHLIGHT, log_dir=str(tmp_path / "drawn"), **settings)
+    drawn.reset(seed=20_000)
+    drawn.step(REST)
+    (line,) = read_episodes(tmp_path / "drawn")
+    assert "choice" not in line
+    assert line["scene_hash"] == records[0]["scene_hash"] == records[1]["scene_hash"] != records[2]["scene_hash"]
+    each, once = (protocol_of(tmp_path / name) for name in ("each", "drawn"))
+    assert differences(each, once) == ["evidence: True and False"]
+
+
+def test_expert_follows_the_prompt_in_an_evidence_episode() -> None:
+    env = make(STRICT_HIGHLIGHT, prompt_in=RESET, expert_action=True, evidence=True)
+    observation, _ = env.reset(seed=20_001)
+    over = False
+    while not over:
+        observation, _, terminated, truncated, _ = env.step(observation["expert_action"])
+        over = terminated or truncated
+    assert env.record().items() >= {"success": True, "choice": 1, "variant": 1}.items()
+
+
+def test_record_and_protocol_contain_the_pace(tmp_path: Path) -> None:
+    pace = {"horizon": 60, "pause_steps": 10, "speed": 0.5, "replan_steps": 4}
+    env = make(log_dir=str(tmp_path), **pace)
+    env.reset(seed=20_000)
+    while not env.step(REST)[3]:
+        pass
+    (record,) = read_episodes(tmp_path)
+    assert (record["steps"], record["paused_steps"] % 12) == (120, 0)
+    assert 0 < record["paused_steps"] <= longest(env.settings) - 120
+    block = protocol_of(tmp_path)
+    before = {key: value for key, value in block.items() if key not in ("pause_steps", "speed")}
+    assert differences(before, block) == ["pause_steps: 0 and 10", "speed: 1.0 and 0.5"]
+
+
+# --- frames that are rendered ---
+
+
+@pytest.mark.usefixtures("no_rendering")
+def test_unneeded_observations_repeat_a_copy_of_the_last_one() -> None:
+    env = make(DRAWER, horizon=4)
+    env.reset(seed=20_007)
+    seen = env.step(actions(1, 1)[0])[0]["environment_state"]
+    env.need_observation(False)
+    articulation, _ = env.episode.sim.world.articulation("wooden_cabinet_1_top_region")
+    env.episode.sim.data.joint(articulation.joint).qpos[0] = articulation.open_q
+    one, two = (env.step(np.ones(7, np.float32))[0]["environment_state"] for _ in range(2))
+    np.testing.assert_array_equal(one, seen)
+    np.testing.assert_array_equal(two, seen)
+    assert not np.shares_memory(one, two)
+    last = env.step(np.ones(7, np.float32))[0]["environment_state"]  # the last frame is always current
+    np.testing.assert_array_equal(last, ObjectSlots(env.episode.sim).observe())
+    assert (last != seen).any()
+
+
+def test_pause_is_observed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    observed: list[int] = []
+    objects = Episode.objects
+    monkeypatch.setattr(Episode, "objects", lambda self: observed.append(self.step_index) or objects(self))  # type: ignore[func-returns-value]
+    env, rested, over = make(horizon=100, pause_steps=30), {0: False}, False
+    env.reset(seed=7)
+    while not over:
+        *_, over, _ = env.step(np.full(7, 0.1, np.float32))
+        rested[env.episode.step_index] = env.episode.rested
+    pauses = sum(rested[step] and not rested[step - 1] for step in rested if step)
+    assert pauses
+    assert len(observed) == sum(not rests for rests in rested.values()) + pauses
+    assert sum(rested[step] for step in observed) == pauses
+
+
+def test_video_contains_every_step_and_other_episodes_are_not_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered: list[int] = []
+    images = Episode.images
+    monkeypatch.setattr(Episode, "images", lambda self: rendered.append(self.step_index) or images(self))  # type: ignore[func-returns-value]
+    env = make(DRAWER, log_dir=str(tmp_path), horizon=2, videos=1)
+    for seed in (20_000, 20_001):
+        play(env, seed, 2)
+    assert rendered == [0, 1, 2]
+    (video,) = tmp_path.rglob("*.mp4")
+    assert (video.name, frame_count(video)) == (f"{DRAWER}.0.mp4", 3 + LAST_FRAMES)
+    assert env.render().std() > 0
+    env.render()
+    assert rendered == [0, 1, 2, 2]
+
+
+def test_failed_video_leaves_the_log_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The episode of the failed video is not logged, so resuming runs it again."""
+    env = make(log_dir=str(tmp_path), videos=-1, horizon=2)
 
     def no_room(video: VideoRecorder, picture: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    run(20_007)
+    play(env, 20_007, 2)
     with monkeypatch.context() as patch:
         patch.setattr(VideoRecorder, "_encode", no_room)
-        with pytest.raises(MemobenchError, match=r"cannot be written \(No space left on device\)"):
-            run(20_008)
-    assert [record["seed"] for record in read_episodes(tmp_path)] == [20_007]
-    run(20_009)
-    env.close()
+        with pytest.raises(MemobenchError, match="No space left on device"):
+            play(env, 20_008, 2)
+    play(env, 20_009, 2)
     assert [record["seed"] for record in read_episodes(tmp_path)] == [20_007, 20_009]
     assert len(list((tmp_path / "videos").iterdir())) == 2
 
 
-def test_log_holds_the_finished_episodes(tmp_path: Path) -> None:
-    env = make(DRAWER, log_dir=str(tmp_path), horizon=4, replan_steps=20)
-    hashes = []
-    for seed in (7, 8):
-        env.reset(seed=seed)
-        hashes.append(env.scene_hash())
-        for _ in range(4):
-            env.step(np.zeros(7, np.float32))
-    env.reset(seed=9)  # cut short: no line
-    env.step(np.zeros(7, np.float32))
-    env.close()
-    records = read_episodes(tmp_path)
-    assert [(r["task"], r["episode"], r["seed"], r["scene_hash"]) for r in records] == [
-        (DRAWER, 0, 7, hashes[0]),
-        (DRAWER, 1, 8, hashes[1]),
+# --- resume ---
+
+
+def test_resume_keeps_outcomes_and_other_rows(tmp_path: Path) -> None:
+    def rolled(env: gym.vector.VectorEnv) -> list[dict[str, Any]]:
+        found = [env.reset(seed=SEEDS, options=NEW_ROLLOUT)[0]["agent_pos"]]
+        for _ in range(3):
+            observation, reward, terminated, truncated, _ = env.step(np.full((3, 7), 0.5, np.float32))
+            found += [observation["agent_pos"], reward, terminated, truncated]
+        env.close()
+        return [np.array(each) for each in found]
+
+    whole, log = tmp_path / "whole", tmp_path / "log"
+    reference = rolled(vector(whole))
+    line = {"task": STOVE, "memory_type": "temporal", "episode": 1, "success": True, "checkpoints": []}
+    others = [{**line, "task": "another", "episode": 0}, {**line, "referent": "random", "episode": 2}]
+    log.mkdir()
+    (log / "episodes.jsonl").write_text("".join(json.dumps(each) + "\n" for each in (line, *others)))
+    found = rolled(vector(log, resume=True))
+    for before, after in zip(reference, found, strict=True):
+        np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
+    assert [found[2][1], found[3][1], found[4][1]] == [1.0, True, False], "the logged success ends the row"
+    records = [record for record in read_episodes(log) if record["task"] == STOVE]
+    assert [(record["episode"], "wall_s" in record) for record in records] == [
+        (0, True),
+        (1, False),
+        (2, True),
+        (2, False),
     ]
-    record = records[0]
-    assert record["memory_type"] == "spatial"
-    assert record["steps"] == 4
-    assert record["success"] is False
-    assert record["replan_steps"] == 20
-    assert record["prompt_steps"] == 0
-    assert [checkpoint["first_step"] for checkpoint in record["checkpoints"]] == [None] * 3
-    assert record["failure"] == "cut_off"
+    hashes = {record["episode"]: record["scene_hash"] for record in read_episodes(whole)}
+    assert [record["scene_hash"] for record in records if "wall_s" in record] == [hashes[0], hashes[2]]
 
 
-def test_render_is_annotated() -> None:
-    env = make(STOVE)
-    env.reset(seed=7)
-    frame = env.render()
-    assert frame.dtype == np.uint8
-    assert frame.shape[0] > 256
-    assert frame.shape[1:] == (512, 3)
+# --- faults ---
+
+
+@pytest.mark.parametrize(
+    ("bad", "named", "use_async"),
+    [
+        (np.nan, "not finite", False),
+        pytest.param(np.nan, "not finite", True, marks=pytest.mark.slow),
+        (None, "shape", False),
+    ],
+)
+def test_invalid_action_ends_only_its_own_episode(
+    tmp_path: Path, bad: float | None, named: str, use_async: bool
+) -> None:
+    env = vector(tmp_path, use_async=use_async)
+    env.reset(seed=SEEDS, options=NEW_ROLLOUT)
+    ends = []
+    for step in range(3):
+        action = np.tile(REST, (3, 1))
+        if step == 1 and bad is None:
+            action = action[:, :6]
+        elif step == 1:
+            action[1] = bad
+        *_, terminated, truncated, info = env.step(action)
+        assert not terminated.any()
+        assert not np.any(info["is_success"])
+        ends.append(truncated.tolist())
     env.close()
+    cut = [True] * 3 if bad is None else [False, True, False]
+    assert ends[:2] == [[False] * 3, cut]
+    records = read_episodes(tmp_path)
+    assert [record["steps"] for record in records if "fault" in record] == [1] * sum(cut)
+    assert [named in record.get("fault", "") for record in records] == cut
+    assert [failure_of(record) for record in records if "fault" in record] == ["invalid_action"] * sum(cut)
+    assert write_report(tmp_path).summary.failures["invalid_action"] == sum(cut)
+
+
+@pytest.mark.parametrize("bad", ["up", [[0], [0, 1]], {"arm": 0}, "up" * 500, None, np.full(7, np.inf)])
+def test_invalid_action_raises_without_a_log_until_the_next_reset(tmp_path: Path, bad: Any) -> None:
+    env = make()
+    for _ in range(2):
+        env.reset(seed=20_000)
+        env.step(REST)
+        for action in (bad, REST):
+            with pytest.raises(MemobenchError, match="an action") as caught:
+                env.step(action)
+            assert len(str(caught.value)) < 250
+    logged = make(log_dir=str(tmp_path))
+    logged.reset(seed=20_000)
+    *_, truncated, info = logged.step(bad)
+    assert truncated
+    assert info["fault"].startswith("an action")
+    assert [record["failure"] for record in read_episodes(tmp_path)] == ["invalid_action"]
+
+
+def test_unstable_physics_end_an_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
+    for log in (None, str(tmp_path)):
+        env = make(log_dir=log)
+        env.reset(seed=20_000)
+        env.step(REST)
+        env.episode.sim.data.qvel[0] = 1e12
+        if log is None:
+            for _ in range(2):
+                with pytest.raises(MemobenchError, match="physics"):
+                    env.step(REST)
+    with caplog.at_level(logging.WARNING):
+        *_, terminated, truncated, info = env.step(REST)
+    assert (terminated, truncated, info["is_success"]) == (False, True, False)
+    assert info["fault"] in caplog.text
+    (record,) = read_episodes(tmp_path)
+    assert (record["failure"], record["steps"], record["fault"]) == ("unstable_physics", 1, info["fault"])
+    hashes = set()
+    for each in (env, env, make()):  # later episodes are not affected
+        each.reset(seed=20_001)
+        assert "fault" not in each.step(REST)[-1]
+        hashes.add(each.scene_hash())
+    assert len(hashes) == 1
+
+
+SHELF = """
+(define (problem a_pan_in_a_shelf)
+  (:language put the frying pan into the shelf)
+  (:regions
+    (pan_place (:target kitchen_table) (:ranges ((-0.02 -0.02 0.02 0.02))))
+    (shelf_place (:target kitchen_table) (:ranges ((-0.02 -0.28 0.02 -0.24))) (:yaw_rotation ((3.1415 3.1415))))
+    (top_region (:target shelf_1)))
+  (:fixtures kitchen_table - kitchen_table shelf_1 - wooden_two_layer_shelf)
+  (:objects pan_1 - chefmate_8_frypan)
+  (:init (On pan_1 kitchen_table_pan_place) (On shelf_1 kitchen_table_shelf_place))
+  (:goal (In pan_1 shelf_1_top_region)))
+"""
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Path:
+    """Write a task that the expert cannot do."""
+    folder = tmp_path / "tasks" / "spatial" / "a_shelf"
+    folder.mkdir(parents=True)
+    (folder / "task_config.bddl").write_text(SHELF)
+    meta = {
+        "memory": [["in"] * 3],
+        "operating_type": [[0] * 3],
+        "subtask_goals": [["in", "pan_1", "shelf_1_top_region"]],
+    }
+    (folder / "task_config.meta.json").write_text(json.dumps(meta))
+    return folder
+
+
+def test_task_that_cannot_be_run_enters_no_rate(shelf: Path, tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match="drawers only"):
+        make(str(shelf), expert_action=True).reset(seed=20_000)
+    log = tmp_path / "log"
+    for resume in (False, True):
+        env = vector(log, 2, task_dir=str(shelf), expert_action=True, resume=resume)
+        env.reset(seed=SEEDS[:2], options=NEW_ROLLOUT)
+        *_, terminated, truncated, _ = env.step(np.tile(REST, (2, 1)))
+        assert (truncated.all(), terminated.any()) == (True, False)
+        env.close()
+    assert [line["episode"] for line in read_log(log)] == [0, 1]
+    assert read_episodes(log) == []
+    with pytest.raises(MemobenchError, match="drawers only"):
+        write_report(log)
+    other = tmp_path / "other"
+    play(make(expert_action=True, log_dir=str(other), horizon=3, prompt_in=STEPS), 20_000)
+    report = merge_and_report(tmp_path / "merged", [log, other])
+    assert report.run.summary.rollouts == 1
+    assert any("a_shelf was not run" in note for note in report.run.notes)
+    assert json.loads((tmp_path / "merged" / "report.json").read_text())["not_run"] == {"a_shelf": 2}
+
+
+def test_evaluation_of_a_folder_skips_a_task_that_cannot_be_run(shelf: Path, tmp_path: Path) -> None:
+    shutil.copytree(get_task(STOVE).folder, shelf.parent / STOVE)
+    words = ["eval", "env=memobench", f"env.task_dir={shelf.parent}", "episodes=1", "videos=0", "horizon=3"]
+    for more in ((), ("resume=true",)):
+        flags = (f"obs_type={OBJECTS}", "eval.use_async_envs=false", f"output_dir={tmp_path / 'out'}", *more)
+        assert main([*words, *flags]) == 0
+        assert [record["task"] for record in read_episodes(tmp_path / "out")] == [STOVE]
+        assert json.loads((tmp_path / "out" / "report.json").read_text())["not_run"] == {"a_shelf": 1}
+    named = json.loads((tmp_path / "out" / EVALUATION_FILE).read_text())["episodes"]
+    assert [episode["task"] for episode in named] == ["a_shelf", STOVE]
+
+
+def test_evidence_episode_that_cannot_be_run_names_its_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any, **__: Any) -> None:
+        raise MemobenchError("no simulator")
+
+    monkeypatch.setattr(Episode, "reset", fails)
+    env = make(STRICT_HIGHLIGHT, log_dir=str(tmp_path), evidence=True, prompt_in=RESET)
+    for seed in (20_002, 20_003):
+        env.reset(seed=seed)
+        env.step(REST)
+    assert [(r["episode"], r["seed"], seed_base(r)) for r in read_log(tmp_path)] == [
+        (2, 20_001, 20_000),
+        (3, 20_001, 20_000),
+    ]
+
+
+# --- seeds ---
+
+
+def test_episodes_without_a_seed_are_outside_all_splits(tmp_path: Path) -> None:
+    runs: list[list[str]] = []
+    for run in range(2):
+        env = vector(tmp_path / str(run), 2, horizon=1)
+        env.reset(seed=SEEDS[:2], options=NEW_ROLLOUT)
+        seeds, hashes = [], []
+        for _ in range(2):
+            env.reset(options=NEW_ROLLOUT)
+            seeds += [episode.seed for episode in env.get_attr("episode")]
+            hashes += env.call("scene_hash")
+        assert len({*seeds}) == len({*hashes}) == 4
+        assert all(UNSEEDED[0] <= seed < UNSEEDED[1] for seed in seeds)
+        env.step(np.tile(REST, (2, 1)))
+        env.close()
+        runs.append(hashes)
+    assert runs[0] == runs[1], "a seed determines the episodes after it"
+    assert UNSEEDED[0] > 10 * MOST_EPISODES
+    drawn = set()
+    for _ in range(2):
+        env = make()
+        env.reset()
+        drawn.add(env.episode.seed)
+    assert len(drawn) == 2
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_sealed_scene_is_logged_once_unless_its_run_is_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, counted: bool
+) -> None:
+    if counted:
+        run = {"release": "1", "run": 1, "earlier": []}
+        (tmp_path / EVALUATION_FILE).write_text(json.dumps({"protocol": {}, "sealed": run}))
+    memobench_env._log_sealed.cache_clear()
+    env = make(log_dir=str(tmp_path))
+    for seed, lines in ((7, 0), (100_006, 0), (100_007, 1), (100_056, 1), (100_057, 1)):
+        env.reset(seed=seed)
+        found = [record for record in caplog.records if "sealed scenes" in record.getMessage()]
+        assert len(found) == (0 if counted else lines), seed
+
+
+# --- gymnasium ---
+
+
+def test_each_task_has_a_gymnasium_id() -> None:
+    assert lerobot_memobench.envs
+    assert {f"memobench/{name.replace(',', '')}-v0" for name in task_names(suite=None)} <= set(gym.registry)
+    env = gym.make(f"lerobot_memobench.envs:memobench/{STOVE}-v0")
+    assert env.unwrapped.task == STOVE
+    with pytest.raises(gym.error.NameNotFound, match=STOVE):
+        gym.make("memobench/turn_on_the_stofe_and_turn_it_off-v0")
+
+
+@pytest.mark.parametrize(("name", "obs_type"), [(STOVE, PIXELS), (STRICT_HIGHLIGHT, OBJECTS)])
+def test_gymnasium_checker_gives_no_warning(name: str, obs_type: str) -> None:
+    env = gym.make(f"memobench/{name}-v0", obs_type=obs_type, render="fast")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    env.close()
+
+
+@pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
+def test_gymnasium_vector_environment_uses_the_seeds_of_the_benchmark(mode: str) -> None:
+    workers = {"context": "forkserver"} if mode == "async" else {}  # this process has threads
+    settings = {"obs_type": OBJECTS, "horizon": 2}
+    envs = gym.make_vec(f"memobench/{STOVE}-v0", num_envs=2, vectorization_mode=mode, vector_kwargs=workers, **settings)
+    observation, _ = envs.reset(seed=7)
+    scenes = envs.call("scene_hash")
+    assert observation in envs.observation_space
+    for done in (False, True):
+        *_, terminated, truncated, _ = envs.step(np.zeros((2, 7), np.float32))
+        assert (list(terminated), list(truncated)) == ([False, False], [done, done])
+    envs.step(np.zeros((2, 7), np.float32))  # both rows start an episode of another scene
+    assert not set(envs.call("scene_hash")) & set(scenes)
+    envs.close()
+    episode = Episode(get_task(STOVE))
+    for seed, scene in zip((7, 8), scenes, strict=True):
+        episode.reset(seed)
+        assert episode.scene_hash == scene
+
+
+def test_calls_without_a_running_episode_raise_gymnasium_errors() -> None:
+    env = make()
+    calls = (lambda: env.step(REST), env.render, env.record, env.scene_hash)
+    for expected in (ResetNeeded, ClosedEnvironmentError):
+        for call in calls:
+            with pytest.raises(expected):
+                call()
+        env.close()
+    env.reset(seed=20_000)  # LeRobot reuses closed environments
+    env.step(REST)
+    before = env.scene_hash()
+    for copied in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):  # noqa: S301
+        with pytest.raises(ResetNeeded):
+            copied.step(REST)
+        copied.reset(seed=20_000)
+        copied.step(REST)
+        assert copied.scene_hash() == before == env.scene_hash()
+
+
+def test_observation_kinds_are_all_tested() -> None:
+    assert {(case if isinstance(case, tuple) else case.values)[2] for case in CONTRACT.values()} == set(OBS_TYPES)

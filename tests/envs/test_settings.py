@@ -1,4 +1,4 @@
-"""One table of settings for everything that takes them: the same values are accepted and refused everywhere."""
+"""Settings have the same accepted values everywhere; a folder's file contains one protocol."""
 
 from __future__ import annotations
 
@@ -13,88 +13,106 @@ import pytest
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.episode_log import differences
 from lerobot_memobench.envs.evaluation_file import (
     EARLIER_CARD,
     EARLIER_PROTOCOL,
     EVALUATION_FILE,
+    WHOLE,
     check_protocol,
     protocol_of,
     read_evaluation,
     write_protocol,
 )
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.settings import NOT_COMPARED, SETTINGS, EnvSettings
+from lerobot_memobench.envs.settings import GOALS, IDLE, NOT_COMPARED, SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EVALUATION_SEED, HORIZON, UPSTREAM_HORIZON
-from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.protocol import EVALUATION_SEED, HORIZON, IDLE_STEPS, UPSTREAM_HORIZON
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.task import STRICT
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
-
+STRICT_STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
 TAKERS: dict[str, Callable[..., object]] = {
     "settings": lambda **asked: EnvSettings().changed(**asked),
     "configuration": lambda **asked: MemobenchEnvConfig(**asked),
     "environment": lambda **asked: MemobenchEnv(STOVE, **asked),
     "episode": lambda **asked: Episode(get_task(STOVE), **asked),
 }
-
-BAD: list[tuple[str, Any]] = [
-    ("suite", "strikt"),
-    ("world", "robosuite"),
-    ("protocol", "papers"),
-    ("seed_base", -1),
-    ("obs_type", "state"),
-    ("referent", "randon"),
-    ("referent", "drawn"),
-    ("demonstration_prompt", "yes"),
-    ("prompt_in", "rest"),
-    ("horizon", 0),
-    ("horizon", "60"),
-    ("horizon", True),
-    ("replan_steps", 0),
-    ("render", "ultra"),
-    ("oracle_memory", 1),
-    ("pause_steps", -1),
-    ("speed", 0.0),
-    ("speed", 0.7),
-    ("speed", 2.0),
-    ("speed", float("nan")),
-    ("speed", "0.5"),
-    ("evidence", True),  # with the published referent alone there is nothing to choose from
-    ("videos", -2),
-]
+BAD: dict[str, tuple[Any, ...]] = {
+    "suite": ("strikt",),
+    "world": ("robosuite",),
+    "protocol": ("papers",),
+    "seed_base": (-1,),
+    "obs_type": ("state",),
+    "referent": ("randon", "drawn"),
+    "demonstration_prompt": ("yes",),
+    "prompt_in": ("rest",),
+    "horizon": (0, "60", True),
+    "replan_steps": (0,),
+    "render": ("ultra",),
+    "oracle_memory": (1,),
+    "pause_steps": (-1,),
+    "speed": (0.0, 0.7, 2.0, float("nan"), "0.5"),
+    "evidence": (True,),  # not with the published referent
+    "videos": (-2,),
+}
 
 
 @pytest.mark.parametrize("taker", TAKERS)
-@pytest.mark.parametrize(("name", "value"), BAD, ids=[f"{name}={value}" for name, value in BAD])
-def test_a_bad_value_is_refused_by_everything_that_takes_settings(taker: str, name: str, value: Any) -> None:
-    if name == "suite" and taker == "environment":
-        pytest.skip("an environment has the suite of its task")
-    if (name, taker) == ("render", "episode"):
-        pytest.skip("an episode takes size and quality of its frames")
-    with pytest.raises(MemobenchError, match=name) as caught:
-        TAKERS[taker](**{name: value})
-    assert "\n" not in str(caught.value)
+def test_bad_values_and_unknown_names_are_refused_everywhere(taker: str) -> None:
+    for name, values in BAD.items():
+        if (name, taker) in (("suite", "environment"), ("render", "episode")):
+            continue  # the task determines the suite; an episode accepts other render settings
+        for value in values:
+            with pytest.raises(MemobenchError, match=name) as caught:
+                TAKERS[taker](**{name: value})
+            assert "\n" not in str(caught.value)
+    if taker != "configuration":
+        with pytest.raises(MemobenchError, match="'horizon'"):
+            TAKERS[taker](horizn=5)
 
 
-@pytest.mark.parametrize("taker", ["settings", "environment", "episode"])
-def test_an_unknown_setting_names_the_nearest(taker: str) -> None:
-    with pytest.raises(MemobenchError, match=r"'horizn'.*'horizon'"):
-        TAKERS[taker](horizn=5)
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"task": STOVE, "tasks": "object"}, "env.tasks"),
+        ({"fps": 30}, "env.fps"),
+        ({"task_dir": "somewhere", "tasks": "object"}, "tasks=object"),
+        ({"suite": STRICT, "world": "libero"}, "world=libero"),
+    ],
+)
+def test_unused_and_incompatible_fields_of_the_configuration_are_refused(fields: dict[str, Any], named: str) -> None:
+    with pytest.raises(MemobenchError, match=named):
+        MemobenchEnvConfig(**fields)
 
 
-@pytest.mark.parametrize(("name", "value"), [("task", STOVE), ("fps", 30), ("task_dir", "somewhere")])
-def test_a_field_of_lerobots_that_has_no_use_here_is_refused(name: str, value: Any) -> None:
-    with pytest.raises(MemobenchError, match=name):
-        MemobenchEnvConfig(tasks="object", **{name: value})
-
-
-def test_bad_settings_leave_no_file_behind(tmp_path: Path) -> None:
+def test_tasks_are_selected_before_a_folder_is_created(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=STOVE):
         MemobenchEnvConfig(tasks="turn_on_the_stofe_and_turn_it_off", log_dir=str(tmp_path / "log")).create_envs(1)
     assert not (tmp_path / "log").exists()
+    assert [folder.name for *_, folder in MemobenchEnvConfig(suite=STRICT).selected()] == task_names(suite=STRICT)
+    assert len(MemobenchEnvConfig().selected()) == 30
+    assert MemobenchEnvConfig(task="object").selected() == MemobenchEnvConfig(tasks="object").selected()
+    with pytest.raises(MemobenchError, match="suite=strict"):
+        MemobenchEnvConfig(tasks=STRICT_STOVE).selected()
+    folder = str(get_task(STRICT_STOVE).folder)
+    with pytest.raises(MemobenchError, match="suite=strict"):
+        MemobenchEnvConfig(task_dir=folder).selected()
+    assert len(MemobenchEnvConfig(task_dir=folder, suite=STRICT).selected()) == 1
 
 
-def test_every_setting_has_a_meaning_and_reaches_configuration_environment_and_protocol() -> None:
+def test_evidence_selects_tasks_with_variants() -> None:
+    config = MemobenchEnvConfig(evidence=True, referent="random", tasks=f"object,{STOVE}")
+    names = [folder.name for *_, folder in config.selected()]
+    assert len(names) == 5
+    assert all(get_task(name).num_variants > 1 for name in names)
+    with pytest.raises(MemobenchError, match="variants"):
+        MemobenchEnvConfig(evidence=True, referent="random", tasks=STOVE).selected()
+    assert MemobenchEnvConfig(evidence=True, suite=STRICT).settings.protocol_block["evidence"] is True
+
+
+def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
     fields = {each.name: each for each in dataclasses.fields(EnvSettings)}
     assert all(each.metadata["meaning"] for each in fields.values())
     assert set(SETTINGS) == set(fields) - set(NOT_COMPARED)
@@ -111,32 +129,23 @@ def test_every_setting_has_a_meaning_and_reaches_configuration_environment_and_p
 @pytest.mark.parametrize(
     ("asked", "found"),
     [
-        ({"suite": "strict"}, {"referent": "drawn", "idle": 1800, "goals": 2}),
+        ({"suite": STRICT, "referent": "fixed"}, {"referent": "drawn", IDLE: IDLE_STEPS, GOALS: 2}),
         ({"protocol": "upstream"}, {"demonstration_prompt": False, "horizon": UPSTREAM_HORIZON}),
         ({"protocol": "upstream", "horizon": 5}, {"horizon": 5}),
         ({}, {"horizon": HORIZON, "seed_base": EVALUATION_SEED, "world": "memobench"}),
     ],
 )
-def test_a_suite_and_a_protocol_decide_other_settings(asked: dict[str, Any], found: dict[str, Any]) -> None:
+def test_suite_and_protocol_determine_other_settings(asked: dict[str, Any], found: dict[str, Any]) -> None:
     block = EnvSettings(**asked).protocol_block
     assert {name: block[name] for name in found} == found
     assert vars(MemobenchEnvConfig(**asked)).items() >= {k: v for k, v in found.items() if k in SETTINGS}.items()
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {"suite": "strict"},
-        {"referent": "random"},
-        {"oracle_memory": True},
-        {"pause_steps": 3},
-        {"speed": 0.5},
-        {"referent": "random", "evidence": True},
-    ],
-)
-def test_the_authors_evaluation_has_no_controls(asked: dict[str, Any]) -> None:
-    with pytest.raises(MemobenchError, match="protocol=upstream"):
-        EnvSettings(protocol="upstream", **asked)
+def test_upstream_protocol_has_no_controls() -> None:
+    controls = ({"suite": STRICT}, {"referent": "random"}, {"oracle_memory": True}, {"pause_steps": 3}, {"speed": 0.5})
+    for asked in (*controls, {"evidence": True}):
+        with pytest.raises(MemobenchError, match="protocol=upstream"):
+            EnvSettings(protocol="upstream", **asked)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +156,7 @@ def test_the_authors_evaluation_has_no_controls(asked: dict[str, Any]) -> None:
         (type("P", (), {"reads_prompt": True}), "steps", None),
     ],
 )
-def test_settings_that_follow_from_the_policy(policy: Any, prompt_in: str, replan: int | None) -> None:
+def test_policy_determines_prompt_and_replanning(policy: Any, prompt_in: str, replan: int | None) -> None:
     settings = MemobenchEnvConfig().settings_for(policy)
     assert (settings.prompt_in, settings.replan_steps) == (prompt_in, replan)
     named = MemobenchEnvConfig(prompt_in="steps", replan_steps=2).settings_for(policy)
@@ -157,7 +166,19 @@ def test_settings_that_follow_from_the_policy(policy: Any, prompt_in: str, repla
 # --- the file ---
 
 
-def test_the_protocol_of_a_folder_is_written_once_and_another_refused(tmp_path: Path) -> None:
+def test_omitted_settings_have_their_former_values() -> None:
+    assert differences({"horizon": 5}, {"suite": "published", "horizon": 5}) == []
+    assert differences({"suite": STRICT}, {}) == ["suite: strict and published"]
+    now = EnvSettings(suite=STRICT).protocol_block
+    before = {key: value for key, value in now.items() if key != IDLE}
+    assert differences(before, now) == [f"idle: 0 and {IDLE_STEPS}"]
+    assert differences(now, now) == []
+    assert differences({"tasks": ["a"], "policy": {"sha256": "a"}}, {"tasks": ["b"], "policy": {"sha256": "b"}}) == []
+    found = differences({"tasks": ["a"]}, {"tasks": ["b"]}, extent=True)
+    assert found == ["tasks: a and b"]
+
+
+def test_folder_keeps_one_protocol_and_one_policy(tmp_path: Path) -> None:
     block = EnvSettings(horizon=5).protocol_block
     write_protocol(tmp_path, block)
     before = (tmp_path / EVALUATION_FILE).read_bytes()
@@ -173,7 +194,7 @@ def test_the_protocol_of_a_folder_is_written_once_and_another_refused(tmp_path: 
         write_protocol(tmp_path / "of_a_policy", {**block, "policy": {"identity": "b"}})
 
 
-def test_files_of_earlier_versions_are_read_as_one(tmp_path: Path) -> None:
+def test_files_of_earlier_versions_are_merged(tmp_path: Path) -> None:
     card = {"protocol": {"tasks": ["a"], "episodes": 2, "horizon": 5}, "policy": {"type": "act"}}
     (tmp_path / EARLIER_CARD).write_text(json.dumps(card))
     (tmp_path / EARLIER_PROTOCOL).write_text(json.dumps({"horizon": 5, "render_every": 1, "prompt_in": "steps"}))
@@ -188,24 +209,34 @@ def test_files_of_earlier_versions_are_read_as_one(tmp_path: Path) -> None:
     card_file.with_name(f"{EARLIER_CARD}.gz").write_bytes(gzip.compress(card_file.read_bytes()))
     card_file.unlink()
     assert read_evaluation(card_file) == card
-    write_protocol(tmp_path / "new", EnvSettings().protocol_block)
-    assert read_evaluation(tmp_path / "new")["format"] == 2
 
 
 @pytest.mark.parametrize("name", [EVALUATION_FILE, EARLIER_CARD, EARLIER_PROTOCOL])
 @pytest.mark.parametrize(
-    "text", ["", "[]", '{"protocol": 3, "horizon": "x"}', "\x00", '{"protocol": {"horizon": -3}, "horizon": []}']
+    "text", ["", "[]", '{"protocol": 3, "horizon": ""}', '{"protocol": {"horizon": -3}, "horizon": []}']
 )
-def test_a_damaged_file_is_named(tmp_path: Path, name: str, text: str) -> None:
+def test_damaged_file_is_named(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(MemobenchError, match=name.replace(".", r"\.")) as caught:
         protocol_of(tmp_path)
     assert "\n" not in str(caught.value)
 
 
-def test_an_absent_file_is_an_empty_one_unless_all_of_it_is_needed(tmp_path: Path) -> None:
+def test_resuming_needs_the_whole_file(tmp_path: Path) -> None:
     assert read_evaluation(tmp_path) == protocol_of(tmp_path) == protocol_of(tmp_path / "new") == {}
-    with pytest.raises(MemobenchError, match="missing"):
-        read_evaluation(tmp_path, whole=True)
-    with pytest.raises(MemobenchError, match="missing"):
-        read_evaluation(tmp_path / "no.json", whole=True)
+    for place in (tmp_path, tmp_path / "no.json"):
+        with pytest.raises(MemobenchError, match="missing"):
+            read_evaluation(place, whole=True)
+    start = {"command": [], "batch_size": 1, "versions": {}, "git_commit": None, "machine": {}}
+    parts = {"format": 2, "policy": {}, "checkpoint": None, "trained_on": None, "task_files": {}, "shard": None}
+    whole = {**parts, "protocol": {"tasks": [], "episodes": 0}, "runs": [start], "episodes": []}
+    file = tmp_path / EVALUATION_FILE
+    file.write_text(json.dumps(whole))
+    assert read_evaluation(tmp_path, whole=True) == whole
+    lacking = [{k: v for k, v in whole.items() if k != key} for key in WHOLE]
+    lacking += [{**whole, "protocol": {"tasks": []}}, {**whole, "runs": [{}]}]
+    for content in lacking:
+        file.write_text(json.dumps(content))
+        assert read_evaluation(tmp_path)
+        with pytest.raises(MemobenchError, match="found no"):
+            read_evaluation(tmp_path, whole=True)

@@ -1,4 +1,4 @@
-"""A video is whole or not there, and shows the end of its episode; the text over its pictures."""
+"""Videos are complete or absent and contain the end of the episode; cached text equals freshly drawn text."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,60 +14,23 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw, ImageFont
+from PIL import ImageDraw
 
 from lerobot_memobench.envs import video
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.video import AHEAD, BAND, LAST_FRAMES, OPERATION_COLOURS, VideoRecorder, annotate
+from lerobot_memobench.envs.video import AHEAD, BAND, LAST_FRAMES, MARGIN, OPERATION_COLOURS, VideoRecorder, annotate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
 
 
 def frame(value: int) -> np.ndarray:
     return np.full((64, 128, 3), value, dtype=np.uint8)
 
 
-def test_a_video_appears_when_it_is_finished(tmp_path: Path) -> None:
-    recorder = VideoRecorder(tmp_path / "videos" / "task.0.mp4")
-    for value in (0, 100, 200):
-        recorder.add(frame(value))
-    assert not (tmp_path / "videos" / "task.0.mp4").exists()
-    assert recorder.finish() == tmp_path / "videos" / "task.0.mp4"
-    with av.open(str(tmp_path / "videos" / "task.0.mp4")) as container:
-        means = [picture.to_ndarray(format="rgb24").mean() for picture in container.decode(video=0)]
-    assert len(means) == 3 + LAST_FRAMES
-    assert np.abs(np.array(means[-LAST_FRAMES:]) - 200).max() < 4
-    assert [path.name for path in (tmp_path / "videos").iterdir()] == ["task.0.mp4"]
-
-
-def test_an_unfinished_video_leaves_nothing(tmp_path: Path) -> None:
-    recorder = VideoRecorder(tmp_path / "task.0.mp4")
-    recorder.add(frame(10))
-    recorder.discard()
-    assert list(tmp_path.iterdir()) == []
-    assert VideoRecorder(tmp_path / "empty.mp4").finish() is None
-
-
-def test_a_video_shows_each_frame_as_it_was_when_added(tmp_path: Path) -> None:
-    """One buffer serves all frames; 100 pixels are no multiple of what a video library pads its lines to."""
-    recorder, shown = VideoRecorder(tmp_path / "task.0.mp4"), np.zeros((64, 100, 3), np.uint8)
-    for value in (0, 60, 120, 180):
-        shown[:, value // 3 : value // 3 + 10] = value
-        recorder.add(shown)
-    recorder.finish()
-    shown[:] = 255  # the caller's own again
-    with av.open(str(tmp_path / "task.0.mp4")) as container:
-        pictures = [picture.to_ndarray(format="rgb24") for picture in container.decode(video=0)]
-    assert [picture.shape for picture in pictures[:1]] == [(64, 100, 3)]
-    for number, value in enumerate((0, 60, 120, 180)):
-        assert abs(pictures[number][20:40, value // 3 + 4].mean() - value) < 12
-        assert pictures[number][:, 99].mean() < 12
-    assert abs(pictures[-1][20:40, 64].mean() - 180) < 12
-
-
 def encoded_directly(path: Path, frames: list[np.ndarray]) -> bytes:
-    """One frame after the other, in the caller's thread."""
     container = av.open(str(path), "w", format="mp4")
     stream = container.add_stream("libx264", rate=20, options={"preset": "ultrafast", "crf": "20", "threads": "1"})
     stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
@@ -79,22 +41,37 @@ def encoded_directly(path: Path, frames: list[np.ndarray]) -> bytes:
     return path.read_bytes()
 
 
-@pytest.mark.parametrize("count", [1, AHEAD, AHEAD + 1, 40])
-def test_videos_are_those_that_are_encoded_directly(tmp_path: Path, count: int) -> None:
-    """Two at once share the thread."""
-    noise = np.random.default_rng(0).integers(0, 256, (2, count, 64, 128, 3), np.uint8)
-    recorders = [VideoRecorder(tmp_path / f"task.{number}.mp4") for number in range(2)]
+@pytest.mark.parametrize(("count", "width"), [(1, 128), (AHEAD + 1, 100), (20, 128)])
+def test_video_equals_direct_encoding(tmp_path: Path, count: int, width: int) -> None:
+    """Two recorders share the thread; the caller reuses one buffer; 100 pixels are no multiple of the padding."""
+    noise = np.random.default_rng(0).integers(0, 256, (2, count, 64, width, 3), np.uint8)
+    recorders = [VideoRecorder(tmp_path / "videos" / f"task.{number}.mp4") for number in range(2)]
+    buffer = np.empty((64, width, 3), np.uint8)
     for pictures in noise.swapaxes(0, 1):
         for recorder, picture in zip(recorders, pictures, strict=True):
-            recorder.add(picture)
-    for recorder, pictures in zip(recorders, noise, strict=True):
+            buffer[:] = picture
+            recorder.add(buffer)
+    buffer[:] = 0
+    assert not list(tmp_path.rglob("task*.mp4"))
+    for number, (recorder, pictures) in enumerate(zip(recorders, noise, strict=True)):
         path = recorder.finish()
-        assert path is not None
+        assert path == tmp_path / "videos" / f"task.{number}.mp4"
         assert path.read_bytes() == encoded_directly(tmp_path / "direct.mp4", list(pictures))
+    assert len(list((tmp_path / "videos").iterdir())) == 2
 
 
-def test_frames_wait_for_the_encoder_when_it_is_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is in memory stays bounded, and discarding does not encode what waits."""
+def test_unfinished_and_empty_videos_leave_no_file(tmp_path: Path) -> None:
+    recorder = VideoRecorder(tmp_path / "task.0.mp4")
+    recorder.add(frame(10))
+    with pytest.raises(ValueError, match="shape"):
+        recorder.add(np.zeros((32, 128, 3), np.uint8))
+    recorder.discard()
+    assert VideoRecorder(tmp_path / "empty.mp4").finish() is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_adding_waits_for_the_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory stays bounded; discarding skips the waiting frames."""
     begun, go_on, encoded = threading.Event(), threading.Event(), []
 
     def encode(self: VideoRecorder, picture: av.VideoFrame) -> None:
@@ -130,7 +107,6 @@ def test_frames_wait_for_the_encoder_when_it_is_behind(tmp_path: Path, monkeypat
 
 @contextmanager
 def on_a_full_disk(path: Path) -> Iterator[Path]:
-    """A draft that takes no byte."""
     yield Path("/dev/full")
 
 
@@ -139,144 +115,100 @@ def add_often(recorder: VideoRecorder, picture: np.ndarray) -> None:
         recorder.add(picture)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full disk to offer")
-def test_what_cannot_be_written_is_told_and_nothing_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (320, 512, 3), np.uint8)  # more than is kept back for later
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_unwritable_video_raises_and_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (320, 512, 3), np.uint8)  # exceeds the encoder's buffer
     monkeypatch.setattr(video, "draft_of", on_a_full_disk)
     recorder = VideoRecorder(tmp_path / "task.0.mp4")
-    with pytest.raises(MemobenchError, match=r"task\.0\.mp4 cannot be written \(No space left on device\); make room"):
+    with pytest.raises(MemobenchError, match=r"task\.0\.mp4.*No space left on device"):
         add_often(recorder, noise)
     with pytest.raises(MemobenchError, match="No space left"):
-        recorder.finish()  # FFmpeg is handed nothing more: it would end the process
+        recorder.finish()
     recorder.discard()
     monkeypatch.undo()
     (tmp_path / "file").touch()
     recorder = VideoRecorder(tmp_path / "file" / "task.1.mp4")
     recorder.add(noise)
-    with pytest.raises(MemobenchError, match=r"task\.1\.mp4 cannot be written"):
+    with pytest.raises(MemobenchError, match=r"task\.1\.mp4"):
         recorder.finish()
     recorder.discard()
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_frame_of_another_size_is_refused(tmp_path: Path) -> None:
-    recorder = VideoRecorder(tmp_path / "task.0.mp4")
-    recorder.add(frame(0))
-    with pytest.raises(ValueError, match="shape"):
-        recorder.add(np.zeros((32, 128, 3), np.uint8))
-    recorder.discard()
-    assert list(tmp_path.iterdir()) == []
+# --- text over the pictures ---
 
 
-# --- the text over the pictures: kept from frame to frame, it looks as if all of it were drawn each time ---
-
-BACKGROUND, TEXT, FAINT, PURPLE = (24, 26, 30), (240, 240, 240), (150, 155, 165), (204, 121, 167)
-
-
-load_font = cache(ImageFont.load_default)
-
-
-def fitted(draw: ImageDraw.ImageDraw, text: str, width: int) -> tuple[str, ImageFont.FreeTypeFont]:
-    for points in range(14, 8, -1):
-        font = load_font(size=points)
-        if draw.textlength(text, font=font) <= width:
-            return text, font
-    font = load_font(size=9)
-    while text and draw.textlength(text + "…", font=font) > width:
-        text = text[:-1]
-    return text + "…", font
+def moment(name: str, phase: int = EXECUTION, step: int = 0, done: int = 0, **changes: Any) -> SimpleNamespace:
+    task = dataclasses.replace(get_task(name), **changes)
+    texts = [checkpoint.language[1] for checkpoint in task.checkpoints]
+    return SimpleNamespace(
+        task=task,
+        phase=phase,
+        step_index=step,
+        exec_steps=step,
+        progress=SimpleNamespace(index=done),
+        success=done == len(texts),
+        subgoal=lambda: texts[min(done, len(texts) - 1)],
+    )
 
 
-def drawn_anew(images: dict[str, np.ndarray], episode: SimpleNamespace) -> np.ndarray:
-    """The whole frame, nothing kept."""
-    pictures = np.hstack(list(images.values()))
-    width = pictures.shape[1]
-    band = Image.new("RGB", (width, BAND), BACKGROUND)
-    draw = ImageDraw.Draw(band)
-    prompt = episode.phase == PROMPT
-    text, font = fitted(draw, episode.task.language, width - 96)
-    draw.text((8, 5), text, fill=TEXT, font=font)
-    clock = ("prompt ", *str(episode.step_index)) if prompt else ("step ", *str(episode.exec_steps))
-    font = load_font(size=13)
-    x = width - 8 - sum(round(font.getlength(piece)) for piece in clock)
-    for piece in clock:
-        draw.text((x, 5), piece, fill=PURPLE if prompt else FAINT, font=font)
-        x += round(font.getlength(piece))
-    x = 8
-    for index, checkpoint in enumerate(episode.task.checkpoints):
-        colour, done = OPERATION_COLOURS[checkpoint.operation], index < episode.progress.index and not prompt
-        draw.rounded_rectangle((x, 34, x + 20, 54), 4, fill=colour if done else None, outline=colour, width=2)
-        if done:
-            draw.line([(x + 5, 44), (x + 9, 49), (x + 16, 39)], fill=BACKGROUND, width=3)
-        else:
-            font = load_font(size=12)
-            draw.text((x + 10, 44), checkpoint.operation, fill=colour, font=font, anchor="mm")
-        x += 26
-    now = "watch the prompt" if prompt else "done" if episode.success else f"next: {episode.subgoal()}"
-    text, font = fitted(draw, now, width - x - 14)
-    draw.text((x + 6, 44), text, fill=PURPLE if prompt else TEXT, font=font, anchor="lm")
-    return np.vstack([np.asarray(band), pictures])
+def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((picture == colour).all(axis=2).any())
 
 
-def test_what_is_next_is_an_instruction() -> None:
-    task = get_task("turn_on_the_stove_and_turn_it_off")
-    found: list[Any] = [SimpleNamespace(task=task, progress=SimpleNamespace(index=index)) for index in range(3)]
-    told = [Episode.subgoal(moment) for moment in found]
-    assert told == ["switch the stove on", *["switch the stove off again"] * 2]
-
-
-def moments(name: str) -> Iterator[SimpleNamespace]:
-    """An episode that shows its prompt, completes one checkpoint after the other and succeeds."""
-    task = get_task(name)
-    count = len(task.checkpoints)
-
-    def moment(phase: int, step: int, done: int) -> SimpleNamespace:
-        subgoal = task.checkpoints[min(done, count - 1)].language[1] if count else task.language
-        return SimpleNamespace(
-            task=task,
-            phase=phase,
-            step_index=step,
-            exec_steps=step,
-            progress=SimpleNamespace(index=done),
-            success=done == count,
-            subgoal=lambda: subgoal,
-        )
-
-    yield from (moment(PROMPT, step, done) for step in (0, 9, 444, 1000) for done in (0, 1))
-    yield from (moment(EXECUTION, 111 * done + step, done) for done in range(count + 1) for step in (0, 1, 8))
-
-
-@pytest.mark.parametrize("size", [128, 256])
-def test_what_is_kept_looks_as_if_drawn_anew(size: int) -> None:
+def test_frame_shows_cameras_checkpoints_and_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
-    for name in task_names()[::12]:
-        images = {camera: rng.integers(0, 256, (size, size, 3), np.uint8) for camera in ("image", "wrist_image")}
-        for episode in moments(name):
-            np.testing.assert_array_equal(annotate(images, episode), drawn_anew(images, episode))
+    images = {camera: rng.integers(0, 256, (128, 128, 3), np.uint8) for camera in ("image", "wrist_image")}
+    first, second = ([*range(MARGIN, MARGIN + 20)], [*range(MARGIN + 26, MARGIN + 46)])
+    operations = [checkpoint.operation for checkpoint in get_task(STOVE).checkpoints]
+    filled = []
+    for done in range(3):
+        found = annotate(images, moment(STOVE, done=done))  # type: ignore[arg-type]
+        assert found.shape == (BAND + 128, 256, 3)
+        np.testing.assert_array_equal(found[BAND:], np.hstack(list(images.values())))
+        for operation, place in zip(operations, (first, second), strict=True):
+            assert has_colour(found[34:55, place], OPERATION_COLOURS[operation])
+        filled.append(
+            [
+                bool((found[52, place[4]] == OPERATION_COLOURS[op]).all())
+                for op, place in zip(operations, (first, second), strict=True)
+            ]
+        )
+    assert filled == [[False, False], [True, False], [True, True]]
+    prompt = annotate(images, moment(STOVE, PROMPT, 9, done=1))  # type: ignore[arg-type]
+    assert not (prompt[52, first[4]] == OPERATION_COLOURS[operations[0]]).all(), "no checkpoint is done in a prompt"
+    assert has_colour(prompt, (204, 121, 167))
+    assert [Episode.subgoal(moment(STOVE, done=k)) for k in range(3)] == [  # type: ignore[arg-type]
+        "switch the stove on",
+        *["switch the stove off again"] * 2,
+    ]
 
 
-def test_every_clock_is_the_one_drawn() -> None:
-    (first, *_), images = list(moments(task_names()[0])), {"image": np.zeros((2, 512, 3), np.uint8)}
-    for phase, last in ((PROMPT, 1000), (EXECUTION, 1200)):
-        for step in range(0, last + 1, 13):
-            episode = SimpleNamespace(**{**vars(first), "phase": phase, "step_index": step, "exec_steps": step})
-            np.testing.assert_array_equal(annotate(images, episode), drawn_anew(images, episode))
-
-
-def test_what_does_not_change_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cached_text_equals_drawn_text_and_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = {"image": np.zeros((2, 512, 3), np.uint8)}
+    moments = [
+        moment(name, phase, step, done)
+        for name in task_names()[::12]
+        for phase in (PROMPT, EXECUTION)
+        for step in (0, 9, 444, 1200)
+        for done in (0, 1)
+    ]
+    cached = [annotate(images, each) for each in moments]  # type: ignore[arg-type]
+    for each, expected in zip(moments, cached, strict=True):
+        video._band.cache_clear()
+        video._piece.cache_clear()
+        np.testing.assert_array_equal(annotate(images, each), expected)  # type: ignore[arg-type]
+    assert len({picture.tobytes() for picture in cached}) > len(moments) / 2
     drawn: list[str] = []
-    draw = video.ImageDraw.ImageDraw.text
+    draw = ImageDraw.ImageDraw.text
 
     def text(self: ImageDraw.ImageDraw, place: object, words: str, *args: object, **settings: object) -> None:
         drawn.append(words)
         draw(self, place, words, *args, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(video.ImageDraw.ImageDraw, "text", text)
-    task = dataclasses.replace(get_task(task_names()[0]), language="said in this test alone")
-    (*_, last), images = list(moments(task.name)), {"image": np.zeros((2, 512, 3), np.uint8)}
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
     video._piece.cache_clear()
     for step in (123_456, 123_457, 123_456):
-        annotate(images, SimpleNamespace(**{**vars(last), "task": task, "exec_steps": step}))
-    assert drawn.count(task.language) == 1
+        annotate(images, moment(STOVE, step=step, language="drawn in this test only"))  # type: ignore[arg-type]
     assert max(Counter(drawn).values()) == 1
-    assert {"step ", "7"} < {*drawn}
+    assert {"drawn in this test only", "step ", "7"} < {*drawn}

@@ -1,4 +1,4 @@
-"""The benchmark in vla-evaluation-harness: by its runner and its servers what lerobot-eval does, bit for bit."""
+"""The benchmark in vla-evaluation-harness gives the same episodes as `lerobot eval`, bit for bit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import logging
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ Steps = dict[tuple[str, int], list[tuple[list[float], str, bool]]]
 
 @contextmanager
 def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Steps]:
-    """Write down what environments in this process do."""
+    """Record the execution steps of environments in this process."""
     found: Steps = {}
     step = MemobenchEnv.step
 
@@ -81,13 +81,13 @@ def by_lerobot(out: Path, *words: str, episodes: int = 1) -> None:
 
 
 def log_of(folder: Path) -> list[dict[str, Any]]:
-    """The log without what differs from run to run."""
+    """Return the log without time, policy and run."""
     own = {"wall_s", "policy", "run"}
     return [{key: value for key, value in record.items() if key not in own} for record in read_episodes(folder)]
 
 
-def test_both_sides_act_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The actions follow from every bit that the server is sent, prompt included."""
+def test_harness_and_lerobot_run_the_same_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server derives its actions from every bit that it receives, including the prompt."""
     monkeypatch.setattr(episodes, "PROMPT_HORIZON", 7)
     server = DigestServer(steps=3)
     with vla_eval.serve_background(server) as handle:
@@ -115,9 +115,24 @@ def test_both_sides_act_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         assert row[metric] == (None if value is None else 100 * value)
 
 
-def played(benchmark: MEMOBench, task: dict[str, Any], expert: bool = True) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Play an episode as the harness does, by the expert's actions; return the first observation and the result."""
-    benchmark._recorder = vla_eval.recording.NullEpisodeRecorder()
+@pytest.fixture
+def benchmarks() -> Iterator[Callable[..., MEMOBench]]:
+    """Return a function that makes benchmarks; they are closed after the test."""
+    made = []
+
+    def make(*tasks: Any, **params: Any) -> MEMOBench:
+        made.append(MEMOBench(*tasks, render="fast", **params))
+        made[-1]._recorder = vla_eval.recording.NullEpisodeRecorder()
+        return made[-1]
+
+    yield make
+    for benchmark in made:
+        benchmark.cleanup()
+
+
+def played(benchmark: MEMOBench, number: int = 0, expert: bool = False) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Play an episode as the harness does; return the first observation and the result."""
+    task = benchmark.get_tasks()[0] | {"episode_idx": number}
     first = benchmark.make_obs(benchmark.reset(task), task)
     running = benchmark._running()
     running.need_observation(False)
@@ -127,41 +142,33 @@ def played(benchmark: MEMOBench, task: dict[str, Any], expert: bool = True) -> t
             return first, benchmark.get_step_result(last)
 
 
-def test_the_means_of_the_metrics_are_the_reports(tmp_path: Path) -> None:
-    """A success and a failure of one task; it has no checkpoints of one operation, and so no such metric."""
-    benchmark = MEMOBench(UNPROMPTED, render="fast", log_dir=str(tmp_path))
-    (task,) = benchmark.get_tasks()
-    _, good = played(benchmark, task | {"episode_idx": 0})
-    short = MEMOBench(UNPROMPTED, render="fast", horizon=40)
-    _, poor = played(short, task | {"episode_idx": 1})
+Make = Callable[..., MEMOBench]
+
+
+def test_means_of_the_harness_equal_the_report(tmp_path: Path, benchmarks: Make) -> None:
+    """One success and one failure of a task without checkpoints of one operation."""
+    benchmark, short = benchmarks(UNPROMPTED, log_dir=str(tmp_path)), benchmarks(UNPROMPTED, horizon=40)
+    (_, good), (_, poor) = played(benchmark, 0, expert=True), played(short, 1, expert=True)
     records = [*read_episodes(tmp_path), short._running().record()]
     row = report_values(summarise(records))["tasks"][UNPROMPTED]
-    assert good["success"]
-    assert not poor["success"]
+    assert (good["success"], poor["success"], bool(poor["failure"])) == (True, False, True)
     assert 0 < row["SR"] < 100
-    keys = benchmark.get_metric_keys()
-    assert set(keys) == set(METRICS)
+    assert set(benchmark.get_metric_keys()) == set(METRICS)
     for name, metric in METRICS.items():
         found = [result[name] for result in (good, poor) if name in result]
         assert (round(100 * sum(found) / len(found), 1) if found else None) == row[metric]
     assert None in row.values()
-    assert poor["failure"]
-    benchmark.cleanup()
-    short.cleanup()
 
 
-def test_frames_in_which_a_strict_robot_idles_are_not_sent() -> None:
-    benchmark = MEMOBench(HIGHLIGHT, suite="strict", render="fast", horizon=1, seed=20_000)
-    (task,) = benchmark.get_tasks()
-    first, _ = played(benchmark, task, expert=False)
+def test_idling_frames_are_not_sent(benchmarks: Make) -> None:
+    first, _ = played(benchmarks(HIGHLIGHT, suite="strict", horizon=1, seed=20_000))
     assert first["step"].tolist() == [NO_CLOCK]
-    assert len(first["video_history"]) == len(first["state_history"]) == 66, "the highlight alone"
+    assert len(first["video_history"]) == len(first["state_history"]) == 66, "the highlight only"
     assert not np.array_equal(first["video_history"][30], first["images"]["agentview"])
-    benchmark.cleanup()
 
 
 @pytest.mark.slow
-def test_controls_are_run_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_harness_and_lerobot_run_the_same_controls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(episodes, "PROMPT_HORIZON", 7)
     paces: dict[str, Any] = {"referent": "random", "pause_steps": 5, "speed": 0.5, "evidence": True, "horizon": 24}
     server = DigestServer(steps=3)
@@ -178,38 +185,32 @@ def test_controls_are_run_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert [record["variant"] for record in log_of(tmp_path / "run")] == [0, 1]
 
 
-def test_controls_are_the_environments(tmp_path: Path) -> None:
-    benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=25, pause_steps=5, speed=0.5, n_action_steps=2)
-    benchmark._recorder = vla_eval.recording.NullEpisodeRecorder()
+def test_controls_count_answers_and_variants(tmp_path: Path, benchmarks: Make) -> None:
+    benchmark = benchmarks(UNPROMPTED, horizon=25, pause_steps=5, speed=0.5, n_action_steps=2)
     benchmark.reset(benchmark.get_tasks()[0])
     benchmark._running().need_observation(False)
     answers = 1
     while not benchmark.step({"actions": np.zeros((2, 7))}).done:
         answers += 1
     record = benchmark._running().record()
-    assert record["steps"] == 50
-    assert record["paused_steps"] == 6, "a whole number of answers"
+    assert (record["steps"], record["paused_steps"]) == (50, 6), "a pause is a whole number of answers"
     assert answers == 28 <= benchmark.get_metadata()["max_steps"]
-    benchmark.cleanup()
     settings: dict[str, Any] = {"suite": "strict", "demonstration_prompt": False, "horizon": 1, "seed": 20_000}
-    each = MEMOBench(HIGHLIGHT, evidence=True, log_dir=str(tmp_path), **settings)
-    (task,) = each.get_tasks()
+    each = benchmarks(HIGHLIGHT, evidence=True, log_dir=str(tmp_path), label="one", **settings)
     for number in range(3):
-        played(each, task | {"episode_idx": number}, expert=False)
-    each.cleanup()
+        played(each, number)
     found = [(record["episode"], record["seed"], record["variant"]) for record in read_episodes(tmp_path)]
     assert found == [(0, 20_000, 0), (1, 20_000, 1), (2, 20_001, 0)]
-    with pytest.raises(MemobenchError, match="holds episodes of another protocol"):
-        MEMOBench(HIGHLIGHT, log_dir=str(tmp_path), **settings)
+    for changes in ({"label": "one"}, {"label": "another", "evidence": True}):
+        with pytest.raises(MemobenchError, match="holds episodes of another"):
+            MEMOBench(HIGHLIGHT, log_dir=str(tmp_path), **settings, **changes)
 
 
-def test_what_is_sent() -> None:
-    benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=2, send_state=False, send_wrist_image=False, mirror=True)
-    plain = MEMOBench(UNPROMPTED, render="fast", horizon=2)
-    (task,) = benchmark.get_tasks()
-    assert task == {"name": UNPROMPTED, "suite": "temporal"}
-    first, _ = played(benchmark, task, expert=False)
-    whole, _ = played(plain, task, expert=False)
+def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
+    less = benchmarks(UNPROMPTED, horizon=1, send_state=False, send_wrist_image=False, mirror=True)
+    plain = benchmarks(UNPROMPTED, horizon=1)
+    assert less.get_tasks() == [{"name": UNPROMPTED, "suite": "temporal"}]
+    (first, _), (whole, _) = played(less), played(plain)
     assert set(first) == {"images", "task_description", "step"}
     assert set(whole) == {"images", "task_description", "states", "step"}
     assert whole["step"].tolist() == [0]
@@ -218,65 +219,52 @@ def test_what_is_sent() -> None:
     declared = plain.get_observation_spec()
     assert check_specs(plain.get_action_spec(), plain.get_action_spec(), declared, declared) == []
     assert set(declared) == {"agentview", "wrist", "language", "state"}
-    assert set(benchmark.get_observation_spec()) == {"agentview", "language"}
+    assert set(less.get_observation_spec()) == {"agentview", "language"}
     held = plain.get_hold_action({"actions": np.full((2, 7), 0.5)})["actions"]
     assert held.tolist() == [0] * 6 + [0.5]
-    for one in (benchmark, plain):
-        one.cleanup()
+    assert len(MEMOBench().get_tasks()) == 30
+    assert {task["suite"] for task in MEMOBench("object", suite="strict").get_tasks()} == {"object"}
+    assert MEMOBench(horizon=9).get_metadata()["max_steps"] == 9
 
 
-def test_chunks_are_executed_to_the_end_of_the_episode(caplog: pytest.LogCaptureFixture) -> None:
-    benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=5, n_action_steps=3)
-    (task,) = benchmark.get_tasks()
-    benchmark._recorder = vla_eval.recording.NullEpisodeRecorder()
-    benchmark.reset(task)
+def test_chunks_are_executed_up_to_the_end(benchmarks: Make, caplog: pytest.LogCaptureFixture) -> None:
+    benchmark = benchmarks(UNPROMPTED, horizon=5, n_action_steps=3)
+    benchmark.reset(benchmark.get_tasks()[0])
     last = benchmark.step({"actions": np.zeros((10, 7))})
     assert (benchmark._running().episode.exec_steps, last.done) == (3, False)
     with caplog.at_level(logging.WARNING):
         benchmark.get_step_result(last)
-    assert "max_steps ended an episode" in caplog.text
+    assert "max_steps" in caplog.text
     assert benchmark.step({"actions": np.zeros((10, 7))}).done
     assert benchmark._running().episode.exec_steps == 5
     for wrong in (np.zeros(8), np.zeros((2, 3, 7)), ["a"], np.zeros((0, 7)), None):
-        with pytest.raises(MemobenchError, match=r"answered actions of shape .*expected numbers of shape \(7,\) or"):
+        with pytest.raises(MemobenchError, match="shape"):
             benchmark.step({"actions": wrong})
-    with pytest.raises(MemobenchError, match=r"answers 2 actions at a time, fewer than the 3 .*n_action_steps to 2"):
+    with pytest.raises(MemobenchError, match="n_action_steps"):
         benchmark.step({"actions": np.zeros((2, 7))})
-    benchmark.cleanup()
 
 
 @pytest.mark.parametrize(
-    ("params", "told"),
+    ("params", "named"),
     [
         ({"tasks": "temporaly"}, "temporal"),
-        ({"suite": "strikt"}, "did you mean 'strict'"),
-        ({"history_every": 0}, "history_every is 0"),
-        ({"n_action_steps": "2"}, "n_action_steps is '2'; expected a whole number"),
-        ({"horizon": "60"}, "horizon is '60'; expected a whole number"),
-        ({"seed": "7"}, "seed is '7'; expected a whole number"),
-        ({"seed": 100_007}, "seed 100007 is of the sealed test.*memobench test-sealed"),
         ({"tasks": [31]}, "31"),
-        ({"speed": "0.5"}, "speed is '0.5'"),
-        ({"evidence": True}, "say referent=random"),
-        ({"render": "best"}, "'best'"),
+        ({"suite": "strikt"}, "suite"),
+        ({"history_every": 0}, "history_every"),
+        ({"n_action_steps": "2"}, "n_action_steps"),
+        ({"horizon": "60"}, "horizon"),
+        ({"seed": "7"}, "seed"),
+        ({"seed": 100_007}, "test-sealed"),
+        ({"obs_type": "both"}, "send_state"),
+        ({"evidence": True}, "referent"),
     ],
 )
-def test_wrong_settings_are_named(params: dict[str, Any], told: str) -> None:
-    with pytest.raises(MemobenchError, match=told):
+def test_wrong_settings_are_named(params: dict[str, Any], named: str) -> None:
+    with pytest.raises(MemobenchError, match=named):
         MEMOBench(**params)
 
 
-def test_a_folder_of_another_policy_is_refused_before_anything_runs(tmp_path: Path) -> None:
-    benchmark = MEMOBench(UNPROMPTED, render="fast", horizon=1, log_dir=str(tmp_path), label="one")
-    played(benchmark, benchmark.get_tasks()[0], expert=False)
-    benchmark.cleanup()
-    with pytest.raises(MemobenchError, match="holds episodes of another policy"):
-        MEMOBench(UNPROMPTED, render="fast", horizon=1, log_dir=str(tmp_path), label="another")
-
-
-def test_an_episode_that_cannot_be_run_is_an_error_and_is_logged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_episode_that_cannot_be_run_is_raised_and_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: Any, **__: Any) -> None:
         raise MemobenchError("no such scene")
 
@@ -289,30 +277,23 @@ def test_an_episode_that_cannot_be_run_is_an_error_and_is_logged(
     assert "no such scene" in problems[0]
 
 
-def test_tasks_by_suite() -> None:
-    assert len(MEMOBench().get_tasks()) == 30
-    strict = MEMOBench("object", suite="strict", referent="random").get_tasks()
-    assert {task["suite"] for task in strict} == {"object"}
-    assert MEMOBench(horizon=9).get_metadata()["max_steps"] == 9
-
-
-def test_without_vla_eval_one_sentence_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_vla_eval_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules.pop("lerobot_memobench.vla_eval")
     monkeypatch.setitem(sys.modules, "vla_eval.benchmarks.base", None)
-    with pytest.raises(MemobenchError, match=r"not installed here \(.*\): pip install 'vla-eval>=0\.8,<0\.9'"):
+    with pytest.raises(MemobenchError, match="pip install"):
         importlib.import_module("lerobot_memobench.vla_eval")
     sys.modules["lerobot_memobench.vla_eval"] = module
 
 
 def configuration() -> dict[str, Any]:
-    """The configuration that the guide shows."""
+    """Return the configuration in the guide."""
     text = (ROOT / "docs" / "guides" / "vla_eval.md").read_text()
     found = yaml.safe_load(text.split("```yaml\n")[1].split("```")[0])
     assert isinstance(found, dict)
     return found
 
 
-def test_the_configuration_in_the_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_configuration_in_the_guide_is_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     config = EvalConfig.from_dict(configuration()["benchmarks"][0])
     assert len(resolve_import_string(config.benchmark)(**config.params).get_tasks()) == 30
@@ -320,7 +301,7 @@ def test_the_configuration_in_the_guide(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def act(folder: Path) -> Path:
-    """Write a checkpoint of LeRobot's ACT without training, as LeRobot does."""
+    """Write an untrained checkpoint of LeRobot's ACT."""
     from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.policies import make_pre_post_processors
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -345,7 +326,7 @@ def act(folder: Path) -> Path:
 
 
 def test_act_by_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The harness's own server of LeRobot policies, asked by both sides, and the policy in lerobot-eval itself."""
+    """With the harness's server of LeRobot policies from both sides, and in the process of `lerobot eval`."""
     checkpoint = str(act(tmp_path / "act"))
     words = (f"tasks={UNPROMPTED}", "horizon=6", "env.render=fast", "batch_size=1")
     with recorded(monkeypatch) as direct:
@@ -363,8 +344,8 @@ def test_act_by_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_a_trained_memory_policy_by_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From pictures, with and without a prompt: by ``vla-eval run``, by ``dialect=vla_eval``, and in this process."""
+def test_trained_memory_policy_by_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With and without a prompt: by ``vla-eval run``, by ``dialect=vla_eval``, and in this process."""
     tasks, port = [PROMPTED, UNPROMPTED], free_port()
     script = [sys.executable, str(ROOT / "examples" / "vla_eval_server.py"), "memobench_small", "--detector", "package"]
     server = subprocess.Popen([*script, "--port", str(port), "--device", "cpu"])

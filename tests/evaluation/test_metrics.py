@@ -26,7 +26,7 @@ from lerobot_memobench.evaluation.metrics import (
 )
 from lerobot_memobench.evaluation.report_tables import pooled_sentence
 from lerobot_memobench.paper import published_rows
-from lerobot_memobench.tasks.catalogue import BOWL, get_task, task_names
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES, asks_order, classify, classify_failure
 from tests.support.logs import record
 
@@ -255,7 +255,7 @@ def test_a_horizon_below_the_protocols_is_no_failure_of_memory() -> None:
     assert classify_failure(task, [40, None], False) == "stale_memory"
     assert classify_failure(task, [40, 50], False, cut_off=True) == "execution_failure"
     assert classify_failure(task, [40, 50], True, cut_off=True) is None
-    bowl = get_task(BOWL)
+    bowl = get_task(DEMO_TASK)
     assert classify_failure(bowl, [None], False, drift=True, cut_off=True) == "reference_drift", "what is known counts"
     procedure = get_task(PROCEDURES[0])
     assert classify_failure(procedure, [None, 40], False, cut_off=True) == "wrong_order"

@@ -16,7 +16,7 @@ from lerobot_memobench.policies.checkpoint import SHIPPED
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.run.arguments import checkpoint_of
 from lerobot_memobench.run.card import encoded
-from lerobot_memobench.tasks.catalogue import BOWL, task_names
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, task_names
 from tests.support.scripts import load_script
 
 
@@ -79,14 +79,14 @@ def test_a_card_tells_how_the_demonstrations_were_made(script: ModuleType, tmp_p
 
     assert "not at hand" in card()
     (tmp_path / "data" / "meta").mkdir(parents=True)
-    request = {"tasks": [BOWL], "episodes": 3, "seed_base": 10_000, "referent": "random", "perturb": True}
+    request = {"tasks": [DEMO_TASK], "episodes": 3, "seed_base": 10_000, "referent": "random", "perturb": True}
     request |= {"images": False, "image_size": 256, "demonstration_prompt": True}
-    made = [{"task_name": BOWL, "seed": seed, "failure": None, "frames": 9} for seed in (10_000, 10_001)]
-    manifest = {"request": request, "episodes": [*made, {"task_name": BOWL, "seed": 10_002, "failure": "it fell"}]}
+    made = [{"task_name": DEMO_TASK, "seed": seed, "failure": None, "frames": 9} for seed in (10_000, 10_001)]
+    manifest = {"request": request, "episodes": [*made, {"task_name": DEMO_TASK, "seed": 10_002, "failure": "it fell"}]}
     (tmp_path / "data" / "manifest.json").write_text(json.dumps(manifest))
     assert "Trained on 2 demonstrations by the scripted expert, of 1 task;" in card()
     options = "--episodes 3 --seed-base 10000 --referent random --perturb --no-images"
-    assert f"memobench generate --tasks {BOWL} --suite published {options} " in card()
+    assert f"memobench generate --tasks {DEMO_TASK} --suite published {options} " in card()
     assert "policy.memory_stride=4 batch_size=6 steps=5 seed=1\n" in card()
     for name in ("few", "more"):
         (tmp_path / name / "meta").mkdir(parents=True)

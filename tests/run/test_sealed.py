@@ -12,11 +12,11 @@ import pytest
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.envs.acting import checkpoint_files
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.policies.lerobot_config import checkpoint_files
 from lerobot_memobench.protocol import SPLITS
 from lerobot_memobench.run.card import card_of, extended, write_card
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line

@@ -1,4 +1,4 @@
-"""Shared pieces: a small valid task to bend, and the reference data beside the checkout."""
+"""A small valid task to modify, and the published task files next to the checkout."""
 
 from __future__ import annotations
 
@@ -80,16 +80,16 @@ def write_task(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def published() -> Path:
-    """The published task folders, where the checkout has them beside it."""
+    """Return the published task folders; skip without them."""
     folder = SHARED / "upstream_tasks"
     if not folder.is_dir():
-        pytest.skip("no published task folders beside the checkout")
+        pytest.skip("no published task folders next to the checkout")
     return folder
 
 
 @pytest.fixture
 def facts() -> Path:
-    """The folder of the reference facts and tools."""
+    """Return the folder of the reference facts and tools; skip without it."""
     if not (SHARED / "spec" / "catalogue.json").is_file():
-        pytest.skip("no reference facts beside the checkout")
+        pytest.skip("no reference facts next to the checkout")
     return SHARED

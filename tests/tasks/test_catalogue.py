@@ -1,4 +1,4 @@
-"""The catalogue: 30 tasks, facts as published, texts of our own."""
+"""The catalogue: the facts of the published tasks, our own texts, selection of tasks by name and number."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from lerobot_memobench.tasks.catalogue import (
     get_task,
     load_task,
     resolve_tasks,
+    suite_of,
     task_index,
     task_names,
     task_number,
@@ -23,44 +24,40 @@ from lerobot_memobench.tasks.catalogue import (
 )
 from lerobot_memobench.tasks.formula import Then, atoms
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import MEMORY_TYPES, SUITES, Task
+from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT, SUITES, Task
 
 COMMAS = "follow_the_prompt_to_determine_the_items,_discard_the_waste_first,_then_plate_the_remaining_item"
+STOVE = "turn_on_the_stove_and_turn_it_off"
 
 
 def tasks() -> list[Task]:
     return [get_task(name) for name in task_names()]
 
 
-def everything_said(task: Task) -> list[str]:
+def texts_of(task: Task) -> list[str]:
     return [task.demo_summary, *(text for checkpoint in task.checkpoints for text in checkpoint.language)]
 
 
-def test_size_and_order() -> None:
-    assert len(task_names()) == 30
+def test_published_tasks_are_complete_and_ordered() -> None:
     assert Counter(task.memory_type for task in tasks()) == dict(zip(MEMORY_TYPES, (10, 10, 5, 5), strict=True))
-    operations = Counter("".join(task.operations for task in tasks()))
-    assert operations == {"S": 35, "U": 32, "C": 17}
+    assert Counter("".join(task.operations for task in tasks())) == {"S": 35, "U": 32, "C": 17}
     keys = [(MEMORY_TYPES.index(task.memory_type), task.name) for task in tasks()]
     assert keys == sorted(keys)
     assert [task_index(name) for name in task_names()] == list(range(30))
     assert len({c for t in tasks() for c in t.objects.values()}) == 29
     assert len({c for t in tasks() for c in t.fixtures.values()}) == 5
-
-
-def test_every_task_is_complete() -> None:
     for task in tasks():
         assert task.folder.parent.name == task.memory_type
         assert task.family != "unspecified"
         assert (task.prompt is None) == (task.memory_type in ("temporal", "spatial"))
-        assert all(text == " ".join(text.split()) and text for text in everything_said(task))
+        assert all(text == " ".join(text.split()) and text for text in texts_of(task))
         for coarse, intermediate, fine in (checkpoint.language for checkpoint in task.checkpoints):
             assert len(coarse) <= len(intermediate) + 12
             assert len(intermediate) < len(fine)
         assert get_task(task.name) is task
 
 
-def test_variants_of_the_catalogue() -> None:
+def test_variants_differ_and_start_incomplete() -> None:
     expected = {
         "put_the_butter_into_the_bowl_from_the_prompt_video": 3,
         "put_the_butter_picked_up_in_the_prompt_video_on_the_plate": 9,
@@ -69,30 +66,24 @@ def test_variants_of_the_catalogue() -> None:
         "execute_the_assembly_procedure_demonstrated_in_the_prompt_video": 2,
     }
     for task in tasks():
-        prompted = task.memory_type in ("object", "procedural")
-        assert len(task.random_variants) == expected.get(task.name, 2 if prompted else 1)
         drawn = [task.variant(k) for k in task.random_variants]
-        # What the video shows decides: no two draws share goal, checkpoints or texts.
-        assert len({variant.goal for variant in drawn}) == len(drawn)
-        assert len({tuple(c.goal for c in variant.checkpoints) for variant in drawn}) == len(drawn)
-        assert len({tuple(everything_said(variant)) for variant in drawn}) == len(drawn)
+        prompted = task.memory_type in ("object", "procedural")
+        assert len(drawn) == expected.get(task.name, 2 if prompted else 1)
+        for fact in (lambda v: v.goal, lambda v: tuple(c.goal for c in v.checkpoints), lambda v: tuple(texts_of(v))):
+            assert len({fact(variant) for variant in drawn}) == len(drawn)
+        problem = parse_bddl(task.bddl_text)
         for variant in drawn:
-            assert variant.operations == task.operations
-            assert variant.init == task.init
-            problem = parse_bddl(task.bddl_text)
-            for checkpoint in variant.checkpoints:
-                problem.resolve(checkpoint.goal, task.name)
-            problem.resolve(variant.goal, task.name)
+            assert (variant.operations, variant.init) == (task.operations, task.init)
+            for goal in (variant.goal, *(checkpoint.goal for checkpoint in variant.checkpoints)):
+                assert problem.resolve(goal, task.name) == goal
             progress = Progress(variant)
             progress.step(set(task.init).__contains__)
             assert not progress.success
-            assert not any(progress.satisfied)  # nothing is complete from the start
+            assert not any(progress.satisfied)
             if task.memory_type == "procedural":
                 if variant.goal != task.goal or task.num_variants == len(drawn):
-                    assert any(
-                        isinstance(node, Then) for node in (variant.goal, *getattr(variant.goal, "children", ()))
-                    )
-                # The goal asks for the checkpoints' atoms in the checkpoints' order.
+                    parts = (variant.goal, *getattr(variant.goal, "children", ()))
+                    assert any(isinstance(part, Then) for part in parts)
                 wanted = [atom for checkpoint in variant.checkpoints for atom in atoms(checkpoint.goal)]
                 assert list(atoms(variant.goal)) == wanted
             if variant.prompt is not None and variant.prompt.target is not None:
@@ -100,8 +91,8 @@ def test_variants_of_the_catalogue() -> None:
                 assert variant.prompt.target in named
 
 
-def test_sides_are_the_cameras() -> None:
-    """The third-person camera looks along -x, so +y is right in its image and in our texts."""
+def test_left_and_right_are_those_of_the_camera() -> None:
+    """The third-person camera looks along -x, so +y is on the right."""
     for name in (
         "put_the_butter_into_the_bowl_from_the_prompt_video",
         "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate",
@@ -113,55 +104,62 @@ def test_sides_are_the_cameras() -> None:
             moved = variant.prompt.target if variant.prompt else None
             moved = moved or next(atoms(variant.checkpoints[0].goal)).args[0]
             y = sum(place[moved][1::2]) / 2
-            said = variant.checkpoints[0].language[1].split(" into ")[0 if "stack" in name else -1]
+            text = variant.checkpoints[0].language[1].split(" into ")[0 if "stack" in name else -1]
             side = "right" if y > 0.1 else "left" if y < -0.1 else None
-            assert [word for word in ("left", "right") if word in said] == ([side] if side else [])
+            assert [word for word in ("left", "right") if word in text] == ([side] if side else [])
 
 
-def test_names_and_resolution() -> None:
-    stove = "turn_on_the_stove_and_turn_it_off"
+def test_tasks_are_selected_by_type_name_number_and_range() -> None:
     assert resolve_tasks("all") == task_names()
     assert resolve_tasks("spatial") == task_names("spatial") == task_names(["spatial"])
     assert task_names(["object", "temporal"]) == task_names("temporal") + task_names("object")
-    assert resolve_tasks(f" {stove} , object,{stove}") == [stove, *task_names("object")]
-    assert resolve_tasks(f"{stove},{COMMAS},temporal")[:2] == [stove, COMMAS]
+    assert resolve_tasks(f" {STOVE} , object,{STOVE}") == [STOVE, *task_names("object")]
+    assert resolve_tasks(f"{STOVE},{COMMAS},temporal")[:2] == [STOVE, COMMAS]
     assert resolve_tasks([COMMAS, "object"]) == [COMMAS, *task_names("object")]
     for suite in SUITES:
         names = task_names(suite=suite)
         assert [task_number(name) for name in names] == list(range(1, 31))
+        assert resolve_tasks("all", suite) == names
         assert resolve_tasks("30, 1-3,object,2", suite) == [names[29], *names[:3], *task_names("object", suite)]
+    assert task_names(suite=None) == task_names() + task_names(suite=STRICT)
+    assert (suite_of(STOVE), suite_of("another")) == ("published", None)
 
 
 @pytest.mark.parametrize(
-    ("spec", "fragment"),
+    ("spec", "suite", "named"),
     [
-        (" ", "nothing"),
-        ("12,,3", "'12,,3'"),
-        ("object,", "'object,'"),
-        ("4-3", "4-3 among the tasks; the range is reversed"),
-        ("object,3-", "3- among the tasks; this is not a complete range"),
-        ("1-3-5", "not a complete range"),
-        ("3 - 7", "not a complete range"),
-        ("0", "numbered 1 to 30"),
-        ("28-31", "numbered 1 to 30"),
-        ("object, all", "either 'all' or the others"),
-        (["12", "all"], "either 'all' or the others"),
-        ("spatial,temporl", "did you mean 'temporal'"),
+        (" ", "published", "tasks"),
+        ("12,,3", "published", "'12,,3'"),
+        ("object,", "published", "'object,'"),
+        ("4-3", "published", "reversed"),
+        ("object,3-", "published", "3-"),
+        ("1-3-5", "published", "1-3-5"),
+        ("3 - 7", "published", "3 - 7"),
+        ("0", "published", "1 to 30"),
+        ("28-31", "published", "1 to 30"),
+        ("object, all", "published", "'all'"),
+        (["12", "all"], "published", "'all'"),
+        ("spatial,temporl", "published", "'temporal'"),
+        ("turn_on_the_stove_and_turn_of", "published", f"'{STOVE}'"),
+        (task_names(suite=STRICT)[3], "published", "suite=strict"),
+        (f"object,{STOVE}", STRICT, "suite=published"),
+        ("all", "strikt", "'strict'"),
     ],
 )
-def test_an_invalid_list_of_tasks_names_the_entry(spec: str | list[str], fragment: str) -> None:
+def test_invalid_selection_names_the_entry(spec: str | list[str], suite: str, named: str) -> None:
     with pytest.raises(MemobenchError) as error:
-        resolve_tasks(spec)
-    assert fragment in str(error.value)
+        resolve_tasks(spec, suite)
+    assert named in str(error.value)
 
 
-def test_unknown_names_suggest_the_nearest() -> None:
-    with pytest.raises(MemobenchError, match="did you mean 'turn_on_the_stove_and_turn_it_off'"):
-        get_task("turn_on_the_stove_and_turn_of")
-    with pytest.raises(MemobenchError, match="'episodic'"):
-        task_names("episodic")
-    with pytest.raises(MemobenchError, match="'nothing'"):
-        task_index("nothing")
+def test_unknown_names_are_errors() -> None:
+    for call, named in (
+        (lambda: get_task("turn_on_the_stove_and_turn_of"), STOVE),
+        (lambda: task_names("episodic"), "'episodic'"),
+        (lambda: task_index("unknown"), "'unknown'"),
+    ):
+        with pytest.raises(MemobenchError, match=named):
+            call()
 
 
 def test_record_is_json() -> None:
@@ -170,13 +168,15 @@ def test_record_is_json() -> None:
     assert record["goal"] == ["then", ["on", "milk_1", "bowl_1"], ["on", "butter_1", "plate_1"]]
     assert record["objects"]["akita_black_bowl"] == ["bowl_1"]
     assert [checkpoint["operation"] for checkpoint in record["checkpoints"]] == ["S", "U"]
-    assert record["state_dim"] == 71
+    assert (record["state_dim"], "suite" in record) == (71, False)
+    strict = get_task(task_names(suite=STRICT)[0])
+    assert task_record(strict, 71).items() >= {"suite": STRICT, "derived_from": strict.derived_from}.items()
 
 
-# --- against the reference facts beside the checkout ---
+# --- the reference facts next to the checkout ---
 
 
-def test_facts_are_the_published_ones(facts: Path) -> None:
+def test_facts_equal_the_published_ones(facts: Path) -> None:
     published = {task["name"]: task for task in json.loads((facts / "spec" / "catalogue.json").read_text())}
     records = [task_record(task, published[task.name]["state_dim"]) for task in tasks()]
     check = subprocess.run(
@@ -190,30 +190,21 @@ def test_facts_are_the_published_ones(facts: Path) -> None:
     for task in tasks():
         fact = published[task.name]
         assert task.family == fact["family"]
-        assert ["".join(c.operations_by_level) for c in task.checkpoints] == [
-            c["operation_by_level"] for c in fact["checkpoints"]
-        ]
+        operations = [checkpoint["operation_by_level"] for checkpoint in fact["checkpoints"]]
+        assert ["".join(c.operations_by_level) for c in task.checkpoints] == operations
 
 
-def test_scenes_are_the_published_ones(published: Path) -> None:
+def test_scenes_equal_the_published_ones_and_texts_do_not(published: Path) -> None:
+    def plain(text: str) -> str:
+        return " ".join("".join(c for c in text.lower() if c.isalnum() or c == " ").split())
+
+    others = {t.name: load_task(published / t.memory_type / t.name, require_metadata=False) for t in tasks()}
+    theirs = {plain(text) for other in others.values() for text in texts_of(other)}
     for task in tasks():
-        other = load_task(published / task.memory_type / task.name, require_metadata=False)
+        other = others[task.name]
         for key in ("language", "objects", "fixtures", "regions", "init", "objects_of_interest", "goal"):
             assert getattr(task, key) == getattr(other, key), (task.name, key)
         if other.checkpoints:
             assert [c.goal for c in task.checkpoints] == [c.goal for c in other.checkpoints]
-
-
-def test_texts_are_our_own(published: Path) -> None:
-    def plain(text: str) -> str:
-        return " ".join("".join(c for c in text.lower() if c.isalnum() or c == " ").split())
-
-    theirs = {
-        plain(text)
-        for folder in published.glob("*/*")
-        for text in everything_said(load_task(folder, require_metadata=False))
-    }
-    for task in tasks():
-        for k in range(task.num_variants):
-            for text in everything_said(task.variant(k)):
-                assert plain(text) not in theirs, (task.name, text)
+        for text in (text for k in range(task.num_variants) for text in texts_of(task.variant(k))):
+            assert plain(text) not in theirs, (task.name, text)

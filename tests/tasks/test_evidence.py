@@ -45,8 +45,8 @@ def test_each_scene_goes_through_all_variants_that_may_be_drawn() -> None:
 def test_chance_is_that_of_the_best_answer_without_the_past() -> None:
     assert chance(get_task(PUBLISHED_MILK)) == 1 / 2
     assert chance(get_task(TOMATO)) == 1 / 3
-    assert chance(get_task(TWO)) == 1 / 3, "where the other thing lies changes nothing"
-    assert chance(get_task(STOVE)) is None, "the instruction says how often"
+    assert chance(get_task(TWO)) == 1 / 3, "the place of the other object is irrelevant"
+    assert chance(get_task(STOVE)) is None, "the instruction contains the count"
     tasks = [get_task(name) for suite in SUITES for name in task_names(suite=suite)]
     rates = [rate for task in tasks if task.num_variants > 1 and (rate := chance(task)) is not None]
     assert len(rates) == 30

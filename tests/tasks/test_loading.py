@@ -1,8 +1,11 @@
-"""Loading task folders, ours and published ones."""
+"""Task folders: BDDL and metadata files, inferred values, malformed files, the published folders."""
 
 from __future__ import annotations
 
 import json
+import pickle
+import random
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,141 +13,398 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.catalogue import load_task
-from lerobot_memobench.tasks.formula import And, Atom
-from lerobot_memobench.tasks.task import MEMORY_TYPES, Prompt
+from lerobot_memobench.tasks.bddl import Region, parse_bddl
+from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task, load_task, task_names
+from lerobot_memobench.tasks.formula import And, Atom, Not, format_formula
+from lerobot_memobench.tasks.memory_text import memory_text, with_memory
+from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.task import Prompt
+from tests.support.scripts import load_script
 
+format_bddl = load_script("strict_suite/bddl_text").format_bddl
 Write = Callable[..., Path]
+DRAWER = "box_1_top_region"
+LANGUAGE, GOAL = "put the cup, the red one, into the drawer", f"(And (In cup_1 {DRAWER}) (Not (Open {DRAWER})))"
+
+# --- BDDL ---
 
 
-def test_loads_a_folder_in_the_published_format(write_task: Write) -> None:
-    task = load_task(write_task(parent="temporal"))
+def test_bddl_is_parsed_in_any_case_and_written_again(bddl: str) -> None:
+    problem = parse_bddl(bddl)
+    assert (problem.name, problem.domain, problem.language) == ("KITCHEN", "robosuite", LANGUAGE)
+    assert problem.objects == {"cup_1": "cup", "cup_2": "cup", "lid,v1.2": "lid"}
+    assert list(problem.fixtures) == ["table_1", "box_1"]
+    place = Region("cup_place", "table_1", ((0.0, 0.0, 0.1, 0.1), (0.2, 0.2, 0.3, 0.3)), (0.0, 1.5))
+    assert problem.regions["table_1_cup_place"] == place
+    assert problem.regions[DRAWER] == Region("top_region", "box_1")
+    assert problem.objects_of_interest == ("cup_1", "box_1")
+    assert problem.init[3:] == (Atom("on", ("lid,v1.2", "cup_2")), Atom("close", (DRAWER,)))
+    assert problem.goal == And((Atom("in", ("cup_1", DRAWER)), Not(Atom("open", (DRAWER,)))))
+    words = "define|problem|:domain|:regions|:target|:ranges|:goal|And|In|Not|On"
+    shouted = re.sub(rf"\(({words})\b", lambda found: found[0].upper(), bddl).replace("(IN cup_1", "(IN CUP_1")
+    assert parse_bddl(shouted) == problem
+    assert parse_bddl(format_bddl(problem, "a comment (with parentheses)")) == problem
+    for name in task_names(suite=None):
+        text = get_task(name).bddl_text
+        assert parse_bddl(format_bddl(parse_bddl(text))) == parse_bddl(text)
+
+
+def test_language_is_free_text_and_some_sections_are_optional(bddl: str) -> None:
+    text = "put  the\n  Cup (red) - not: the other one, please"
+    problem = parse_bddl(bddl.replace(LANGUAGE, text).replace("(:obj_of_interest cup_1 box_1)", ""))
+    assert problem.language == "put the Cup (red) - not: the other one, please"
+    assert parse_bddl(bddl.replace("(:domain robosuite)", "")).domain == ""
+    assert problem.objects_of_interest == ()
+
+
+def test_unused_region_on_an_undeclared_target_is_accepted(bddl: str) -> None:
+    """LIBERO's ten goal tasks declare such a region of a drainer."""
+    libero = bddl.replace("(top_region", "(right_region (:target Drainer_1))\n    (top_region")
+    problem = parse_bddl(libero)
+    assert problem.regions == parse_bddl(bddl).regions
+    used = libero.replace(f"(Not (Open {DRAWER}))", "(On cup_1 drainer_1_right_region)")
+    with pytest.raises(MemobenchError, match=r"^a\.bddl, line 7: .*'Drainer_1'"):
+        parse_bddl(used, "a.bddl")
+    with pytest.raises(MemobenchError, match="right_region"):
+        problem.resolve(Atom("on", ("cup_1", "drainer_1_right_region")), "a.json")
+
+
+MALFORMED_BDDL = [
+    # (text, replacement, line of the error, word in the message)
+    ("(define", "(definition", 1, "problem"),
+    ("(problem KITCHEN)", "(problem)", 1, "problem"),
+    ("(problem KITCHEN)", "problem KITCHEN", 1, "problem"),
+    ("(:domain robosuite)", "(:domain)", 2, ":domain"),
+    ("(:domain robosuite)", "(:domian robosuite)", 2, ":domian"),
+    ("(:domain robosuite)", "(:domain robosuite) (:domain robosuite)", 2, "second :domain"),
+    ("(:domain robosuite)", "()", 2, "empty list"),
+    (LANGUAGE, "", 3, ":language"),
+    ("(cup_place (:target table_1)", "(cup_place", 5, ":target"),
+    ("(cup_place (:target table_1)", "(cup_place (:target tabel_1)", 5, "'table_1'"),
+    ("(cup_place (:target table_1)", "(cup_place (:target table_1 box_1)", 5, ":target"),
+    ("(cup_place (:target table_1)", "(cup_place (:target table_1) (:target table_1)", 5, "second :target"),
+    ("(:yaw_rotation ((0.0 1.5)))", "(:yaw ((0.0 1.5)))", 5, ":yaw"),
+    ("(:yaw_rotation ((0.0 1.5)))", "(:yaw_rotation ((1.5 0.0)))", 5, "low <= high"),
+    ("(:yaw_rotation ((0.0 1.5)))", "(:yaw_rotation ((0.0 1.5) (0.0 1.0)))", 5, "yaw"),
+    ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 0.0))", 6, "value"),
+    ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 -0.2 0.0))", 6, "x1 <= x2"),
+    ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 nan 0.0))", 6, "finite"),
+    ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 1e999 0.0))", 6, "finite"),
+    ("((-0.1 -0.1 0.0 0.0))", "()", 6, ":ranges"),
+    (" (:ranges ((-0.1 -0.1 0.0 0.0)))", "", 19, ":ranges"),
+    ("(box_place", "(cup_place", 6, "again"),
+    ("table_1 - kitchen_table", "table_1 - kitchen_table Table_1 - shelf", 10, "'Table_1'"),
+    ("lid,v1.2 - lid", "lid,v1.2 -", 15, "class"),
+    ("cup_1 cup_2 - cup", "- cup", 14, "name"),
+    ("lid,v1.2 - lid", "lid,v1.2", 15, "class"),
+    ("lid,v1.2 - lid", "lid,v1.2 (- lid)", 15, "list"),
+    ("(:obj_of_interest cup_1", "(:obj_of_interest cup_3", 17, "'cup_3'"),
+    ("    (On cup_1 table_1_cup_place)\n", "", 18, "'cup_1'"),
+    ("(On cup_1 table_1_cup_place)", "(On cup_1 table_1_cup_place) (On cup_1 cup_2)", 20, "'cup_1'"),
+    ("(On cup_2 table_1_cup_place)", "(On cup_2 lid,v1.2)", 18, "itself"),
+    ("(On cup_2 table_1_cup_place)", "(Not (On cup_2 table_1_cup_place))", 21, ":init"),
+    ("(Close box_1_top_region)", "(WasOpen box_1_top_region)", 23, ":init"),
+    ("(Close box_1_top_region)", "Close", 23, "'Close'"),
+    ("(Close box_1_top_region)", "(Close cup_1)", 23, "'cup_1'"),
+    ("(On cup_1 table_1_cup_place)", "(On table_1_cup_place cup_1)", 20, "region"),
+    ("(In cup_1 box_1_top_region)", "(In cup_1 box_1)", 25, "region"),
+    ("(In cup_1 box_1_top_region)", "(In cup_1 top_region)", 25, "'top_region'"),
+    ("(In cup_1 box_1_top_region)", "(In cup_1)", 25, "argument"),
+    ("(In cup_1 box_1_top_region)", "(Into cup_1 box_1_top_region)", 25, "'Into'"),
+    ("(In cup_1 box_1_top_region)", "(In cup_1 (top box_1))", 25, "name"),
+    ("(In cup_1 box_1_top_region)", "(In cup_1 box_1_top_region", 1, "never closed"),
+    ("(Not (Open box_1_top_region))", "(Not)", 25, "Not"),
+    ("(:goal (And", "(:goal (On cup_1 box_1) (And", 25, ":goal"),
+    ("(Not (Open box_1_top_region))", "(Not " * 5_000 + "(Open box_1)" + ")" * 5_000, 25, "nested"),
+    ("(:goal", "(:gaol", 25, ":gaol"),
+    ("(define", "(" * 50_000 + "define", 1, "never closed"),
+    ("(define", ") (define", 1, "')'"),
+]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "word"), MALFORMED_BDDL, ids=[str(k) for k in range(len(MALFORMED_BDDL))]
+)
+def test_malformed_bddl_names_file_line_and_item(bddl: str, old: str, new: str, line: int, word: str) -> None:
+    assert old in bddl
+    with pytest.raises(MemobenchError) as error:
+        parse_bddl(bddl.replace(old, new, 1), "some/file.bddl")
+    message = str(error.value)
+    assert message.startswith(f"some/file.bddl, line {line}: found ")
+    assert word in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("section", [":language", ":fixtures", ":init", ":goal"])
+def test_missing_section_is_named(bddl: str, section: str) -> None:
+    broken = re.sub(rf"  \({section}\b.*?\n(?=  \(:|\)$)", "", bddl, flags=re.DOTALL | re.MULTILINE)
+    with pytest.raises(MemobenchError, match=section):
+        parse_bddl(broken)
+
+
+# --- metadata ---
+
+
+def test_folder_in_the_published_format(write_task: Write) -> None:
+    folder = write_task(parent="temporal")
+    task = load_task(folder)
     assert (task.name, task.memory_type, task.family) == ("my_task", "temporal", "unspecified")
     assert task.operations == "SC"
     assert task.checkpoints[1].operations_by_level == ("U", "C", "U")
     assert task.checkpoints[1].language == ("d", "e", "f")
-    assert task.checkpoints[0].goal == And((Atom("wasopen", ("box_1_top_region",)),))
-    assert task.prompt is None
-    assert (task.num_variants, task.random_variants, task.demo_summary) == (1, (0,), "")
+    assert task.checkpoints[0].goal == And((Atom("wasopen", (DRAWER,)),))
+    assert (task.prompt, task.num_variants, task.random_variants, task.demo_summary) == (None, 1, (0,), "")
     assert task.variant(0) is task
+    assert task.metadata == json.loads((folder / "task_config.meta.json").read_text())
+    again = load_task(str(folder))
+    assert task == again == pickle.loads(pickle.dumps(task))  # noqa: S301
+    assert hash(task) == hash(again)
 
 
-@pytest.mark.parametrize(
-    ("language", "goal", "expected"),
-    [
-        ("put the cup away", "(In cup_1 box_1_top_region)", "spatial"),
-        ("open the drawer", "(WasOpen box_1_top_region)", "temporal"),
-        ("put the cup from the prompt video away", "(In cup_1 box_1_top_region)", "object"),
-        ("take the cup pointed out in the video", "(In cup_1 box_1_top_region)", "object"),
-        ("follow the prompt video", "(In cup_1 box_1_top_region)", "procedural"),
-        ("do the 3-step sequence shown in the prompt", "(In cup_1 box_1_top_region)", "procedural"),
-    ],
-)
-def test_memory_type_is_inferred(write_task: Write, bddl: str, language: str, goal: str, expected: str) -> None:
-    bddl = bddl.replace("put the cup, the red one, into the drawer", language)
-    bddl = bddl.replace("(And (In cup_1 box_1_top_region) (Not (Open box_1_top_region)))", goal)
-    assert load_task(write_task(bddl)).memory_type == expected
-    assert load_task(write_task(bddl, parent="spatial")).memory_type == "spatial"
+def test_keys_of_this_project(write_task: Write, metadata: dict[str, Any]) -> None:
+    metadata |= {"memory_type": "object", "family": "mine", "demo_summary": "Stow the cup.", "note": {"kept": True}}
+    metadata |= {"prompt": {"kind": "pick", "target": "cup_1"}, "timestep_exec_start_idx": [-1]}
+    task = load_task(write_task(metadata=metadata, parent="spatial"))
+    assert (task.memory_type, task.family, task.demo_summary) == ("object", "mine", "Stow the cup.")
+    assert task.prompt == Prompt("pick", "cup_1")
+    assert task.metadata["note"] == {"kept": True}
+    metadata["prompt"] = None
+    assert load_task(write_task(metadata=metadata)).prompt is None
+    strict = {"suite": "strict", "derived_from": "a_task", "drawn": True, "spoilt_as": "miscount"}
+    task = load_task(write_task(metadata=metadata | strict))
+    assert (task.suite, task.derived_from, task.drawn, task.spoilt_as) == tuple(strict.values())
 
 
-@pytest.mark.parametrize(
-    ("language", "kind"),
-    [
-        ("stow the cup picked up in the prompt video", "pick"),
-        ("stow the cup pointed out in the prompt video", "point"),
-        ("stow the cup from the place highlighted in the prompt video", "highlight"),
-        ("stow the cup from the prompt video", "routine"),
-    ],
-)
-def test_prompt_is_inferred(write_task: Write, bddl: str, language: str, kind: str) -> None:
-    bddl = bddl.replace("put the cup, the red one, into the drawer", language)
-    assert load_task(write_task(bddl, parent="object")).prompt == Prompt(kind, "cup_1")  # type: ignore[arg-type]
-    assert load_task(write_task(bddl, parent="temporal")).prompt is None
-    if kind == "routine":
-        assert load_task(write_task(bddl, parent="procedural")).prompt == Prompt("routine", None)
+def test_variants_replace_goals_texts_and_prompt(write_task: Write, metadata: dict[str, Any]) -> None:
+    metadata["prompt"] = {"kind": "pick", "target": "cup_1"}
+    texts = [["g", "h", "i"], ["j", "k", "l"]]
+    swap = {"cup_1": "cup_2", "cup_2": "cup_1"}
+    metadata["variants"] = [
+        {"substitute": swap, "memory": texts, "demo_summary": "The other cup."},
+        {"order": [1, 0], "goal": {"then": [["open", DRAWER], ["close", DRAWER]]}, "memory": texts},
+        {"subtask_goals": [["open", DRAWER], ["on", "cup_2", "cup_1"]], "memory": texts, "language": "other"},
+    ]
+    task = load_task(write_task(metadata=metadata))
+    first, second, third = (task.variant(k) for k in (1, 2, 3))
+    assert (task.num_variants, task.random_variants) == (4, (0, 1, 2, 3))
+    assert format_formula(first.goal) == f"(And (In cup_2 {DRAWER}) (Not (Open {DRAWER})))"
+    assert first.checkpoints[1].goal == And((Atom("in", ("cup_2", DRAWER)),))
+    assert first.checkpoints[1].language == ("j", "k", "l")
+    assert (first.prompt, first.demo_summary) == (Prompt("pick", "cup_2"), "The other cup.")
+    assert (first.name, first.language, first.init, first.variant_index) == (task.name, task.language, task.init, 1)
+    assert first != task
+    assert first.variant(0) is task
+    assert first.variant(2) == second
+    assert [each.goal for each in second.checkpoints] == [each.goal for each in reversed(task.checkpoints)]
+    assert second.operations == task.operations, "labels belong to positions"
+    assert format_formula(second.goal) == f"(Then (Open {DRAWER}) (Close {DRAWER}))"
+    assert third.checkpoints[1].goal == Atom("on", ("cup_2", "cup_1"))
+    assert (third.goal, third.prompt, third.language) == (task.goal, task.prompt, "other")
+    for k in (-1, 4):
+        with pytest.raises(MemobenchError, match="0 to 3"):
+            task.variant(k)
+    metadata["variants"][1]["replaces_published"] = True
+    assert load_task(write_task(metadata=metadata)).random_variants == (1, 2, 3)
 
 
-def test_referent_is_the_object_that_has_siblings(write_task: Write, bddl: str, metadata: dict[str, Any]) -> None:
-    metadata["subtask_goals"][0] = ["on", "lid,v1.2", "cup_2"]
-    prompt = load_task(write_task(bddl, metadata, parent="object")).prompt
-    assert prompt == Prompt("routine", "cup_2")
+MALFORMED_METADATA: list[tuple[dict[str, Any], str]] = [
+    *(({key: None}, key) for key in ("memory", "operating_type", "subtask_goals")),
+    ({"subtask_goals": []}, "subtask_goals"),
+    ({"subtask_goals": {"and": []}}, "subtask_goals"),
+    ({"subtask_goals": [["open", "box_1"]]}, "1 entries"),
+    ({"subtask_goals": [["open", "box_1"], ["open", "box_2"]]}, "subtask_goals[1]"),
+    ({"subtask_goals": [["open", "box_1"], 5]}, "subtask_goals[1]"),
+    ({"operating_type": [[0, 0, 0]]}, "operating_type"),
+    ({"operating_type": [[0, 0, 0], [0, 0]]}, "operating_type[1]"),
+    ({"operating_type": [[0, 0, 0], [0, 0, 3]]}, "operating_type[1][2]"),
+    ({"operating_type": [[0, 0, 0], [0, 0, True]]}, "operating_type[1][2]"),
+    ({"memory": [["a", "b", "c"]]}, "memory"),
+    ({"memory": [["a", "b", "c"], ["a", "b"]]}, "memory[1]"),
+    ({"memory": [["a", "b", "c"], ["a", "b", " "]]}, "memory[1]"),
+    ({"memory": [["a", "b", "c"], ["a", "b", 3]]}, "memory[1][2]"),
+    ({"key_frame": [-1]}, "key_frame"),
+    ({"key_frame": [-1, 0.5]}, "key_frame[1]"),
+    ({"timestep_exec_start_idx": "0"}, "timestep_exec_start_idx"),
+    ({"demo_summary": ["a"]}, "demo_summary"),
+    ({"memory_type": "episodic"}, "memory_type"),
+    ({"family": 1}, "family"),
+    ({"suite": "strikt"}, "suite"),
+    ({"drawn": 1}, "drawn"),
+    ({"spoilt_as": "lost"}, "spoilt_as"),
+    ({"prompt": "pick"}, "prompt"),
+    ({"prompt": {"kind": "pick", "target": "cup_1", "x": 1}}, "prompt"),
+    ({"prompt": {"kind": "grab", "target": "cup_1"}}, "prompt.kind"),
+    ({"prompt": {"kind": "pick"}}, "prompt.target"),
+    ({"prompt": {"kind": "pick", "target": "cup_9"}}, "prompt.target"),
+    ({"prompt": {"kind": "hide"}}, "prompt.places"),
+    ({"prompt": {"kind": "hide", "places": [["cup_1", "box_1"]]}}, "prompt.places"),
+    ({"variants": {}}, "variants"),
+    ({"variants": [{}]}, "memory"),
+    ({"variants": [{"memory": []}]}, "variants[0].memory"),
+    ({"variants": [{"memory": "M", "swap": 1}]}, "variants[0]"),
+    ({"variants": [{"memory": "M", "substitute": {"cup_1": "cup_7"}}]}, "variants[0].substitute['cup_1']"),
+    ({"variants": [{"memory": "M", "substitute": {"cup_1": DRAWER}}]}, "variants[0].substitute"),
+    ({"variants": [{"memory": "M", "order": [0, 0]}]}, "variants[0].order"),
+    ({"variants": [{"memory": "M", "goal": ["open", "nowhere"]}]}, "variants[0].goal"),
+    ({"variants": [{"memory": "M", "subtask_goals": []}]}, "variants[0].subtask_goals"),
+    ({"variants": [{"memory": "M", "replaces_published": 1}]}, "variants[0].replaces_published"),
+]
 
 
-# --- missing or malformed files ---
-
-
-def test_missing_metadata_names_file_and_content(write_task: Write, bddl: str) -> None:
-    folder = write_task(bddl, None)
+@pytest.mark.parametrize(("change", "key"), MALFORMED_METADATA, ids=map(str, range(len(MALFORMED_METADATA))))
+def test_malformed_metadata_names_file_and_key(
+    write_task: Write, metadata: dict[str, Any], change: dict[str, Any], key: str
+) -> None:
+    for variant in change["variants"] if isinstance(change.get("variants"), list) else []:
+        if variant.get("memory") == "M":
+            variant["memory"] = metadata["memory"]
+    found = {name: value for name, value in (metadata | change).items() if value is not None}
+    folder = write_task(metadata=found)
     with pytest.raises(MemobenchError) as error:
         load_task(folder)
-    for words in (
-        str(folder / "task_config.meta.json"),
-        "missing",
-        "memory",
-        "operating_type",
-        "subtask_goals",
-    ):
-        assert words in str(error.value)
+    message = str(error.value)
+    assert message.startswith(str(folder / "task_config.meta.json"))
+    assert key in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("text", ["", '{"memory": [\n}', "[]", "null", "[" * 100_000, '{"a": ' + "9" * 5000 + "}"])
+def test_metadata_that_is_no_json_object_names_its_file(write_task: Write, text: str) -> None:
+    with pytest.raises(MemobenchError, match=r"task_config\.meta\.json"):
+        load_task(write_task(metadata=text))
+
+
+def test_missing_and_unreadable_files_are_named(write_task: Write, bddl: str, tmp_path: Path) -> None:
+    folder = write_task(bddl, None)
+    with pytest.raises(MemobenchError, match=r"task_config\.meta\.json is missing.*subtask_goals"):
+        load_task(folder)
     task = load_task(folder, require_metadata=False)
     assert (task.checkpoints, task.operations, task.metadata) == ((), "", {})
-    assert load_task(write_task(), require_metadata=False).operations == "SC"
-
-
-def test_missing_folder_and_bddl(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="not a folder"):
         load_task(tmp_path / "nowhere")
-    with pytest.raises(MemobenchError, match=r"task_config\.bddl is missing"):
+    with pytest.raises(MemobenchError, match=r"task_config\.bddl"):
         load_task(tmp_path)
     (tmp_path / "task_config.bddl").mkdir()
-    with pytest.raises(MemobenchError, match="cannot be read"):
+    with pytest.raises(MemobenchError, match=r"task_config\.bddl"):
         load_task(tmp_path)
-
-
-def test_bytes_that_are_no_text(write_task: Write) -> None:
-    folder = write_task()
     (folder / "task_config.bddl").write_bytes(b"(define \xff")
     with pytest.raises(MemobenchError, match="offset 8"):
         load_task(folder)
 
 
-# --- the published folders ---
+# --- values that the published format lacks ---
 
 
-def test_every_published_folder_loads(published: Path) -> None:
+@pytest.mark.parametrize(
+    ("language", "goal", "memory_type", "prompt"),
+    [
+        ("put the cup away", f"(In cup_1 {DRAWER})", "spatial", None),
+        ("open the drawer", f"(WasOpen {DRAWER})", "temporal", None),
+        ("stow the cup from the prompt video", f"(In cup_1 {DRAWER})", "object", Prompt("routine", "cup_1")),
+        ("stow the cup picked up in the video", f"(In cup_1 {DRAWER})", "object", Prompt("pick", "cup_1")),
+        ("stow the cup pointed out in the video", f"(In cup_1 {DRAWER})", "object", Prompt("point", "cup_1")),
+        ("stow the cup highlighted in the video", f"(In cup_1 {DRAWER})", "object", Prompt("highlight", "cup_1")),
+        ("follow the prompt video", f"(In cup_1 {DRAWER})", "procedural", Prompt("routine")),
+        ("do the 3-step sequence shown in the prompt", f"(In cup_1 {DRAWER})", "procedural", Prompt("routine")),
+    ],
+)
+def test_memory_type_and_prompt_are_inferred(
+    write_task: Write, bddl: str, language: str, goal: str, memory_type: str, prompt: Prompt | None
+) -> None:
+    task = load_task(write_task(bddl.replace(LANGUAGE, language).replace(GOAL, goal)))
+    assert (task.memory_type, task.prompt) == (memory_type, prompt)
+    assert load_task(write_task(bddl.replace(LANGUAGE, language), parent="spatial")).memory_type == "spatial"
+
+
+def test_inferred_referent_is_the_object_with_siblings(write_task: Write, metadata: dict[str, Any]) -> None:
+    metadata["subtask_goals"][0] = ["on", "lid,v1.2", "cup_2"]
+    assert load_task(write_task(metadata=metadata, parent="object")).prompt == Prompt("routine", "cup_2")
+
+
+def test_published_folders_load_wherever_they_are(published: Path, tmp_path: Path) -> None:
     folders = sorted(path for path in published.glob("*/*") if path.is_dir())
     assert len(folders) == 30
-    lacking = []
     for folder in folders:
-        if not (folder / "task_config.meta.json").exists():
-            lacking.append(folder.name)
-            with pytest.raises(MemobenchError, match=r"task_config\.meta\.json is missing"):
-                load_task(folder)
-        task = load_task(folder, require_metadata=False)
-        assert task.memory_type == folder.parent.name
-        assert (task.prompt is None) == (task.memory_type in ("temporal", "spatial"))
-        assert task.num_variants == 1
-    assert lacking == ["turn_on_the_stove_and_turn_it_off_near_the_shelf"]
-
-
-def test_published_folders_elsewhere_get_the_same_memory_type(published: Path, tmp_path: Path) -> None:
-    for folder in published.glob("*/*"):
-        if (folder / "task_config.meta.json").is_file():
-            copy = tmp_path / "x" / folder.name
-            copy.mkdir(parents=True)
+        complete = (folder / "task_config.meta.json").exists()
+        assert complete == (folder.name != "turn_on_the_stove_and_turn_it_off_near_the_shelf")
+        task = load_task(folder, require_metadata=complete)
+        assert (task.memory_type, task.num_variants) == (folder.parent.name, 1)
+        if task.prompt is None:
+            assert task.memory_type in ("temporal", "spatial")
+        else:
+            assert task.prompt == get_task(folder.name).prompt
+        if complete:
+            elsewhere = tmp_path / "x" / folder.name
+            elsewhere.mkdir(parents=True)
             for file in folder.iterdir():
-                (copy / file.name).write_bytes(file.read_bytes())
-            assert load_task(copy).memory_type == folder.parent.name
-            assert folder.parent.name in MEMORY_TYPES
+                (elsewhere / file.name).write_bytes(file.read_bytes())
+            assert load_task(elsewhere).memory_type == folder.parent.name
 
 
-def test_inferred_prompts_equal_the_catalogues(published: Path) -> None:
-    from lerobot_memobench.tasks.catalogue import get_task
+# --- damaged files ---
 
-    for folder in published.glob("*/*"):
-        if folder.parent.name in ("object", "procedural"):
-            assert load_task(folder).prompt == get_task(folder.name).prompt
+PIECES = [
+    *'()[]{}",:;- \n\t\x00é😀',
+    *("0", "-1", "nan", "1e999", "(And)", "(Not", ":goal", "- -", "null", "true", "[]", "{}"),
+]
 
 
-def test_metadata_is_kept_as_read(write_task: Write) -> None:
-    folder = write_task()
-    assert load_task(folder).metadata == json.loads((folder / "task_config.meta.json").read_text())
+def mutate(text: str, rng: random.Random) -> str:
+    """Return a text with one to four random edits."""
+    for _ in range(rng.randint(1, 4)):
+        start = rng.randrange(len(text) + 1)
+        end = min(len(text), start + rng.choice([0, 1, 1, 2, 5, 20, 200]))
+        before, part, after = text[:start], text[start:end], text[end:]
+        edits = (before + after, before + rng.choice(PIECES) + part + after, before + 2 * part + after,
+                 before + part.swapcase() + after, before if rng.random() < 0.2 else text)  # fmt: skip
+        text = rng.choice(edits)
+        words = text.split(" ")
+        i, j = rng.randrange(len(words)), rng.randrange(len(words))
+        if rng.random() < 0.2:
+            words[i], words[j] = words[j], words[i]
+        text = " ".join(words)
+    return text
+
+
+@pytest.mark.parametrize(("count", "seed"), [(200, 0), pytest.param(2000, 1, marks=pytest.mark.slow)])
+def test_damaged_files_load_or_raise_one_sentence(count: int, seed: int, write_task: Write) -> None:
+    rng, refused = random.Random(seed), 0
+    for _ in range(count):
+        task = get_task(rng.choice(task_names()))
+        texts = [task.bddl_text, (task.folder / "task_config.meta.json").read_text()]
+        which = rng.randrange(2)
+        texts[which] = mutate(texts[which], rng)
+        folder = write_task(*texts)
+        message = refusal(folder)
+        refused += bool(message)
+        assert not message or (str(folder) in message and "\n" not in message)
+    assert count / 4 < refused < 0.95 * count
+
+
+def refusal(folder: Path) -> str:
+    """Load a folder and evaluate its variants; return the error message, "" without an error."""
+    try:
+        task = load_task(folder)
+        for k in range(task.num_variants):
+            Progress(task.variant(k)).step(lambda atom: True)
+    except MemobenchError as error:
+        return str(error)
+    return ""
+
+
+# --- worlds and memory texts ---
+
+
+def test_world_is_kept_by_variants() -> None:
+    published = get_task(DEMO_TASK)
+    there = published.variant(1).in_world("libero")
+    assert there.world == there.variant(0).world == there.variant(2).world == "libero"
+    assert there.variant(0) == published.in_world("libero") != published
+
+
+def test_memory_text_contains_the_completed_checkpoints() -> None:
+    task = get_task("turn_on_the_stove_and_turn_it_off")
+    texts = [checkpoint.language[1] for checkpoint in task.checkpoints]
+    assert [memory_text(task, k) for k in range(3)] == ["", texts[0], "; ".join(texts)]
+    assert with_memory("Put it back", "") == "Put it back Memory: nothing yet"
+    assert with_memory("Put it back", "took it") == "Put it back Memory: took it"

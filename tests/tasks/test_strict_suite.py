@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.bddl import parse_bddl
-from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks, suite_of, task_index, task_names, task_record
+from lerobot_memobench.tasks.catalogue import get_task, task_index, task_names
 from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.formula import (
     Atom,
@@ -53,7 +52,6 @@ def of_family(*families: str) -> list[str]:
 def test_a_strict_task_for_each_published_one() -> None:
     assert Counter(get_task(name).memory_type for name in NAMES) == dict(zip(MEMORY_TYPES, (10, 10, 5, 5), strict=True))
     assert sorted(str(get_task(name).derived_from) for name in NAMES) == sorted(task_names())
-    assert task_names(suite=None) == task_names() + NAMES
     assert len(set(task_names(suite=None))) == 60
     assert [task_index(name) for name in NAMES] == list(range(30, 60))
     families = {"counting": 5, "ordering": 5, "hidden_thing": 5, "two_hidden_things": 5}
@@ -65,7 +63,7 @@ def test_a_strict_task_for_each_published_one() -> None:
 def test_a_strict_task_uses_the_published_scene(name: str) -> None:
     task = get_task(name)
     published = get_task(str(task.derived_from))
-    assert (task.suite, suite_of(name), task.drawn) == (STRICT, STRICT, True)
+    assert (task.suite, task.drawn) == (STRICT, True)
     assert (task.objects, task.fixtures, task.init) == (published.objects, published.fixtures, published.init)
     other = {key for key, region in published.regions.items() if task.regions[key] != region}
     assert other == MOVED.get(name, set())
@@ -77,46 +75,21 @@ def test_a_strict_task_uses_the_published_scene(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_variants_are_complete_and_different(name: str) -> None:
     found = variants(name)
-    shown = [(task.language, format_formula(task.goal), task.prompt) for task in found]
-    assert len(set(shown)) == len(found)
+    assert len({(task.language, format_formula(task.goal), task.prompt) for task in found}) == len(found)
+    assert len({task.demo_summary for task in found}) == len(found) or get_task(name).family == "two_hidden_things"
     for task in found:
         assert task.operations == get_task(name).operations
-        assert task.demo_summary
         for formula in (task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)):
             assert parse_formula(to_lists(formula)) == formula
-        for texts in (checkpoint.language for checkpoint in task.checkpoints):
-            coarse, intermediate, fine = texts
-            assert all(text == " ".join(text.split()) for text in texts)
-            assert len(coarse) <= len(intermediate) + 12
-            assert len(intermediate) < len(fine)
-        said = [checkpoint.language for checkpoint in task.checkpoints]
-        assert len(set(said)) == len(said), "two checkpoints share a text"
-    assert len({task.demo_summary for task in found}) == len(found) or get_task(name).family == "two_hidden_things"
+        texts = [checkpoint.language for checkpoint in task.checkpoints]
+        assert len(set(texts)) == len(texts)
+        assert all(text == " ".join(text.split()) for levels in (*texts, (task.demo_summary,)) for text in levels)
+        assert all(len(levels[0]) <= len(levels[1]) + 12 and len(levels[1]) < len(levels[2]) for levels in texts)
 
 
-def test_the_folders_are_what_the_script_writes() -> None:
+def test_folders_equal_the_output_of_the_script() -> None:
     done = subprocess.run([sys.executable, str(SCRIPT), "--check"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_a_suite_resolves_its_own_tasks_only() -> None:
-    published = task_names()[0]
-    assert resolve_tasks("all", STRICT) == NAMES
-    assert resolve_tasks("object,temporal", STRICT) == task_names("object", STRICT) + task_names("temporal", STRICT)
-    assert resolve_tasks(NAMES[3], STRICT) == [NAMES[3]]
-    with pytest.raises(MemobenchError, match="suite=strict"):
-        resolve_tasks(NAMES[3])
-    with pytest.raises(MemobenchError, match="suite=published"):
-        resolve_tasks(f"object,{published}", STRICT)
-    with pytest.raises(MemobenchError, match=r"suite is 'strikt'.*strict"):
-        task_names(suite="strikt")
-    assert suite_of("a_task_of_mine") is None
-
-
-def test_a_record_has_suite_and_origin() -> None:
-    record = task_record(get_task(NAMES[0]), 71)
-    assert (record["suite"], record["derived_from"]) == (STRICT, get_task(NAMES[0]).derived_from)
-    assert not {"suite", "derived_from"} & set(task_record(get_task(task_names()[0]), 71))
 
 
 # --- the instruction states the drawn variant ---
@@ -138,11 +111,11 @@ def test_counting_asks_for_the_number_in_its_instruction(name: str) -> None:
 def test_the_drawers_are_requested_in_every_order() -> None:
     orders = set()
     for task in variants("check_all_three_drawers_once_each_in_the_given_order"):
-        said = tuple(sorted(DRAWERS, key=task.language.index))
+        order = tuple(sorted(DRAWERS, key=task.language.index))
         whens = [part for part in children(task.goal) if isinstance(part, When)]
         later = [next(atoms(part)).args[0] for part in whens]
-        assert list(said[1:]) == [name.split("_")[-2] for name in later]
-        orders.add(said)
+        assert list(order[1:]) == [name.split("_")[-2] for name in later]
+        orders.add(order)
     assert len(orders) == 6
 
 

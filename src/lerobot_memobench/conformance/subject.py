@@ -18,11 +18,11 @@ from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import check_clock, objects_column
-from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
+from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import SHORT_FORMS, read_arguments, split_arguments
 from lerobot_memobench.run.plan import policy_config

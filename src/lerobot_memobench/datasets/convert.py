@@ -63,7 +63,7 @@ from lerobot_memobench.io import (
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
-from lerobot_memobench.sim.worlds import KINDS
+from lerobot_memobench.sim.worlds import WORLDS
 from lerobot_memobench.tasks.task import World
 
 SUFFIXES = (".hdf5", ".h5")
@@ -324,7 +324,7 @@ def _checked_world(demo: PublishedDemo, others: World | None) -> World:
     world = world_of(demo)
     if world != (others or world):
         raise Unusable(f"its scenes are of world={world}, those before of {others}; convert each world separately")
-    KINDS[world].check()
+    WORLDS[world].check()
     return world
 
 

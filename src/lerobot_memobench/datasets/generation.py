@@ -29,7 +29,7 @@ from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
-from lerobot_memobench.sim.worlds import KINDS
+from lerobot_memobench.sim.worlds import WORLDS
 from lerobot_memobench.tasks.task import MEMOBENCH, Task, referent_text
 
 NEEDS = Needs(cores=1, memory_gb=4)
@@ -107,7 +107,7 @@ def generate(
     if finish:
         return _finish_early(plan, Path(out))
     if slurm is None:  # on Slurm, each job checks its own machine
-        KINDS[plan.world].check()
+        WORLDS[plan.world].check()
     return _run(plan, Path(out), workers, slurm=slurm, progress=progress, notify=notify)
 
 

@@ -1,1 +1,1 @@
-"""Can this machine run the benchmark, and if not, what mends it?"""
+"""Check whether this machine can run the benchmark, and suggest fixes."""

@@ -1,4 +1,4 @@
-"""Checks of a machine: installed versions, pictures, video decoding, the device of policies."""
+"""Checks of a machine: operating system, versions, plugin, rendering, video decoding, device."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from lerobot_memobench.tasks.task import LIBERO
 DISTRIBUTION = "lerobot_policy_memobench"
 PLUGIN = "LeRobot plugin"
 
-#: Packages whose versions are checked against the requirements of this project and of LeRobot.
+#: Packages checked against the requirements of this project and of LeRobot.
 SHOWN = ("lerobot", "torch", "transformers", "mujoco", "robosuite", "numpy", "gymnasium", "torchcodec", "av")
 
 EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av-dep")
-"""Parts of LeRobot that are installed with this project."""
+"""Extras of LeRobot that this project installs."""
 
 
 Status = Literal["ok", "warning", "failed"]
@@ -40,8 +40,8 @@ class Finding:
     """The result of one check.
 
     Attributes:
-        status: ``failed`` keeps the benchmark from running, ``warning`` costs speed or a part of it.
-        fix: how to repair it; empty where nothing is to be done.
+        status: ``failed`` if the benchmark cannot run, ``warning`` if a part is missing or slow.
+        fix: how to repair it; empty if no action is needed.
     """
 
     what: str
@@ -51,7 +51,7 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Run all checks; this takes some tens of seconds, most of it LeRobot's import."""
+    """Run all checks. The import of LeRobot takes most of the time, some tens of seconds."""
     return [
         system(),
         python_version(),
@@ -68,29 +68,29 @@ def examine() -> list[Finding]:
 
 
 def exit_status(findings: Sequence[Finding]) -> int:
-    """Return 1 when a needed check failed."""
+    """Return 1 if a check failed, else 0."""
     return int(any(finding.status == "failed" for finding in findings))
 
 
 def system() -> Finding:
-    """Compare the operating system with the one that is supported."""
+    """Check the operating system."""
     found = f"{platform.system()} {platform.machine()}"
     if problem := unsupported_system():
         return Finding("system", "failed", found, problem)
     if sys.platform != "linux" or platform.machine() != "x86_64":
-        return Finding("system", "warning", f"{found}; tested is Linux x86_64", "expect slower or missing packages")
+        return Finding("system", "warning", f"{found}; only Linux x86_64 is tested", "packages may be missing or slow")
     return Finding("system", "ok", found)
 
 
 def python_version() -> Finding:
-    """Compare the interpreter with the one that is supported."""
+    """Check the Python version."""
     found = ".".join(str(part) for part in sys.version_info[:3])
     good = sys.version_info[:2] == (3, 12)
     return Finding("Python", "ok" if good else "failed", found, "" if good else "use 3.12, as `make setup` does")
 
 
 def package_versions() -> Iterator[Finding]:
-    """Yield installed versions against what this project and LeRobot require."""
+    """Compare installed versions with the requirements of this project and of LeRobot."""
     requirements = supported_versions()
     for name in SHOWN:
         found = _installed(name)
@@ -104,18 +104,18 @@ def package_versions() -> Iterator[Finding]:
 
 
 def physics() -> Finding:
-    """Compare MuJoCo with that of the published figures. From 4.0 on its files are those of a second distribution."""
+    """Compare MuJoCo with the version of the published figures. From 4.0 a second distribution contains its files."""
     found = _installed("mujoco") or "not installed"
     if found.startswith("3.") and (other := _installed("mujoco-core")):
         fix = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install mujoco=={found}"
-        return Finding("physics", "warning", f"MuJoCo {found} is written over the files of {other}", fix)
+        return Finding("physics", "warning", f"MuJoCo {found} has overwritten the files of {other}", fix)
     if found != PUBLISHED_MUJOCO:
         return Finding("physics", "ok", f"MuJoCo {found}; published figures are of {PUBLISHED_MUJOCO}")
     return Finding("physics", "ok", f"MuJoCo {found}, as for published figures")
 
 
 def supported_versions() -> dict[str, SpecifierSet]:
-    """Return package -> versions that both this project and LeRobot accept here."""
+    """Return package -> versions that both this project and LeRobot accept."""
     found = {"robosuite": SpecifierSet(f"=={ROBOSUITE}")}
     for owner in ("lerobot", DISTRIBUTION):
         for requirement in _requirements(owner):
@@ -125,7 +125,7 @@ def supported_versions() -> dict[str, SpecifierSet]:
 
 
 def _requirements(owner: str) -> Iterator[Requirement]:
-    """Yield what an installed distribution asks for on this machine."""
+    """Yield the requirements of an installed distribution on this machine."""
     try:
         lines = metadata.requires(owner) or []
     except metadata.PackageNotFoundError:
@@ -137,7 +137,7 @@ def _requirements(owner: str) -> Iterator[Requirement]:
 
 
 def opencv() -> Finding:
-    """Two distributions install the same module ``cv2``; the one with windows needs desktop libraries."""
+    """Check that only the headless distribution installs the module ``cv2``; the others need desktop libraries."""
     contrib = "opencv-contrib-python"
     names = {"opencv-python", "opencv-python-headless", contrib, f"{contrib}-headless"}
     installed = {name: version for name in sorted(names) if (version := _installed(name)) is not None}
@@ -149,12 +149,12 @@ def opencv() -> Finding:
 
 
 def plugin() -> Finding:
-    """Find the plugin as LeRobot does, which only logs an import error."""
+    """Import the plugin in the way of LeRobot, which only logs an import error."""
     if DISTRIBUTION not in [distribution.metadata.get("Name") for distribution in metadata.distributions()]:
         return Finding(
             PLUGIN,
             "failed",
-            f"no installed distribution is named {DISTRIBUTION}, so LeRobot does not look for it",
+            f"no installed distribution is named {DISTRIBUTION}, so LeRobot does not load it",
             "run `make setup`, or `pip install .` in its folder; a source folder on PYTHONPATH is not enough",
         )
     try:
@@ -169,7 +169,7 @@ def plugin() -> Finding:
 
 
 def not_registered() -> list[str]:
-    """Import the plugin as LeRobot does; return what LeRobot still does not know of it."""
+    """Import the plugin in the way of LeRobot; return the types that are still not registered."""
     __import__(DISTRIBUTION)
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.envs.configs import EnvConfig
@@ -181,7 +181,7 @@ def not_registered() -> list[str]:
 
 
 def _installed(name: str) -> str | None:
-    """Return the version of a package, None where it is not installed."""
+    """Return the version of a package; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -189,31 +189,31 @@ def _installed(name: str) -> str | None:
 
 
 def golden_frame() -> Finding:
-    """Compare a frame of the benchmark with the one that ships."""
+    """Compare a rendered frame with the golden frame of the package."""
     try:
         off = difference(render_golden(), read_golden())
     except Exception as error:
         return Finding("golden frame", "failed", _in_one_line(error), "fix what failed above first")
-    detail = f"drawn on the CPU, mean difference {off:.2f} of 255 (tolerance {TOLERANCE:g})"
+    detail = f"rendered on the CPU, mean difference {off:.2f} of 255 (tolerance {TOLERANCE:g})"
     if off > TOLERANCE:
-        fix = "the pictures here are not the benchmark's; remove numba's cache folders and install the package again"
+        fix = "pictures differ from the benchmark's; remove numba's cache folders and install the package again"
         return Finding("golden frame", "failed", detail, fix)
     return Finding("golden frame", "ok", detail)
 
 
 def paper_world() -> Finding:
-    """Look for the assets of ``world=libero``; the package's own world needs none of them."""
+    """Check the assets of ``world=libero``, which the package's own world does not need."""
     what = f"world {LIBERO}"
     try:
         folder = check_assets()
     except MemobenchError as error:
         detail, _, fix = str(error).partition("; ")
-        return Finding(what, "ok", f"not here, and only world={LIBERO} needs it: {detail}", fix)
+        return Finding(what, "ok", f"not installed; only world={LIBERO} needs it: {detail}", fix)
     return Finding(what, "ok", f"LIBERO's assets in {folder}")
 
 
 def ffmpeg() -> Finding:
-    """Look for the program ffmpeg."""
+    """Check for the program ffmpeg."""
     program = shutil.which("ffmpeg")
     if program is None:
         return Finding("FFmpeg", "warning", "no ffmpeg on the PATH", "apt-get install ffmpeg")
@@ -222,15 +222,15 @@ def ffmpeg() -> Finding:
 
 
 def torchcodec() -> Finding:
-    """Load the decoder that LeRobot prefers."""
+    """Load LeRobot's preferred video decoder."""
     try:
-        import torchcodec.decoders  # noqa: F401 - it loads FFmpeg's libraries
+        import torchcodec.decoders  # noqa: F401 - loads FFmpeg's libraries
     except Exception as error:
         return Finding(
             "video decoding",
             "warning",
             f"torchcodec does not load ({_in_one_line(error)}); LeRobot falls back to PyAV, which is slower",
-            "apt-get install ffmpeg (its libraries are what torchcodec needs)",
+            "apt-get install ffmpeg (torchcodec needs its libraries)",
         )
     return Finding("video decoding", "ok", "torchcodec loads FFmpeg's libraries")
 
@@ -240,9 +240,9 @@ def _in_one_line(error: Exception) -> str:
 
 
 def device() -> Finding:
-    """Return the device of policies."""
+    """Return the device on which policies run."""
     import torch
 
     if torch.cuda.is_available():
-        return Finding("device", "ok", f"{torch.cuda.get_device_name()} ({torch.cuda.device_count()} in all)")
+        return Finding("device", "ok", f"{torch.cuda.get_device_name()} ({torch.cuda.device_count()} in total)")
     return Finding("device", "ok", f"CPU, {cores()} cores; enough for size=tiny and the expert")

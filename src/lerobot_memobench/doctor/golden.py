@@ -1,7 +1,7 @@
-"""The golden frame: a small picture of a scene that ships with the package.
+"""The golden frame: a small reference picture of a scene.
 
-Pictures are drawn to equal bits everywhere; a machine whose frame differs by more than the tolerance draws something
-else. ``python -m lerobot_memobench.doctor.golden`` writes the frame again; look at it before committing it.
+Rendering gives equal bits on every machine; a difference above the tolerance means wrong pictures.
+``python -m lerobot_memobench.doctor.golden`` writes the frame again; check it by eye before committing it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ GOLDEN_FILE = Path(__file__).with_name("golden.png")
 TASK = "turn_on_the_stove_and_turn_it_off"
 SEED = 7
 SIDE = 64
-"""Side of the golden frame, pixels: the 256 of the benchmark, averaged 4 × 4, so that edges do not count."""
+"""Side of the golden frame, pixels: 256 averaged 4 × 4, which reduces differences at edges."""
 
 TOLERANCE = 2.0
-"""Largest mean absolute difference, of 255: versions of MuJoCo settle a scene in ways that differ by far less."""
+"""Largest accepted mean absolute difference, of 255. Scenes of different MuJoCo versions differ by far less."""
 
 
 def render_golden() -> Frame:
-    """Render the golden scene here and now; return it as (64, 64, 3) uint8."""
+    """Render the golden scene, (64, 64, 3) uint8."""
     from lerobot_memobench.sim.simulation import Simulation
     from lerobot_memobench.tasks.catalogue import get_task
 
@@ -45,7 +45,7 @@ def shrink(image: Frame) -> Frame:
 
 
 def read_golden() -> Frame:
-    """Return the frame that ships with the package, (64, 64, 3) uint8."""
+    """Return the golden frame of the package, (64, 64, 3) uint8."""
     if not GOLDEN_FILE.is_file():
         raise MemobenchError(f"{GOLDEN_FILE} is missing; install the package again")
     with Image.open(GOLDEN_FILE) as image:

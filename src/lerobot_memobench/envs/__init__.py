@@ -1,8 +1,8 @@
-"""The benchmark's environment: LeRobot configuration, gymnasium environment, episode, log.
+"""The environment: LeRobot configuration, gymnasium environment, episode, log.
 
 Importing this package registers each task of both suites with gymnasium: ``gymnasium.make("memobench/<task>-v0")``
-takes the settings of `memobench_env.MemobenchEnv`, such as ``obs_type``. Commas, which gymnasium does not allow in a
-name, are left out.
+accepts the settings of `memobench_env.MemobenchEnv`, such as ``obs_type``. Ids omit the commas of a name, which
+gymnasium does not allow.
 """
 
 import gymnasium

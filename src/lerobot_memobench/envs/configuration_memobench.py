@@ -1,13 +1,13 @@
-"""LeRobot's name for the benchmark: `--env.type=memobench`.
+"""The benchmark as a LeRobot environment: ``--env.type=memobench``.
 
-Importing this module registers the environment and nothing more: no simulator, no GL. Both open in the process that
-steps the environment, at its first reset.
+Importing this module registers the environment without loading the simulator. Each process that steps an environment
+loads it at the first reset.
 """
 
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, fields, make_dataclass
 from datetime import datetime
 from functools import partial
@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from lerobot.configs import PolicyFeature
+from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
+from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 
-from lerobot_memobench.envs.acting import NOBODY, Acting
-from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, Acting, has_log
 from lerobot_memobench.envs.evaluation_file import check_protocol
 from lerobot_memobench.envs.observations import (
     METADATA,
@@ -34,10 +34,10 @@ from lerobot_memobench.envs.observations import (
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import AUTO, PIXELS, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import CONTROL_HZ
+from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
-"""Called with a task's folder, the number of rows, and whether each has a process of its own."""
+"""Called with a task's folder, the number of rows, and whether each row runs in its own process."""
 
 _TYPES = typing.get_type_hints(EnvSettings)
 # LeRobot reads `--env.<name>` into fields of the configuration itself.
@@ -53,15 +53,15 @@ _WithSettings: Any = make_dataclass(
 class MemobenchEnvConfig(_WithSettings):
     """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural.
 
-    Its fields are those of `EnvSettings`, and these:
+    The fields are those of `EnvSettings` and:
 
     Args:
-        task: LeRobot's name of ``tasks``.
-        tasks: `all`, memory types, task names, numbers and ranges of them (12, 3-7), separated by commas.
-        task_dir: a folder in the published format to run instead of the catalogue (one task, or a tree of them).
-        log_dir: folder of the episode log; a dated one below ``outputs/eval`` when left out. A folder that holds a log
-            already gets a folder ``evaluation-2`` and so on, unless ``resume`` is set.
-        resume: leave out the episodes that the log in `log_dir` holds already.
+        tasks: `all`, memory types, task names, numbers and ranges of numbers (12, 3-7), separated by commas.
+        task: LeRobot's field of every environment; sets ``tasks``.
+        task_dir: folder in the published format (one task, or a tree of tasks) that replaces the catalogue.
+        log_dir: folder of the episode log; by default a dated folder in ``outputs/eval``. In a folder with a log, the
+            log goes to a subfolder ``evaluation-2`` and so on, unless ``resume`` is set.
+        resume: skip episodes that the log in `log_dir` already contains.
     """
 
     task: str | None = None
@@ -74,36 +74,41 @@ class MemobenchEnvConfig(_WithSettings):
     features_map: dict[str, str] = field(default_factory=policy_names)
 
     def __post_init__(self) -> None:
-        if self.task is not None:  # LeRobot's field of every environment
+        if self.task is not None:
             if self.tasks != "all":
-                raise MemobenchError(f"env.task={self.task} and env.tasks={self.tasks} both choose; leave env.task out")
+                raise MemobenchError(f"env.task={self.task} and env.tasks={self.tasks} are both given; remove env.task")
             self.tasks, self.task = self.task, None
         if self.fps != CONTROL_HZ:
             raise MemobenchError(f"env.fps is {self.fps}; the control rate is {CONTROL_HZ}, leave env.fps out")
-        for name, value in asdict(self.settings).items():  # a protocol decides some of them
+        for name, value in asdict(self.settings).items():  # some follow from the protocol and the suite
             setattr(self, name, value)
         if self.task_dir is not None and self.tasks != "all":
             raise MemobenchError(
-                f"env.task_dir={self.task_dir} runs every task in that folder, and tasks={self.tasks} chooses among "
-                "the catalogue's; leave tasks= out, or name the folder of one task by env.task_dir="
+                f"env.task_dir={self.task_dir} runs every task of that folder and excludes tasks={self.tasks}; remove "
+                "tasks=, or set env.task_dir= to the folder of one task"
             )
         if self.obs_type != PIXELS:
             self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
 
     @property
     def settings(self) -> EnvSettings:
-        """The settings of every environment."""
+        """Settings of each environment."""
         return EnvSettings(**{each.name: getattr(self, each.name) for each in fields(EnvSettings)})
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """The settings by name, as `MemobenchEnv` takes them."""
+        """Settings by name, for `MemobenchEnv`."""
         return asdict(self.settings)
 
     def selected(self) -> list[tuple[str, int, Path]]:
-        """Return memory type, task id and folder of each chosen task; unknown names raise `MemobenchError`."""
+        """Return memory type, task id and folder of each chosen task; with `evidence`, of tasks with variants.
+
+        Raises:
+            MemobenchError: a task is unknown or of another suite, or no chosen task has variants for `evidence`.
+        """
         from lerobot_memobench.tasks.catalogue import find_tasks, load_task, resolve_tasks, task_folder, task_index
 
+        tasks: list[tuple[str, int, Path]]
         if self.task_dir is not None:
             loaded = [load_task(folder) for folder in find_tasks(self.task_dir)]
             for task in loaded:
@@ -113,38 +118,33 @@ class MemobenchEnvConfig(_WithSettings):
                         f"suite={task.suite} for folders of such tasks"
                     )
             tasks = [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
-            return self._with_variants(tasks)
-        folders = [task_folder(name) for name in resolve_tasks(self.tasks, self.suite)]
-        return self._with_variants([(folder.parent.name, task_index(folder.name), folder) for folder in folders])
-
-    def _with_variants(self, tasks: Sequence[tuple[str, int, Path]]) -> list[tuple[str, int, Path]]:
-        """Return the tasks that `evidence` can be asked of, all without `evidence`."""
-        from lerobot_memobench.tasks.catalogue import load_task
-
+        else:
+            folders = [task_folder(name) for name in resolve_tasks(self.tasks, self.suite)]
+            tasks = [(folder.parent.name, task_index(folder.name), folder) for folder in folders]
         if not self.evidence:
-            return [*tasks]
+            return tasks
         found = [task for task in tasks if load_task(task[2]).num_variants > 1]
         if not found:
             raise MemobenchError(
-                "env.evidence=true runs each scene with each variant, and none of the chosen tasks has any; choose "
-                "object or procedural tasks, or suite=strict"
+                "env.evidence=true runs each scene with each variant, but no chosen task has variants; choose object "
+                "or procedural tasks, or suite=strict"
             )
         return found
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """Return `{memory type: {task id: vector env}}`; nothing is simulated before an env's first reset.
+        """Return ``{memory type: {task id: vector env}}``; the first reset of an env starts its simulation.
 
-        LeRobot's own commands call this. The log then does not name the policy, and ``prompt_in=auto`` means `STEPS`.
+        LeRobot's own commands call this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
         """
-        chosen = self.selected()  # before anything is written: a wrong name leaves nothing behind
-        opened = self.opener(None, NOBODY, self.resolved_log_dir())
+        chosen = self.selected()  # raises before a folder is created
+        opened = self.opener(None, UNKNOWN_POLICY, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
             suites.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
         return suites
 
     def settings_for(self, policy: Any) -> EnvSettings:
-        """Return the settings, those completed that follow from a policy's configuration (None: not known)."""
+        """Return the settings with defaults that follow from a policy's configuration (None if unknown)."""
         settings = self.settings
         if settings.prompt_in == AUTO:
             settings = settings.changed(prompt_in=STEPS if policy is None else prompt_in(policy))
@@ -156,17 +156,17 @@ class MemobenchEnvConfig(_WithSettings):
         """Return a function that opens the vector environment of a task for a policy.
 
         Args:
-            policy: its configuration; None where it is not known.
-            by: who acts, for the log.
+            policy: configuration of the policy; None if unknown.
+            by: description of the policy for the log.
             log_dir: folder of the episode log.
 
         Raises:
-            MemobenchError: the folder holds a log of another protocol.
+            MemobenchError: the folder contains a log of another protocol.
         """
         from lerobot_memobench.envs.memobench_env import MemobenchEnv, SkipLogged
 
         settings = self.settings_for(policy)
-        check_protocol(log_dir, settings.protocol_block | by.protocol)  # before an episode is simulated
+        check_protocol(log_dir, settings.protocol_block | by.protocol)  # fail before the first episode
 
         def opened(folder: Path, rows: int, use_async_envs: bool) -> gym.vector.VectorEnv:
             make: Callable[[], gym.Env[Any, Any]] = partial(
@@ -179,15 +179,11 @@ class MemobenchEnvConfig(_WithSettings):
         return opened
 
     def get_env_processors(self) -> tuple[Any, Any]:
-        """Return LeRobot's processors of observations and actions of these environments."""
-        from lerobot.processor import PolicyProcessorPipeline
-
-        from lerobot_memobench.envs.processor_memobench import ClockProcessorStep
-
+        """Return LeRobot's processors of observations and actions."""
         return PolicyProcessorPipeline(steps=[ClockProcessorStep()]), PolicyProcessorPipeline(steps=[])
 
     def resolved_log_dir(self) -> Path:
-        """Return the folder of the episode log, see the class."""
+        """Return the folder of the episode log; see ``log_dir``."""
         if self.log_dir is None:
             return Path(f"outputs/eval/{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench")
         folder = Path(self.log_dir)
@@ -202,12 +198,27 @@ def _vector(
     from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
     if use_async_envs:
-        # LeRobot's workers are forked from a server: it imports torch and the simulator once for all of them.
+        # Workers are forked from a server, which imports torch and the simulator once.
         get_context("forkserver").set_forkserver_preload(["lerobot_memobench.envs.memobench_env"])
-        # A vector environment must know the spaces before its workers exist.
         space = observation_space(settings, longest(settings))
         return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
-    # LeRobot freezes finished rows of its own async envs only; a sync row would be reset and go on.
+    # LeRobot freezes finished rows of async environments only; a sync row would start another episode.
     return gym.vector.SyncVectorEnv(
         [freeze_after_episode_end(one) for one in make], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
     )
+
+
+@dataclass
+@ProcessorStepRegistry.register(name="memobench_clock")
+class ClockProcessorStep(ObservationProcessorStep):
+    """Reshape phase and step from (B, 1) to (B,), the shape of one-number columns in a LeRobot training batch."""
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Return the observation with phase and step of shape (B,)."""
+        return {key: value.reshape(len(value)) if key in CLOCK else value for key, value in observation.items()}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Return the features unchanged."""
+        return features

@@ -1,7 +1,7 @@
-"""One episode of one seed: settle, show the prompt, idle where the task does, let the policy act, keep the books.
+"""An episode of one seed: settle the scene, play the prompt, idle, execute the policy's actions, track progress.
 
-The gym environment and the recorder of demonstrations both run on this class, so datasets and a policy's
-observations at evaluation cannot drift apart.
+The gymnasium environment and the recorder of demonstrations share this class, so datasets and observations at
+evaluation agree.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.envs.pacing import NOTHING, Pacing
+from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
 from lerobot_memobench.envs.settings import DEFAULTS, EnvSettings, steps_per_action
 from lerobot_memobench.experts.blind import blind_routine
@@ -49,7 +49,7 @@ from lerobot_memobench.tasks.task import STRICT, Task, referent_text
 
 
 class Fault(NamedTuple):
-    """What broke an execution off: one of `tasks.failures.FAULTS`, and why in a sentence."""
+    """Reason of an aborted execution: one of `tasks.failures.FAULTS`, and a sentence."""
 
     failure: str
     why: str
@@ -59,21 +59,22 @@ class Episode:
     """An episode of one task; `reset` starts it for a seed.
 
     Args:
-        task: the published task.
-        settings: of the environment; those of an episode are ``referent``, ``demonstration_prompt``, ``horizon``,
-            ``protocol``, ``render`` and the pacing. Objects hidden by a prompt that is not shown are hidden unseen.
-        render: size and quality of frames; as in ``settings`` when None.
-        changes: settings by name, other than in ``settings``.
+        task: the task of the catalogue.
+        settings: settings of the environment. An episode uses ``referent``, ``demonstration_prompt``, ``horizon``,
+            ``protocol``, ``render``, ``pause_steps``, ``speed`` and ``replan_steps``. Without the demonstration prompt,
+            objects that it hides are hidden before the first frame.
+        render: size and quality of frames; None for those of ``settings``.
+        changes: settings by name that replace those of ``settings``.
 
     Attributes:
-        task: the task of this episode: a variant of the given one when the referent is random.
-        step_index: control steps since the episode began, prompt included.
-        exec_start: the frame at which execution began; None during the prompt.
-        progress: checkpoints and goal, counted in execution steps.
-        applied_action: the action (7,) float32 that really moved the arm in the last step.
-        rested: the last step was one of a pause: the scene stood still, and nothing but the clock went on.
-        fault: what broke the execution off; None as long as nothing has.
-        choice: which variant the execution chooses; None where it is not followed.
+        task: the task of this episode: a variant if the referent is drawn.
+        step_index: control steps since the start of the episode, including the prompt.
+        exec_start: first frame of the execution; None before it.
+        progress: checkpoints and goal, in execution steps.
+        applied_action: action (7,) float32 executed in the last step.
+        rested: whether the last step was part of a pause: the scene was at rest and only the clock advanced.
+        fault: reason of an aborted execution, or None.
+        choice: the variant that the policy acts on; None outside evidence episodes.
     """
 
     def __init__(
@@ -94,12 +95,12 @@ class Episode:
         return generator(self.published, self.seed, stream)
 
     def reset(self, seed: int, variant: int | None = None, *, keep_prompt: bool = False) -> None:
-        """Start the episode of a seed. Everything that follows is a function of task, settings, seed and actions.
+        """Start the episode of a seed. The episode is a function of task, settings, seed and actions.
 
         Args:
-            seed: of the scene.
-            variant: the one that is shown, whatever the seed draws; which one the execution chooses is then followed.
-            keep_prompt: whether its prompt is simulated once and kept (`prompt_cache`).
+            seed: seed of the scene.
+            variant: variant to run instead of the drawn one (evidence); `choice` then follows the policy's choice.
+            keep_prompt: whether the prompt is cached (`prompt_cache`).
         """
         self.seed = int(seed)
         self.fault: Fault | None = None
@@ -121,10 +122,10 @@ class Episode:
         self.exec_start: int | None = None
         self.pacing = Pacing(self.settings, self._rng(4))
         self.rested = False
-        self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, dtype=np.float32)
+        self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
         self.prompt_shown: bool | None = None
         self.drifted = False
-        self._wrong: list[Atom] = []
+        self._wrong_atoms: list[Atom] = []
         self._expert: Expert | None = None
         self._blind: Iterator[NDArray[np.float32]] | None = None
         self._prompt: Prompt | None = None
@@ -133,43 +134,43 @@ class Episode:
             file = prompt_file(task, self.seed, self.scene_hash) if keep_prompt else None
             self._prompt = prompt_of(PromptDemonstrator(task, self.sim, self._rng(2)), self.sim, longest, file)
         if not self.demonstration_prompt:
-            self._show_unseen()
-        self._starts = first_execution_step(self.published, self.seed, self.demonstration_prompt)
+            self._hide_objects()
+        self._execution_step = first_execution_step(self.published, self.seed, self.demonstration_prompt)
         self._begin_if_due()
 
-    def _show_unseen(self) -> None:
-        """Play the prompt before the first frame: without it there would be nothing to find."""
+    def _hide_objects(self) -> None:
+        """Play a hiding prompt before the first frame, so that the objects are hidden although it is not shown."""
         self.skip_prompt_frames()
         while self._prompt is not None:
             self._step_prompt()
         self.step_index = 0
 
     def skip_prompt_frames(self) -> None:
-        """Leave out the frames of a kept prompt but its end: the caller reads none of them."""
+        """Restore only the end of a cached prompt, because its frames are not read."""
         if self._prompt is not None:
             self._prompt.observed = False
 
     def _step_prompt(self) -> None:
-        """Show the prompt's next step; when there is none, let the scene rest: nothing is simulated."""
+        """Play the next step of the prompt, or idle: then the scene rests and is not simulated."""
         self.applied_action = np.zeros(ACTION_DIM, np.float32) if self._prompt is None else self._prompt.step()
         self.step_index += 1
         if self._prompt is not None and self._prompt.over:
             self._end_prompt(self._prompt)
 
     def _end_prompt(self, prompt: Prompt) -> None:
-        """Put the scene back exactly as it was, unless something was hidden in it."""
-        self.prompt_shown = prompt.shown
+        """Restore the initial scene, except for hidden objects."""
+        self.prompt_shown = prompt.succeeded
         self.sim.end_prompt(self._start, () if self.task.prompt is None else self.task.prompt.places)
         self._prompt = None
 
     def _begin_if_due(self) -> None:
-        """Hand over to the policy, where prompt and rest are over."""
-        if self._prompt is not None or self.step_index < self._starts:
+        """Start the execution if prompt and idling have ended."""
+        if self._prompt is not None or self.step_index < self._execution_step:
             return
         self.sim.begin_execution()
         self.exec_start = self.step_index
-        # What holds already, such as a thing on the plate that it is to leave, is no mistake.
-        self._wrong = [atom for atom in _wrong_atoms(self.task) if not self.sim.holds(atom)]
+        # A wrong atom that already holds, such as an object on the plate, is not a mistake of the policy.
+        self._wrong_atoms = [atom for atom in _wrong_atoms(self.task) if not self.sim.holds(atom)]
 
     @property
     def phase(self) -> int:
@@ -178,19 +179,19 @@ class Episode:
 
     @property
     def idling(self) -> bool:
-        """Nothing moves until the execution begins: the prompt is over, or there is none."""
+        """Whether the robot idles: the prompt has ended, or the task has none, and the execution has not started."""
         return self.phase == PROMPT and self._prompt is None
 
     @property
-    def still(self) -> bool:
-        """The scene rests: the robot idles, or rested in a pause."""
+    def at_rest(self) -> bool:
+        """Whether the scene rests, while idling or in a pause."""
         return self.idling or self.rested
 
     @property
     def clock(self) -> int:
-        """Value of ``step`` in observations: control steps since the phase began; `NO_CLOCK` where a task idles.
+        """Value of ``step`` in observations: control steps since the phase began.
 
-        Where it idles the count begins with the episode and ends with the execution, which shows no clock.
+        In the execution of a task that idles: `NO_CLOCK`, and `ENDED` once it has ended.
         """
         if self.phase == PROMPT:
             return self.step_index
@@ -199,50 +200,50 @@ class Episode:
         return self.step_index - (self.exec_start or 0)
 
     @property
-    def heeds(self) -> bool:
-        """Whether the next action has an effect: none has during the prompt and in a pause."""
-        return self.phase == EXECUTION and self.pacing.heeds
+    def action_has_effect(self) -> bool:
+        """Whether the next action is executed; actions during the prompt and in a pause are not."""
+        return self.phase == EXECUTION and self.pacing.action_has_effect
 
     @property
     def exec_steps(self) -> int:
-        """Execution steps taken so far, without those of pauses."""
+        """Execution steps so far, without pauses."""
         return self.progress.steps
 
     @property
     def success(self) -> bool:
-        """The goal holds now, and the policy has acted."""
+        """Whether the goal holds now, in the execution."""
         return self.phase == EXECUTION and self.progress.success
 
     @property
     def lost(self) -> bool:
-        """The goal can no longer be reached; for strict tasks only; published ones run to their horizon."""
+        """Whether the goal of a strict task is unreachable; published tasks run to the horizon."""
         return self.task.suite == STRICT and self.phase == EXECUTION and self.progress.lost
 
     @property
     def cut_off(self) -> bool:
-        """The horizon ended it, and is shorter than the protocol's: what was missing might have come."""
+        """Whether a horizon below the protocol's ended the episode."""
         whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else HORIZON
         return self.settings.horizon < whole and self.exec_steps >= self._limit and not (self.success or self.lost)
 
     @property
-    def closed(self) -> bool:
-        """All checkpoints have held, in whatever order: in the authors' evaluation that is the end."""
+    def checkpoints_satisfied(self) -> bool:
+        """Whether all checkpoints have held, in any order; this ends an episode of the authors' evaluation only."""
         first = self.progress.first_step
         return self.settings.protocol == UPSTREAM and bool(first) and None not in first
 
     @property
     def done(self) -> bool:
-        """Ended by success, horizon, loss, fault or, in the authors' evaluation alone, satisfied checkpoints."""
-        ended = self.success or self.lost or self.closed
+        """Whether the episode has ended: success, horizon, fault, unreachable goal or `checkpoints_satisfied`."""
+        ended = self.success or self.lost or self.checkpoints_satisfied
         return ended or self.exec_steps >= self._limit or self.fault is not None
 
     @property
     def stand_ins(self) -> tuple[str, ...]:
-        """Classes whose scans are not on this machine, so that others stand in for them in this scene."""
+        """Object classes without scans on this machine, replaced by boxes in this scene."""
         return self.sim.stand_ins
 
     def step(self, action: ArrayLike) -> None:
-        """Advance by one control step; during the prompt the given action has no effect, after a fault nothing has."""
+        """Advance by one control step. The action has no effect in the prompt; after a fault the step has none."""
         if self.phase == PROMPT:
             self._step_prompt()
             self._begin_if_due()
@@ -257,15 +258,15 @@ class Episode:
         self.progress.step(self.sim.holds)
         if self.choice is not None:
             self.choice.step(self.sim.holds)
-        self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong)
+        self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong_atoms)
 
     def _act(self, action: ArrayLike) -> Fault | None:
-        """Carry out the action of the policy; return the fault, if any."""
+        """Execute the policy's action; return the fault, if any."""
         try:
-            numbers = as_action(action, np.float32)  # before it is clipped: infinity would become 1
+            numbers = as_action(action, np.float32)  # before clipping, which turns infinity into 1
             moved = self.pacing.step(np.clip(numbers, -1.0, 1.0))
             self.rested = moved is None
-            self.applied_action = NOTHING if moved is None else moved
+            self.applied_action = np.zeros(ACTION_DIM, np.float32) if moved is None else moved
             if moved is not None:
                 self.sim.step(moved)
         except InvalidActionError as error:
@@ -275,19 +276,19 @@ class Episode:
         return None
 
     def expert_action(self) -> NDArray[np.float32]:
-        """Return what the scripted expert does now, (7,); zeros while it has no effect. Ask once per step."""
-        if not self.heeds:
+        """Return the scripted expert's action (7,), zeros while actions have no effect. Call once per step."""
+        if not self.action_has_effect:
             return np.zeros(ACTION_DIM, dtype=np.float32)
         if self._expert is None:
             self._expert = Expert(self.task, self.sim, self._rng(3))
         return self._expert.act()
 
     def blind_action(self) -> NDArray[np.float32]:
-        """Return what the published routine does now, blind to prompt and instruction, (7,).
+        """Return the action (7,) of the published routine, which ignores prompt and instruction.
 
-        It is zeros while that has no effect. Ask once per step.
+        Zeros while actions have no effect. Call once per step.
         """
-        if not self.heeds:
+        if not self.action_has_effect:
             return np.zeros(ACTION_DIM, dtype=np.float32)
         if self._blind is None:
             routine = get_task(self.published.derived_from) if self.published.derived_from else self.published
@@ -296,49 +297,48 @@ class Episode:
 
     @property
     def expert_done(self) -> bool:
-        """The expert has gone through its plan; whatever does not hold by now it will not bring about."""
+        """Whether the expert has completed its plan."""
         return self._expert is not None and self._expert.done
 
     def objects(self) -> NDArray[np.float32]:
-        """Return what both cameras see now as objects, (`sim.object_slots.SIZE`,)."""
+        """Return the objects visible in both cameras, (`sim.object_slots.SIZE`,)."""
         if self._slots is None:
             self._slots = ObjectSlots(self.sim)
         return self._slots.observe()
 
     def images(self) -> dict[str, Image]:
-        """Return what both cameras see now, (256, 256, 3) uint8 each, upright."""
+        """Render both cameras, (256, 256, 3) uint8 each, upright."""
         return {key: self.sim.render(camera) for key, camera in CAMERAS.items()}
 
     def subgoal(self) -> str:
-        """Return the instruction for the checkpoint being worked on; that of a task without checkpoints."""
+        """Return the instruction for the next checkpoint; the task's instruction without checkpoints."""
         texts = subtask_texts(self.task)
         return texts[min(self.progress.index, len(texts) - 1)]
 
 
 def referent_of(task: Task, seed: int) -> Task:
-    """Return the variant of a task that a random referent shows in the episode of a seed.
+    """Return the variant of a task that the seed draws.
 
-    Variants are drawn in balance: from the first seed of a split on (`protocol.SPLITS`), every run of as many seeds as
-    there are variants shows each of them once, in a new order. So each is right equally often, in a dataset as
-    in an evaluation, and which one it is says nothing about where things stand.
+    Draws are balanced: from the first seed of a split (`protocol.SPLITS`), each block of as many seeds as variants
+    contains every variant once, in random order. All variants are equally frequent and independent of the layout.
     """
     if task.num_variants == 1:
         return task
     choices = task.random_variants
     first = max((split.start for split in SPLITS.values() if split.start <= seed), default=0)
-    place = (seed - first) % len(choices)
-    order = generator(task, seed - place, 1).permutation(choices)
-    return task.variant(int(order[place]))
+    position = (seed - first) % len(choices)
+    order = generator(task, seed - position, 1).permutation(choices)
+    return task.variant(int(order[position]))
 
 
 def first_execution_step(task: Task, seed: int, demonstration_prompt: bool) -> int:
-    """Return the step at which the execution of a seed's episode begins, or 0: as soon as its prompt is over.
+    """Return the first step of the execution in a seed's episode; 0 for a task that does not idle.
 
-    The seed draws how long the robot idles, apart from the variant and all else.
+    The seed draws the idling time independently of the variant.
 
     Args:
-        task: as the catalogue has it, before a variant is drawn.
-        demonstration_prompt: whether the prompt, where the task has one, is part of the episode.
+        task: the task of the catalogue, before a variant is drawn.
+        demonstration_prompt: whether the task's prompt is part of the episode.
     """
     if not task.idles:
         return 0
@@ -347,28 +347,30 @@ def first_execution_step(task: Task, seed: int, demonstration_prompt: bool) -> i
 
 
 def generator(task: Task, seed: int, stream: int) -> np.random.Generator:
-    """A generator of its own for each use, so that one cannot shift the other's draws."""
+    """Return an independent generator per stream, so that streams cannot shift each other's draws."""
     return np.random.default_rng([seed, zlib.crc32(task.name.encode()), stream])
 
 
 def _wrong_atoms(task: Task) -> Iterator[Atom]:
-    """Yield atoms that say that another answer was given than the prompt's: an object's, a target's or a place's.
+    """Yield atoms that hold after a wrong answer in object and procedural tasks.
 
-    Of object and procedural tasks: a checkpoint in which another instance of the same class stands for an object or for
-    its target, and those of the answers that another prompt would have shown. What this task's own checkpoints ask for
-    is none, in whatever order.
+    These are a checkpoint's atoms with another instance of the same class as object or target, and the atoms of other
+    variants. Atoms of this task's own checkpoints are excluded.
     """
     if task.memory_type not in ("object", "procedural"):
         return
     asked = list(dict.fromkeys(atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)))
-    others = [atom for k in range(task.num_variants) for one in task.variant(k).checkpoints for atom in atoms(one.goal)]
-    for atom in dict.fromkeys([*(sibling for one in asked for sibling in _siblings(task, one)), *others]):
+    others = [
+        atom for k in range(task.num_variants) for each in task.variant(k).checkpoints for atom in atoms(each.goal)
+    ]
+    siblings = [sibling for atom in asked for sibling in _siblings(task, atom)]
+    for atom in dict.fromkeys([*siblings, *others]):
         if atom.predicate in ("on", "in") and atom not in asked:
             yield atom
 
 
 def _siblings(task: Task, atom: Atom) -> Iterator[Atom]:
-    """Yield an atom with another instance of the same class in one place."""
+    """Yield the atom with one argument replaced by another instance of its class."""
     for position, name in enumerate(atom.args):
         class_name = task.objects.get(name)
         for other, other_class in task.objects.items():

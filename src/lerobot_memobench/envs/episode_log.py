@@ -1,8 +1,8 @@
-"""The episode log of an evaluation, one JSON line per finished rollout.
+"""The episode log of an evaluation: one JSON line per finished rollout.
 
 Each process appends to a file of its own, ``<dir>/episodes/<task>.<pid>.jsonl``, so workers never wait for one another
-and a killed run loses at most the line being written. ``read_episodes`` merges them. The settings of the evaluation are
-in another file, see `evaluation_file`.
+and a killed run loses at most the line being written. `read_episodes` merges the files. `evaluation_file` holds the
+settings of the evaluation.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDict
 
@@ -47,19 +48,61 @@ logger = logging.getLogger(__name__)
 EPISODES_FOLDER = "episodes"
 MERGED_FILE = "episodes.jsonl"
 WRITTEN_AT = "written_at"
-"""In the workers' files only: when the line was written, s since 1970. It decides which of two lines is newer."""
+"""Key in the workers' files only: time of writing, s since 1970. The newest of several lines counts."""
+INPUTS = "inputs"
+"""Key of the policy's inputs, see `observations.policy_inputs`; absent in older logs."""
+POLICY = "policy"
+
+
+@dataclass(frozen=True)
+class Acting:
+    """The policy of an evaluation, as the log names it. LeRobot's own commands leave it unknown.
+
+    Attributes:
+        policy: ``type``, ``identity`` and, for a checkpoint in a folder, ``sha256``; {} if unknown.
+        inputs: inputs of the policy in words; None if unknown.
+        run: name of this start of the evaluation; a log may hold several starts of one policy.
+        seeds: seeds of the requested episodes; None if unknown. Whole batches are run, so there may be other
+            episodes, which are not logged.
+    """
+
+    policy: Mapping[str, Any] = field(default_factory=dict)
+    inputs: str | None = None
+    run: str | None = None
+    seeds: range | None = None
+
+    def counts(self, seed: int) -> bool:
+        """Return whether the episode of a seed was requested."""
+        return self.seeds is None or seed in self.seeds
+
+    @property
+    def protocol(self) -> dict[str, Any]:
+        """Known entries of the protocol: inputs and policy."""
+        return _known({INPUTS: self.inputs, POLICY: dict(self.policy) or None})
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """Known fields that every line of the log holds."""
+        return _known({POLICY: self.policy.get("identity"), "run": self.run, INPUTS: self.inputs})
+
+
+UNKNOWN_POLICY = Acting()
+
+
+def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in facts.items() if value is not None}
 
 
 # --- lines ---
 
 
 class CheckpointRecord(TypedDict):
-    """A memory checkpoint of a rollout. Execution steps are counted from 1; None: it never held.
+    """A memory checkpoint of a rollout. Execution steps count from 1; None if the predicate never held.
 
     Attributes:
         operation: Storage, Update or Compression.
-        first_step: execution step at which it held first.
-        ordered_step: execution step at which it held first with all earlier ones complete.
+        first_step: first execution step at which it held.
+        ordered_step: first execution step at which it held with all earlier checkpoints complete.
     """
 
     operation: Literal["S", "U", "C"]
@@ -68,27 +111,27 @@ class CheckpointRecord(TypedDict):
 
 
 class Outcome(TypedDict, total=False):
-    """Fields of an episode that a log and a card share; logs of other tools leave some of them out.
+    """Fields of an episode that a log and a card share; logs of other tools omit some.
 
     Attributes:
-        seed: of the scene: seed base + episode, but where each scene is run with each variant.
+        seed: seed of the scene: seed base + episode, except in evidence episodes.
         referent: fixed, random, or drawn (strict tasks).
-        variant: which admissible referent or order; 0 is the published one.
-        replan_steps: actions executed per prediction, where known.
-        prompt_steps: control steps before the execution: of the demonstration prompt, and of idling.
+        variant: index of the task's variant; 0 is the published one.
+        replan_steps: actions executed per prediction, if known.
+        prompt_steps: control steps before the execution: demonstration prompt and idling.
         steps: execution steps.
-        paused_steps: control steps of pauses, where there were to be some.
-        choice: where each scene is run with each variant: which one was acted on; None: none of them.
-        answered: whether an answer was given; False with a choice of None: none was.
-        variants: then, of the task: how many there are to choose from.
-        chance: then, of the task: the rate of right choices without the past; None where the instruction names it.
-        failure: class of the failure; None for a success.
-        suite: of tasks that are not published: strict.
-        world: of scenes that are not the package's own: libero.
-        stand_ins: of that world: classes whose scans were missing, so that others stood in for them.
-        protocol: of the authors' evaluation: upstream.
-        lost: of strict tasks: the goal could no longer be reached.
-        fault: why the episode was broken off: an invalid action, unstable physics.
+        paused_steps: control steps of pauses; only with pauses.
+        choice: evidence episodes: variant that the policy acted on; None for no variant.
+        answered: evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant.
+        variants: evidence episodes: number of variants of the task.
+        chance: evidence episodes: rate of correct choices without memory; None if the instruction names the variant.
+        failure: failure class; None for a success.
+        suite: ``strict``; absent for published tasks.
+        world: ``libero``; absent for the package's own scenes.
+        stand_ins: world ``libero``: classes without scans, replaced by boxes.
+        protocol: ``upstream``, the authors' evaluation; absent for the paper's.
+        lost: strict tasks: whether the goal became unreachable.
+        fault: reason why the episode was aborted: an invalid action or unstable physics.
         scene_hash: hash of the initial scene.
     """
 
@@ -114,21 +157,21 @@ class Outcome(TypedDict, total=False):
 
 
 class EpisodeRecord(Outcome):
-    """A line, as it must be to count as a rollout (see `episode_record`).
+    """A line of the log.
 
     Attributes:
         task: name in the catalogue.
         memory_type: temporal, spatial, object or procedural.
-        episode: its number.
+        episode: number of the episode in its evaluation, from 0.
         success: whether the goal held at the end.
-        checkpoints: the memory checkpoints, in the task's order.
-        prompt_shown: whether the demonstration prompt showed what it had to; None without one.
-        wall_s: seconds that the episode took.
-        not_run: why the episode could not be run: it is no rollout, and in no figure.
+        checkpoints: memory checkpoints in the task's order.
+        prompt_shown: whether the demonstration prompt succeeded; None without a prompt.
+        wall_s: duration of the episode, s.
+        not_run: reason why the episode could not be run. Such a line is no rollout and enters no rate.
         policy: type and hash of the policy.
-        run: which start of the evaluation.
-        inputs: what the policy was given.
-        written_at: when the line was written, s since 1970; in the workers' files alone.
+        run: name of the start of the evaluation.
+        inputs: inputs of the policy.
+        written_at: time of writing, s since 1970; in the workers' files only.
     """
 
     task: Name
@@ -146,16 +189,17 @@ class EpisodeRecord(Outcome):
 
 
 def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, Any]:
-    """Return an episode's line for the log (fields: `EpisodeRecord`).
+    """Return the log line of an episode, an `EpisodeRecord`.
 
     Args:
-        number: of the episode in its evaluation, from 0 on.
-        wall_s: seconds that the episode took.
+        number: number of the episode in its evaluation, from 0.
+        wall_s: duration of the episode, s.
     """
-    progress, task, fault = episode.progress, episode.task, episode.fault
+    progress, task, fault, choice = episode.progress, episode.task, episode.fault, episode.choice
     failure = classify_failure(
         task, progress.first_step, episode.success, episode.drifted, lost=episode.lost, cut_off=episode.cut_off
     )
+    steps = zip(task.checkpoints, progress.first_step, progress.ordered_step, strict=True)
     return {
         "task": task.name,
         "memory_type": task.memory_type,
@@ -169,12 +213,10 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         "steps": episode.exec_steps,
         **({"paused_steps": episode.pacing.paused_steps} if episode.pacing.pauses else {}),
         "success": episode.success,
-        **({} if episode.choice is None else evidence_line(task, episode.choice.variant, episode.choice.answered)),
+        **({} if choice is None else evidence_line(task, choice.variant, choice.answered)),
         "checkpoints": [
             {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
-            for checkpoint, first, ordered in zip(
-                task.checkpoints, progress.first_step, progress.ordered_step, strict=True
-            )
+            for checkpoint, first, ordered in steps
         ],
         "failure": failure if fault is None else fault.failure,
         **({} if fault is None else {"fault": fault.why}),
@@ -187,7 +229,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
 
 
 def evidence_line(task: Task, choice: int | None, answered: bool) -> dict[str, Any]:
-    """Return the part of an episode's line about its choice among a task's variants."""
+    """Return the fields of an evidence episode's line that describe the choice among a task's variants."""
     return {"choice": choice, "answered": answered, "variants": len(task.random_variants), "chance": chance(task)}
 
 
@@ -199,7 +241,7 @@ def key_of(record: Mapping[str, Any]) -> tuple[str, int, str]:
 def not_run_record(
     task: Task, number: int, seed: int, referent: str, why: str, variants: int | None = None
 ) -> dict[str, Any]:
-    """Return the line for the log of an episode that could not be run; arguments are fields of `EpisodeRecord`."""
+    """Return the log line of an episode that could not be run; arguments are fields of `EpisodeRecord`."""
     return {
         "task": task.name,
         "memory_type": task.memory_type,
@@ -219,10 +261,10 @@ def not_run_record(
 
 
 class EpisodeLog:
-    """Appends finished rollouts of this process to ``directory``, which is made when the first one ends.
+    """Append finished rollouts of this process to ``directory``, which is created when the first rollout ends.
 
     Args:
-        begin: called once, before the first line is written; it may refuse.
+        begin: called once before the first line is written; may raise.
     """
 
     def __init__(self, directory: str | Path, begin: Callable[[], object] | None = None) -> None:
@@ -230,13 +272,13 @@ class EpisodeLog:
         self._begin = begin
 
     def append(self, record: Mapping[str, Any]) -> Path:
-        """Write one rollout to disk, for good when this returns; return the file it went to.
+        """Write one rollout durably and return its file.
 
-        The process is looked up here, not at construction: a log made before a fork is used after it.
+        The process id is read here, not at construction: a log may be constructed before a fork.
 
         Raises:
-            MemobenchError: the folder cannot be written or holds episodes of another protocol, the record is no JSON,
-                or its task's name names no file.
+            MemobenchError: the folder cannot be written or holds episodes of another protocol, the record is not JSON,
+                or its task's name is not a file name.
         """
         task = file_name(record["task"], "the task of a record of an episode")
         path = self.directory / EPISODES_FOLDER / f"{task}.{os.getpid()}.jsonl"
@@ -253,7 +295,7 @@ class EpisodeLog:
                 self._begin()
                 self._begin = None
             with path.open("ab+") as file:
-                if _ends_torn(file):  # a killed process with the same number was here before
+                if _ends_torn(file):  # left by a killed process with the same id
                     line = b"\n" + line
                 file.write(line)
                 file.flush()
@@ -274,10 +316,9 @@ def _ends_torn(file: Any) -> bool:
 
 
 def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path:
-    """Add to ``<directory>/episodes.jsonl`` those of ``records`` that it lacks, whole or not at all; return its path.
+    """Add missing ``records`` to ``<directory>/episodes.jsonl`` atomically and return its path.
 
-    Lines that are there stay as they are, also unreadable ones. A line that is added replaces an earlier one about the
-    same episode for readers.
+    Existing lines stay unchanged, including unreadable ones. Readers use the last line of an episode.
     """
     path = Path(directory) / MERGED_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -294,7 +335,7 @@ def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path
 
 
 def read_episodes(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return the rollouts logged under ``directory``, see `read_log`; ``problems`` names those that were not run."""
+    """Return the rollouts logged in ``directory``, see `read_log`; ``problems`` also names episodes not run."""
     records = read_log(directory, problems)
     if problems is not None:
         problems += notes_on_not_run(records)
@@ -302,7 +343,7 @@ def read_episodes(directory: str | Path, problems: list[str] | None = None) -> l
 
 
 def not_run(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    """Return task -> those of its episodes that could not be run."""
+    """Return task -> its episodes that could not be run."""
     found: dict[str, list[Mapping[str, Any]]] = {}
     for record in records:
         if "not_run" in record:
@@ -311,32 +352,24 @@ def not_run(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str,
 
 
 def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence for each task of which episodes could not be run, with the first of the reasons."""
+    """Return one sentence per task with episodes that could not be run; it contains the first reason."""
     notes = []
     for task, lines in not_run(records).items():
-        all_of_it = len(lines) == sum(record["task"] == task for record in records)
-        part = "was not run" if all_of_it else f"was not run in {count_of(len(lines), 'episode')}"
+        whole_task = len(lines) == sum(record["task"] == task for record in records)
+        part = "was not run" if whole_task else f"was not run in {count_of(len(lines), 'episode')}"
         notes.append(f"{task} {part}, and the figures are without that: {lines[0]['not_run']}")
     return notes
 
 
-def _log_below(directory: Path) -> str:
-    """Return a hint at the first log in a folder's folders, or theirs; "" where there is none."""
-    logs = (file for depth in ("*", "*/*") for file in sorted(directory.glob(f"{depth}/{MERGED_FILE}*")))
-    first = next(logs, None)
-    return "" if first is None else f"; there is one in {first.parent}"
-
-
 def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return all lines logged under ``directory``, sorted by task, episode and referent; also of episodes not run.
+    """Return all lines logged in ``directory``, sorted by task, episode and referent, including episodes not run.
 
-    Reads the workers' files and ``episodes.jsonl``, also as ``gzip`` compresses it; of several lines about the same
-    task, episode and referent the newest counts. Lines that cannot be read, such as the last one of a killed run, are
-    left out, named in ``problems`` (file, line, reason) and logged as warnings; so are episodes with lines of either
-    outcome.
+    Reads the workers' files and ``episodes.jsonl``, which may be compressed by ``gzip``. The newest line of an episode
+    counts. Unreadable lines, such as the last line of a killed run, are skipped. They are added to ``problems`` (file,
+    line, reason) and logged as warnings, as are episodes with lines of both outcomes.
 
     Raises:
-        MemobenchError: there is no such folder, no log in it, or one of several policies.
+        MemobenchError: the folder does not exist, contains no log, or contains a log of several policies.
     """
     directory = Path(directory)
     if not directory.is_dir():
@@ -344,9 +377,11 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
         raise MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written{hint}")
     files = _log_files(directory)
     if not files:
+        nested = (file for depth in ("*", "*/*") for file in sorted(directory.glob(f"{depth}/{MERGED_FILE}*")))
+        first = next(nested, None)
         raise MemobenchError(
             f"{directory} holds no episode log; expected {MERGED_FILE} or {EPISODES_FOLDER}/*.jsonl, as an "
-            f"evaluation writes them{_log_below(directory)}"
+            f"evaluation writes them{'' if first is None else f'; there is one in {first.parent}'}"
         )
     found: list[str] = []
     policies: dict[str | None, tuple[Path, dict[str, Any]]] = {}
@@ -362,7 +397,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
             if key not in newest or written >= newest[key][0]:
                 newest[key] = (written, record)
     _check_one_policy(directory, policies)
-    twice = sorted(key for key, told in outcomes.items() if len(told) > 1)
+    twice = sorted(key for key, values in outcomes.items() if len(values) > 1)
     if twice:
         found.append(
             f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
@@ -376,28 +411,28 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
 
 
 def _check_one_policy(directory: Path, policies: Mapping[str | None, tuple[Path, Mapping[str, Any]]]) -> None:
-    """Refuse a log of several policies (identity -> a line of it and its file): rates would mix them."""
+    """Raise for a log of several policies (identity -> file and one of its lines), whose rates would be mixed."""
     known = [(name, *place) for name, place in policies.items() if name is not None]
     if len(known) > 1:
-        told = " and ".join(f"{name} ({record['task']}, in {file.name})" for name, file, record in known[:2])
+        named = " and ".join(f"{name} ({record['task']}, in {file.name})" for name, file, record in known[:2])
         raise MemobenchError(
-            f"{directory} holds episodes of {len(known)} policies: {told}; they are not one evaluation. Evaluate each "
+            f"{directory} holds episodes of {len(known)} policies: {named}; they are not one evaluation. Evaluate each "
             "into a folder of its own, or sort the lines by their `policy` into such folders"
         )
 
 
 def has_log(directory: Path) -> bool:
-    """Return whether ``directory`` holds rollouts of an evaluation."""
+    """Return whether ``directory`` contains rollouts of an evaluation."""
     return bool(_log_files(directory))
 
 
 def is_archive(directory: Path) -> bool:
-    """Return whether the log in ``directory`` is a compressed one alone: it is kept, and only read."""
+    """Return whether the log in ``directory`` is a single compressed file, which is read-only."""
     return _log_files(directory) == [packed(directory / MERGED_FILE)]
 
 
 def _log_files(directory: Path) -> list[Path]:
-    """The merged file first: its lines carry no time, and those of the workers' files that do are newer."""
+    """Return the merged file first: its lines have no time, so lines of the workers' files replace them."""
     merged = directory / MERGED_FILE
     whole = [path for path in (packed(merged), merged) if path.is_file()]
     return whole + sorted((directory / EPISODES_FOLDER).glob("*.jsonl"))
@@ -426,22 +461,18 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 # --- the protocol ---
 
 
-UNTOLD: dict[str, Any] = {
+OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, "world": MEMOBENCH, "protocol": BY_PAPER},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, "render_every": 1},
 }
-"""Values of settings that a protocol leaves out: there were no others when it was written. ``render_every`` is a
-setting of earlier versions: control steps per drawn picture."""
-INPUTS = "inputs"
-"""Inputs of the policy, in the words of `observations.policy_inputs`; absent in logs from before they were recorded."""
+"""Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
+steps per rendered picture, exists in earlier versions only."""
 OF_THE_POLICY = ("prompt_in", INPUTS)
-"""Settings that follow from the policy: evaluations of two policies may differ in them, which is told, parts of one may
-not."""
+"""Settings that follow from the policy. They may differ between compared evaluations, not between parts of one."""
 EXTENT = ("tasks", "episodes")
-"""How much was run: it may differ, the episodes in common still compare."""
-POLICY = "policy"
+"""Extent of an evaluation. It may differ between compared evaluations, which use their common episodes."""
 MOST_EPISODES = 100_000
-"""Of one task. Every episode that was asked for and is missing is counted, so a file must not ask for any number."""
+"""Largest number of episodes of one task; bounds the memory that a damaged file can request."""
 Episodes = Annotated[int, Ge(0), Le(MOST_EPISODES)]
 
 
@@ -455,16 +486,16 @@ def differences(
 ) -> list[str]:
     """Return the settings in which two protocols differ, each as ``horizon: 1200 and 600``.
 
-    A setting that one of them does not tell (logs of other tools) is not a difference, but for `UNTOLD`.
+    A setting that one protocol omits (logs of other tools) is no difference, unless it is in `OMITTED`.
 
     Args:
-        extent: whether tasks and number of episodes are compared as well.
-        policy: whether what is known of the policy is.
+        extent: whether tasks and number of episodes are compared.
+        policy: whether the policy's identity is compared.
         ignore: settings that may differ.
     """
     left_out = {*ignore, POLICY, *(() if extent else EXTENT)}
-    told = {**UNTOLD, **a}
-    found = _differing({k: v for k, v in told.items() if k not in left_out}, {**UNTOLD, **b})
+    first = {k: v for k, v in {**OMITTED, **a}.items() if k not in left_out}
+    found = _differing(first, {**OMITTED, **b})
     if policy:
         found += _differing(a.get(POLICY) or {}, b.get(POLICY) or {}, f"{POLICY}.")
     return found

@@ -1,7 +1,7 @@
 """The file of an evaluation, ``evaluation.json``: protocol, policy, settings, starts and outcomes.
 
-`lerobot eval` writes the whole of it (`run.card`). LeRobot's own commands and vla-evaluation-harness write the protocol
-alone, when the first episode ends. Earlier versions wrote ``card.json`` and ``protocol.json`` instead; both are read.
+`lerobot eval` writes all of it (`run.card`). LeRobot's own commands and vla-evaluation-harness write the protocol only,
+when the first episode ends. Earlier versions wrote ``card.json`` and ``protocol.json``; both are still read.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _CHECKED: dict[Any, Any] = {
     str: Name | None | list[Name | None],
     bool: bool | None,
 }
-"""Type of a setting -> type of its value in a file; parts that were joined may differ."""
+"""Type of a setting -> type of its value in a file; joined parts may differ and then give a list."""
 
 
 _HINTS = typing.get_type_hints(EnvSettings)
@@ -53,11 +53,11 @@ _FIELDS: dict[str, Any] = {
     **{IDLE: Count | None, GOALS: Count, INPUTS: Name | None},
 }
 Settings: Any = TypedDict("Settings", _FIELDS, total=False)  # type: ignore[misc]
-"""Settings of an evaluation that must agree for two of them to compare, as a file holds them."""
+"""Settings that must agree between two evaluations to be compared, as a file holds them."""
 
 
 class PolicyIdentity(TypedDict, total=False):
-    """Whose episodes they are, of evaluations without a card: see `acting.Acting`."""
+    """Identity of the policy in a protocol without a card, see `episode_log.Acting`."""
 
     type: Name | None
     identity: Name
@@ -65,12 +65,12 @@ class PolicyIdentity(TypedDict, total=False):
 
 
 class Protocol(Settings, total=False):
-    """The protocol of an evaluation.
+    """The protocol of an evaluation; a resumable one contains ``tasks`` and ``episodes``.
 
     Attributes:
-        tasks: their names, sorted.
-        episodes: asked for of each task.
-        policy: whose episodes they are.
+        tasks: names, sorted.
+        episodes: number requested per task.
+        policy: identity of the policy.
     """
 
     tasks: list[Name]
@@ -78,23 +78,11 @@ class Protocol(Settings, total=False):
     policy: PolicyIdentity
 
 
-class WholeProtocol(Settings):
-    """The protocol of an evaluation that can be gone on with: it holds the extent that was asked for.
-
-    Attributes:
-        tasks: their names, sorted.
-        episodes: asked for of each task.
-    """
-
-    tasks: list[Name]
-    episodes: Episodes
-
-
 # --- the other parts ---
 
 
 class PolicySettings(TypedDict, total=False):
-    """Whatever a policy can be set to; what reports and `memobench rerun` read of it."""
+    """The fields of a policy's configuration that reports and `memobench rerun` read."""
 
     n_action_steps: Count | None
     perception: str | None
@@ -102,14 +90,14 @@ class PolicySettings(TypedDict, total=False):
 
 
 class Policy(TypedDict, total=False):
-    """What identifies a policy; {} where nothing is known of it.
+    """Identity of a policy; {} if unknown.
 
     Attributes:
-        type: as it is registered with LeRobot.
-        seed: LeRobot's, of this evaluation.
-        settings: its whole configuration.
+        type: type registered with LeRobot.
+        seed: LeRobot's seed in this evaluation.
+        settings: complete configuration.
         sha256: hash over the checkpoint's files.
-        detector_sha256: hash of its detector's weights.
+        detector_sha256: hash of the detector's weights.
     """
 
     type: Name | None
@@ -120,11 +108,11 @@ class Policy(TypedDict, total=False):
 
 
 class Checkpoint(TypedDict):
-    """Where a policy's weights were, and the hash of each file.
+    """Location of a policy's weights, and the hash of each file.
 
     Attributes:
         path: folder, repository, or name of a policy of the package.
-        revision: commit of a repository's copy.
+        revision: commit of a repository.
         files: name -> SHA-256.
     """
 
@@ -133,42 +121,39 @@ class Checkpoint(TypedDict):
     files: NotRequired[dict[str, str]]
 
 
-BatchSize = Annotated[int, Ge(1), Le(LARGEST)]
-
-
-class Start(TypedDict):
+class Start(TypedDict, total=False):
     """One start of the evaluation, on one machine.
 
     Attributes:
-        command: as it was typed.
-        batch_size: environments at once.
-        versions: of Python and packages.
-        git_commit: of a checkout of this package.
-        machine: processor, cores, GPU, system.
-        gl: what drew the pictures, of cards from when OpenGL could; {} where none were drawn.
-        times: starts that were alike.
+        command: words of the command line.
+        batch_size: number of parallel environments.
+        versions: versions of Python and packages.
+        git_commit: commit of this package, in a checkout.
+        machine: processor, cores, GPU, operating system.
+        gl: OpenGL renderer; earlier versions only.
+        times: number of equal starts.
     """
 
     command: list[str]
-    batch_size: BatchSize
+    batch_size: Annotated[int, Ge(1), Le(LARGEST)]
     versions: dict[str, str]
     git_commit: str | None
     machine: dict[str, Any]
-    gl: NotRequired[dict[str, Any]]
-    times: NotRequired[Count]
+    gl: dict[str, Any]
+    times: Count
 
 
 class SealedStart(TypedDict):
     """A start of an evaluation on the sealed seeds.
 
     Attributes:
-        started: when.
+        started: time.
         suite: published or strict.
-        world: of scenes that are not the package's own: libero.
+        world: ``libero``; absent for the package's own scenes.
         referent: fixed, random or drawn.
         replan_steps: actions executed per prediction; None for the policy's own number.
-        tasks: how many.
-        episodes: of each.
+        tasks: number of tasks.
+        episodes: number of episodes per task.
     """
 
     started: str
@@ -181,12 +166,14 @@ class SealedStart(TypedDict):
 
 
 class SealedRun(TypedDict):
-    """How often a policy was started on the sealed seeds (`memobench test-sealed`).
+    """The count of a policy's starts on the sealed seeds (`memobench test-sealed`).
 
     Attributes:
-        started: when. policy: hash of what it loads. scenes: hash of task files, referent, seed and episodes.
-        release: of this package.
-        run: this start's number, from 1 on, among those of the policy with the release.
+        started: time.
+        policy: hash of the files that the policy loads.
+        scenes: hash of task files, referent, seed and episodes.
+        release: version of this package.
+        run: number of this start, from 1, among those of the policy with the release.
         earlier: the starts before it.
     """
 
@@ -199,14 +186,14 @@ class SealedRun(TypedDict):
 
 
 class CardEpisode(Outcome):
-    """What an episode came to.
+    """Outcome of an episode.
 
     Attributes:
         task: name in the catalogue.
-        episode: its number.
+        episode: number of the episode, from 0.
         memory_type: temporal, spatial, object or procedural.
         success: whether the goal held at the end.
-        checkpoints: the memory checkpoints, in the task's order.
+        checkpoints: memory checkpoints in the task's order.
     """
 
     task: Name
@@ -216,88 +203,84 @@ class CardEpisode(Outcome):
     checkpoints: NotRequired[list[CheckpointRecord]]
 
 
-class StartFacts(TypedDict, total=False):
-    """What is taken from a start where the rest of it does not matter."""
-
-    command: list[str]
-    batch_size: BatchSize
-    versions: dict[str, str]
-
-
 class Card(TypedDict):
-    """What reports take from a card: all but the protocol may be absent."""
+    """The content of the file. To resume, merge or rerun an evaluation, all fields of `WHOLE` are required.
 
+    Attributes:
+        format: version of the format.
+        written: time.
+        protocol: tasks, episodes, and the settings that must agree between two evaluations to be compared.
+        policy: facts that must agree to resume the evaluation.
+        checkpoint: of the policy; None for a policy without one.
+        trained_on: LeRobot's settings of the training dataset.
+        task_files: task -> hash of its files.
+        flags: format 1: LeRobot's flags, without folders.
+        settings: format 2: settings of environment, policy and evaluation; `memobench rerun` repeats them.
+        shard: part of a larger evaluation, or None.
+        runs: each start, on each machine.
+        sealed: count of the evaluations on the sealed seeds.
+        episodes: outcomes.
+    """
+
+    format: NotRequired[Literal[1, 2]]
+    written: NotRequired[str]
     protocol: Protocol
     policy: NotRequired[Policy]
     checkpoint: NotRequired[Checkpoint | None]
-    runs: NotRequired[list[StartFacts]]
+    trained_on: NotRequired[dict[str, Any] | None]
+    task_files: NotRequired[dict[str, str]]
+    flags: NotRequired[list[str]]
+    settings: NotRequired[dict[str, Any]]
+    shard: NotRequired[str | None]
+    runs: NotRequired[Annotated[list[Start], MinLen(1)]]
     sealed: NotRequired[SealedRun]
     episodes: NotRequired[list[CardEpisode]]
 
 
-class WholeCard(TypedDict):
-    """A card from which an evaluation is gone on with, merged or repeated.
-
-    Attributes:
-        format: of the card: 1.
-        written: when.
-        protocol: tasks, episodes, and the settings that must agree for two evaluations to compare.
-        policy: what must agree for an evaluation to be gone on with.
-        checkpoint: of the policy; None where it has none.
-        trained_on: LeRobot's settings of the dataset that it was trained on.
-        task_files: task -> hash of its files.
-        flags: of format 1: LeRobot's flags, complete but for folders.
-        settings: of format 2: of environment, policy and evaluation; `memobench rerun` repeats them.
-        shard: the part, or None.
-        runs: each start, on each machine.
-        sealed: of an evaluation on the sealed seeds: how often they were looked at.
-        episodes: what was found.
-    """
-
-    format: Literal[1, 2]
-    written: NotRequired[str]
-    protocol: WholeProtocol
-    policy: Policy
-    checkpoint: Checkpoint | None
-    trained_on: dict[str, Any] | None
-    task_files: dict[str, str]
-    flags: NotRequired[list[str]]
-    settings: NotRequired[dict[str, Any]]
-    shard: str | None
-    runs: Annotated[list[Start], MinLen(1)]
-    sealed: NotRequired[SealedRun]
-    episodes: list[CardEpisode]
-
+WHOLE = ("format", "policy", "checkpoint", "trained_on", "task_files", "shard", "runs", "episodes")
+WHOLE_PROTOCOL = ("tasks", "episodes")
+WHOLE_START = ("command", "batch_size", "versions", "git_commit", "machine")
 
 # --- reading ---
 
 
 def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
-    """Return the file of an evaluation, or the files of an earlier version joined.
+    """Return the content of an evaluation's file, or of the files of an earlier version.
 
     Args:
         place: folder of the evaluation, or a file.
-        whole: nothing may be missing. Otherwise a folder without any of these files gives {}.
+        whole: require everything that resuming and repeating need. Otherwise a folder without a file gives {}.
 
     Raises:
-        MemobenchError: it is missing or has another form.
+        MemobenchError: the file is missing, incomplete or malformed.
     """
-    schema = WholeCard if whole else Card
     file = place / EVALUATION_FILE if place.is_dir() or not is_there(place) else place
-    if not is_there(file) and (not whole or is_there(place / EARLIER_CARD)):
-        return _earlier(place, schema)
     advice = "expected an evaluation's file as `lerobot eval` writes it"
-    try:
-        found: dict[str, Any] = read_json(file, schema, advice)
-    except FileNotFoundError:
-        raise MemobenchError(f"{file} cannot be read (it is missing); {advice}") from None
+    found: dict[str, Any]
+    if not is_there(file) and (not whole or is_there(place / EARLIER_CARD)):
+        found, file = _earlier(place), place / EARLIER_CARD
+    else:
+        try:
+            found = read_json(file, Card, advice)
+        except FileNotFoundError:
+            raise MemobenchError(f"{file} cannot be read (it is missing); {advice}") from None
+    if whole and (missing := _missing(found)):
+        raise MemobenchError(f"{file}: found no {', '.join(missing)}; {advice}")
     return found
 
 
-def _earlier(folder: Path, schema: Any) -> dict[str, Any]:
-    """Return the files that earlier versions wrote, as one."""
+def _missing(card: Mapping[str, Any]) -> list[str]:
+    """Return the absent fields that resuming and repeating need."""
+    missing = [key for key in WHOLE if key not in card]
+    missing += [f"protocol.{key}" for key in WHOLE_PROTOCOL if key not in card["protocol"]]
+    starts = card.get("runs", [])
+    return missing + [f"runs[{k}].{key}" for k, start in enumerate(starts) for key in WHOLE_START if key not in start]
+
+
+def _earlier(folder: Path) -> dict[str, Any]:
+    """Return the files of earlier versions, merged into one."""
     found: dict[str, Any] = {}
-    for name, kind in ((EARLIER_CARD, schema), (EARLIER_PROTOCOL, Protocol)):
+    for name, kind in ((EARLIER_CARD, Card), (EARLIER_PROTOCOL, Protocol)):
         if is_there(folder / name):
             held = read_json(folder / name, kind, "remove the file, or evaluate into another folder")
             held = held if name == EARLIER_CARD else {"protocol": held}
@@ -309,13 +292,13 @@ def _earlier(folder: Path, schema: Any) -> dict[str, Any]:
 
 
 def protocol_of(folder: Path) -> dict[str, Any]:
-    """Return the protocol that an evaluation's file holds, {} without one."""
+    """Return the protocol of an evaluation's file, {} without a file."""
     found: dict[str, Any] = read_evaluation(folder).get("protocol", {})
     return found
 
 
 def check_protocol(folder: Path, protocol: Mapping[str, Any]) -> bool:
-    """Return whether the folder holds this protocol already; raise where it holds another one."""
+    """Return whether the folder already contains this protocol; raise if it contains another one."""
     earlier = protocol_of(folder)
     found = differences(earlier, protocol, policy=True) if earlier else []
     if found:
@@ -328,7 +311,7 @@ def check_protocol(folder: Path, protocol: Mapping[str, Any]) -> bool:
 
 
 def write_protocol(folder: Path, protocol: Mapping[str, Any]) -> None:
-    """Write the protocol of an evaluation without a card; leave an equal one as it is, refuse another."""
+    """Write the protocol of an evaluation without a card; keep an equal file, and raise for another protocol."""
     if not check_protocol(folder, protocol):
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"format": FORMAT, "protocol": dict(protocol)}, indent=1) + "\n"

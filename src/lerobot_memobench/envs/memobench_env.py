@@ -1,4 +1,4 @@
-"""The gymnasium environment: an `Episode`, its observations, its video, its line in the log."""
+"""The gymnasium environment: an `Episode` with observations, video and a line in the log."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,10 +15,17 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.envs.acting import NOBODY, Acting, note_sealed
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.episode_log import EpisodeLog, episode_record, has_log, not_run_record, read_log
-from lerobot_memobench.envs.evaluation_file import write_protocol
+from lerobot_memobench.envs.episode_log import (
+    UNKNOWN_POLICY,
+    Acting,
+    EpisodeLog,
+    episode_record,
+    has_log,
+    not_run_record,
+    read_log,
+)
+from lerobot_memobench.envs.evaluation_file import read_evaluation, write_protocol
 from lerobot_memobench.envs.observations import (
     METADATA,
     REWARDS,
@@ -40,6 +47,8 @@ from lerobot_memobench.protocol import (
     IMAGE_SIZE,
     PROMPT,
     PROMPT_HORIZON,
+    SEALED,
+    SPLITS,
     UNSEEDED,
 )
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
@@ -57,26 +66,26 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and
     actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began, in the execution of a
-    strict task `NO_CLOCK` or `ENDED`; on request ``expert_action`` (7,), ``blind_action`` (7,). A strict task's robot
-    idles before the execution, with ``phase`` 0.
+    strict task `NO_CLOCK` or `ENDED`; optionally ``expert_action`` (7,) and ``blind_action`` (7,). The robot of a
+    strict task idles before the execution, with ``phase`` 0.
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
-    What cannot be carried out (an action that is none, a task that the simulator or the expert cannot do, physics that
-    break down) is raised as a `MemobenchError`. Where episodes are logged it ends its episode alone, truncated, with
-    the reason in the log and as `fault` in the info.
+    An invalid action, unstable physics, and a task that the simulator or the expert cannot run raise a
+    `MemobenchError`. If episodes are logged, such an episode is truncated instead; its reason is in the log and in the
+    info as ``fault``.
 
-    A pickled copy has the settings and must be reset: the running episode stays where it is.
+    A pickled copy keeps the settings and starts with `reset`.
 
     Args:
-        task: a name in the catalogue of either suite, or a task's folder.
-        settings: of the environment; ``suite`` follows from the task, and ``prompt_in=auto`` means `STEPS`.
-        log_dir: where finished episodes are logged; nowhere when None.
-        acting: the policy whose episodes these are; episodes that were not asked for are neither logged nor recorded.
-        reward: `sparse`, 1 at success; or `checkpoints`, of K memory checkpoints 1 / (K + 1) when one is completed in
-            order, and as much at success. An episode's rewards add up to 1 at most, and to 1 only where it succeeds.
-        render_mode: gymnasium's; there is one.
-        changes: settings by name, other than in ``settings``, such as ``obs_type``.
+        task: name in the catalogue of either suite, or a task folder.
+        settings: settings of the environment; ``suite`` follows from the task, and ``prompt_in=auto`` means `STEPS`.
+        log_dir: folder of the episode log; None for no log.
+        acting: description of the policy; episodes of other seeds than the requested ones are not logged or recorded.
+        reward: `sparse`: 1 at success. `checkpoints`: 1 / (K + 1) for each of the K memory checkpoints completed in
+            order, and 1 / (K + 1) at success, so the sum is at most 1 and reaches 1 only with success.
+        render_mode: ``rgb_array``.
+        changes: settings by name that replace those of ``settings``, such as ``obs_type``.
     """
 
     metadata = METADATA
@@ -87,7 +96,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         settings: EnvSettings = DEFAULTS,
         *,
         log_dir: str | None = None,
-        acting: Acting = NOBODY,
+        acting: Acting = UNKNOWN_POLICY,
         reward: str = SPARSE,
         render_mode: str = "rgb_array",
         **changes: Any,
@@ -101,7 +110,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.render_mode = render_mode
         self._task = self._task.in_world(cast("World", settings.world))
         self.task = self._task.name
-        if log_dir is not None:  # now, not when the first episode has been simulated
+        if log_dir is not None:  # fail before the first episode
             file_name(self.task, "the name of a task")
         self._episode: Episode | None = None
         self._describe(0)
@@ -123,19 +132,19 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return EpisodeLog(folder, partial(write_protocol, Path(folder), protocol))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy is made of: all but the running episode, with its scene and generators."""
+        """Return the state of a copy: everything except the running episode, with its scene and generators."""
         return {**vars(self), "_episode": None, "_video": None, "_began": False}
 
     @property
     def episode(self) -> Episode:
-        """The running episode; its scene is compiled in the process that first asks."""
+        """The running episode; the first access in a process compiles its scene."""
         if self._episode is None:
             self._episode = Episode(self._task, self.settings)
         return self._episode
 
     @property
     def _max_episode_steps(self) -> int:
-        """Upper bound for LeRobot's loop: what it steps through. The horizon counts execution steps without pauses."""
+        """Upper bound of steps for LeRobot's loop: the horizon with pauses, prompt and idling."""
         task = self._task
         if self.settings.prompt_in == RESET:
             return self._longest
@@ -146,12 +155,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of a seed; without one, of a seed drawn from `np_random`, apart from all others in use.
+        """Start the episode of a seed; without a seed, of one drawn from `np_random` outside all splits.
 
-        With the prompt played in here (`prompt_in`), the first observation is that of the first execution frame.
+        With ``prompt_in=reset`` the prompt plays here, and the first observation is the first execution frame.
         """
         super().reset(seed=seed)
-        named = seed is not None  # an episode of a drawn seed does not come again
+        named = seed is not None  # a drawn seed is not used again
         self._seed = seed = int(self.np_random.integers(*UNSEEDED)) if seed is None else int(seed)
         self._started = time.monotonic()
         self._began, self._closed, self._over, self._not_run = True, False, False, None
@@ -160,8 +169,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._number = number = seed - settings.seed_base
         scene, variant = scene_and_variant(self._task, number) if settings.evidence else (number, None)
         self._scene_seed = settings.seed_base + scene
-        note_sealed(self._scene_seed, self._log_dir)
-        with self._noting():
+        _warn_of_sealed_seed(self._scene_seed, self._log_dir)
+        with self._ending_episode():
             self.episode.reset(self._scene_seed, variant, keep_prompt=named)
         if self._not_run is not None:
             return blank(self.observation_space), self._info()
@@ -171,13 +180,13 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._log_dir is not None and recorded:
             self._video = VideoRecorder(self._log_dir / "videos" / f"{self.task}.{number}.mp4")
             self._video.add(self.render())
-        with self._noting():
+        with self._ending_episode():
             if settings.prompt_in == RESET and self.episode.phase == PROMPT:
                 self._play_prompt()
         return self._observation(), self._info()
 
     def _play_prompt(self) -> None:
-        """Let prompt and rest run to their end; they are drawn for a video only."""
+        """Play prompt and idling to their end; render them for a video only."""
         self._observer.needed = False
         if self._video is None:
             self.episode.skip_prompt_frames()
@@ -187,22 +196,22 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._observer.needed = True
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Advance by one control step of 50 ms; of ``reward`` see the class.
+        """Advance by one control step of 50 ms.
 
-        An episode terminates by success, in the authors' evaluation when all checkpoints have held and, of a strict
-        task, by the loss of its goal; the horizon truncates it.
+        An episode terminates at success, when the goal of a strict task becomes unreachable, and in the authors'
+        evaluation when all checkpoints have held. The horizon truncates it.
 
         Raises:
-            gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: it has not begun, or is closed.
-            MemobenchError: see the class; also of every step after it, up to the next reset.
+            gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: no episode is running.
+            MemobenchError: see the class; also at each later step until the next reset.
         """
         self._check_began("step")
         if self._log is None and self._not_run is None and (fault := self.episode.fault) is not None:
             raise MemobenchError(f"the episode has ended ({fault.why}); begin another by reset()")
         if self._not_run is None:
-            # A dataset's labels count checkpoints before a frame; those of this step count one frame later.
+            # As in a dataset, checkpoints of this step count from the next frame on.
             completed = self.episode.progress.index
-            with self._noting():
+            with self._ending_episode():
                 self.episode.step(action)
         if self._not_run is not None:
             self._end()
@@ -216,31 +225,31 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._observe()
         if episode.done:
             self._end()
-        ended = episode.success or episode.lost or episode.closed
+        ended = episode.success or episode.lost or episode.checkpoints_satisfied
         reward = self._rewarded(episode.progress.index - completed)
         return self._observation(), reward, ended, episode.done and not ended, self._info()
 
     def _rewarded(self, completed: int) -> float:
-        """Return the reward of a step in which so many memory checkpoints were completed."""
+        """Return the reward of a step that completed ``completed`` memory checkpoints."""
         success = self.episode.success
         if self._reward == SPARSE:
             return float(success)
         return (completed + success) / (len(self.episode.task.checkpoints) + 1)
 
     def _observe(self) -> None:
-        """Observe the present frame, and record it where the episode is recorded: a video skips pauses."""
+        """Observe the current frame and add it to the video, which skips pauses."""
         filmed = self._video is not None and not self.episode.rested
         self._observer.observe(self.episode, recorded=filmed)
         if self._video is not None and filmed:
             self._video.add(self.render())
 
     def need_observation(self, needed: bool) -> None:
-        """Say whether the frames that follow are read, until the next reset or another call; see `Observer`."""
+        """Set whether the policy reads the following frames, until the next reset or call; see `Observer`."""
         self._observer.needed = needed
 
     @contextmanager
-    def _noting(self) -> Iterator[None]:
-        """Note the reason why an episode cannot be run, if it is logged; else raise."""
+    def _ending_episode(self) -> Iterator[None]:
+        """End the episode with the reason of an error if it is logged, else raise the error."""
         try:
             yield
         except MemobenchError as error:
@@ -250,20 +259,20 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._warn(self._not_run)
 
     def _warn(self, why: str) -> None:
-        """Say at once what ends this episode alone; the same once, if it ends all of them."""
+        """Log the reason that ended an episode, once per reason."""
         if why not in self._warned:
             self._warned.add(why)
             logger.warning("%s, episode %d: %s", self.task, self._number, why)
 
     def _check_began(self, call: str) -> None:
-        """Raise gymnasium's own error for a call that only a running episode can answer."""
+        """Raise gymnasium's error for a call without a running episode."""
         if self._closed:
             raise ClosedEnvironmentError(f"Trying to call `{call}` on a closed environment; `reset` opens it again")
         if not self._began:
             raise ResetNeeded(f"Cannot call env.{call}() before calling env.reset()")
 
     def _end(self) -> None:
-        """Close the books of an episode that has ended, once."""
+        """Finish video and log line of an ended episode, once."""
         if self._over:
             return
         self._over = True
@@ -275,14 +284,14 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._log.append(self.record())
 
     def _describe(self, completed: int) -> None:
-        """Set the instruction, which LeRobot asks for at every step; the oracle's has the memory text behind it."""
+        """Set the instruction, which LeRobot reads at every step; with oracle memory it ends with the memory text."""
         task = self._task if self._episode is None else self._episode.task
         self.task_description = task.language
         if self.settings.oracle_memory:
             self.task_description = with_memory(task.language, memory_text(task, completed))
 
     def scene_hash(self) -> str:
-        """Return the hash of the present scene: equal in two environments when all of their physics is."""
+        """Return the hash of the physical state: equal for equal states."""
         self._check_began("scene_hash")
         return self.episode.sim.scene_hash()
 
@@ -309,17 +318,17 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "step": np.array([episode.clock], dtype=np.float32),
         }
         if self.settings.expert_action:
-            observation["expert_action"] = self._asked(episode.expert_action)
+            observation["expert_action"] = self._offered(episode.expert_action)
         if self.settings.blind_action:
-            observation["blind_action"] = self._asked(episode.blind_action)
+            observation["blind_action"] = self._offered(episode.blind_action)
         return observation
 
-    def _asked(self, who: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
-        """Return an action that is offered, zeros from whom the task is too much."""
-        action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
-        with self._noting():
-            action = who()
-        return action
+    def _offered(self, action: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Return an offered action, zeros if the expert cannot do the task."""
+        offered: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
+        with self._ending_episode():
+            offered = action()
+        return offered
 
     def _info(self) -> dict[str, Any]:
         if self._not_run is not None:
@@ -333,16 +342,16 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
 
     def render(self) -> NDArray[np.uint8]:
-        """Return both cameras side by side under what is being remembered and done; see `Observer.frame`.
+        """Return both cameras side by side, under instruction and checkpoints; see `Observer.frame`.
 
         Raises:
-            gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: as `step`.
+            gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: no episode is running.
         """
         self._check_began("render")
         return self._observer.frame(self.episode) if self._not_run is None else _black()
 
     def close(self) -> None:
-        """Let the scene go; the next reset compiles or fetches it again. It may be closed twice."""
+        """Release the scene; the next `reset` opens it again. Closing twice is allowed."""
         self._discard_video()
         self._episode = None
         self._began, self._closed = False, True
@@ -354,15 +363,15 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment whose logged episodes end at their first step with the logged outcome, without being simulated.
+    """End logged episodes at their first step with the logged outcome, without simulation.
 
-    The batch keeps its size and every other row its place, so a policy gives the rows that do run the actions that it
-    would have given them in an undisturbed evaluation. Observations of a skipped episode are blank.
+    Batch size and rows stay the same, so the policy acts in the other rows as in an uninterrupted evaluation.
+    Observations of a skipped episode are blank.
 
     Args:
         make: makes a `MemobenchEnv`.
         log_dir: folder of the log, read once, at the first reset.
-        settings: the environment's.
+        settings: settings of the environment.
     """
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, settings: EnvSettings) -> None:
@@ -372,7 +381,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         self._skipped: dict[str, Any] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start the episode of a seed, or let it rest where the log holds it."""
+        """Start the episode of a seed, or skip it if it is logged."""
         self._skipped = None if seed is None else self._records().get(seed - self._seed_base)
         if self._skipped is None:
             return self.env.reset(seed=seed, options=options)
@@ -386,14 +395,14 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         return blank(self.observation_space), float(success), success, not success, self._info(success)
 
     def render(self) -> Any:
-        """Return what the environment shows; black while it rests."""
+        """Return the environment's picture; black for a skipped episode."""
         return self.env.render() if self._skipped is None else _black()
 
     def _info(self, success: bool) -> dict[str, Any]:
         return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
 
     def _records(self) -> dict[int, dict[str, Any]]:
-        """Episode -> line of the log, of this environment's task and referent."""
+        """Return episode -> log line, for this environment's task and referent."""
         if self._logged is None:
             records = read_log(self._log_dir) if has_log(self._log_dir) else []
             name = self.get_wrapper_attr("task")
@@ -406,5 +415,20 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _black() -> NDArray[np.uint8]:
-    """Return what is rendered of an episode that is not run."""
+    """Return the rendered frame of an episode that is not run."""
     return np.zeros((BAND + IMAGE_SIZE, 2 * IMAGE_SIZE, 3), np.uint8)
+
+
+def _warn_of_sealed_seed(seed: int, log_dir: Path | None) -> None:
+    """Log once per process that a sealed scene is used outside a counted run, which its evaluation's file names."""
+    if seed in SPLITS[SEALED] and (log_dir is None or "sealed" not in read_evaluation(log_dir)):
+        _log_sealed(SPLITS[SEALED])
+
+
+@cache
+def _log_sealed(split: range) -> None:
+    logger.warning(
+        "sealed scenes, not counted: seeds %d to %d are of the sealed test, whose runs `memobench test-sealed` counts",
+        split[0],
+        split[-1],
+    )

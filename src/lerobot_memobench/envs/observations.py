@@ -1,6 +1,6 @@
-"""Observations and actions: names, shapes and units, which of them a policy reads, and when frames are drawn.
+"""Observations and actions: names, shapes, units, the inputs of policies, and rendering on demand.
 
-Cheap to import: no simulator, no LeRobot.
+Importing this module loads neither the simulator nor LeRobot.
 """
 
 from __future__ import annotations
@@ -36,27 +36,26 @@ if TYPE_CHECKING:
 
 SPARSE, CHECKPOINTS = "sparse", "checkpoints"
 REWARDS = (SPARSE, CHECKPOINTS)
-"""Values of ``reward``, see `memobench_env.MemobenchEnv`."""
+"""Values of ``reward``; see `memobench_env.MemobenchEnv`."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
 
-# --- which of them a policy reads ---
+# --- inputs of a policy ---
 
 PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, MEMORY_TEXT = (
     *("pixels", "detections", "privileged object state", "privileged simulator state", "oracle memory text"),
 )
-"""Inputs of a policy, in the words of reports. Detections: objects that a detector finds in pixels."""
-NOTHING = "nothing"
+"""Names of policy inputs in reports. Detections are the objects that a detector finds in pixels."""
+NO_INPUT = "nothing"
 
 READ_OBJECTS = ("act", "diffusion", "tdmpc", "gaussian_actor")
-"""Policies of LeRobot's that read `observation.environment_state` where they were trained on it; others ignore it."""
+"""LeRobot policies that read `observation.environment_state` if trained on it; the others ignore it."""
 
 
 def obs_type_of(policy: Any) -> str | None:
-    """Return the ``obs_type`` that a policy's configuration needs; None where that is not known, or none is needed.
+    """Return the ``obs_type`` that a policy's configuration needs; None if unknown, or if any works.
 
-    A policy that says by ``perception`` what it reads (`pixels`, `objects` or `any`) is taken at its word; one that
-    ``uses_detector`` does so in pictures.
+    ``uses_detector`` means pixels; otherwise ``perception`` (`pixels`, `objects` or `any`) decides, if declared.
     """
     if getattr(policy, "uses_detector", False):
         return PIXELS
@@ -74,11 +73,11 @@ def _ignores_objects(policy: Any) -> bool:
 
 
 def check_obs_type(policy: Any, obs_type: str) -> None:
-    """Refuse an ``obs_type`` in which something is missing that a policy reads.
+    """Check that an ``obs_type`` contains the inputs of a policy.
 
     Args:
-        policy: its configuration.
-        obs_type: the environment's.
+        policy: configuration of the policy.
+        obs_type: setting of the environment.
 
     Raises:
         MemobenchError: pictures or objects are missing.
@@ -86,16 +85,16 @@ def check_obs_type(policy: Any, obs_type: str) -> None:
     needed = obs_type_of(policy)
     if needed is not None and obs_type not in (needed, BOTH):
         wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
-        told = "" if needed == PIXELS else f" ({PRIVILEGED} among it)"
-        raise MemobenchError(f"env.obs_type is {obs_type}, which lacks inputs of the policy{told}; set it to {wanted}")
+        named = "" if needed == PIXELS else f" ({PRIVILEGED})"
+        raise MemobenchError(f"env.obs_type is {obs_type}, which lacks inputs of the policy{named}; set it to {wanted}")
 
 
 def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
-    """Return a policy's inputs in words, apart from the arm's state; all of ``obs_type`` where they are not known.
+    """Return the names of a policy's inputs, without the arm's state; everything in ``obs_type`` if unknown.
 
     Args:
-        policy: its configuration, or the class of it. One that names its ``inputs`` is taken at its word.
-        obs_type: the environment's.
+        policy: configuration of the policy, or its class. A declared attribute ``inputs`` is returned.
+        obs_type: setting of the environment.
         oracle_memory: whether the instruction ends with the completed checkpoints.
     """
     found = getattr(policy, "inputs", None)
@@ -106,21 +105,21 @@ def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> st
         pixels = obs_type != OBJECTS and (everything or "VISUAL" in types)
         objects = obs_type != PIXELS and not _ignores_objects(policy) and (everything or "ENV" in types)
         found = (PIXEL_INPUT,) * pixels + (PRIVILEGED,) * objects
-    return ", ".join(found + (MEMORY_TEXT,) * oracle_memory) or NOTHING
+    return ", ".join(found + (MEMORY_TEXT,) * oracle_memory) or NO_INPUT
 
 
 def chooses_inputs(policy: object) -> bool:
-    """Return whether a policy's configuration says by its ``perception`` what the policy reads."""
+    """Return whether a policy's configuration declares its inputs by ``perception``."""
     return getattr(policy, "perception", None) is not None
 
 
 def reads_prompt(policy: object) -> bool:
-    """Return whether a policy's configuration, or its class, declares that it reads prompts."""
+    """Return whether a policy's configuration, or its class, declares ``reads_prompt``."""
     return bool(getattr(policy, "reads_prompt", False))
 
 
 def prompt_in(policy: object | None) -> str:
-    """Return `STEPS` or `RESET`, as suits a policy's configuration or its class; `STEPS` where none is known."""
+    """Return `STEPS` if a policy's configuration reads prompts or is None, else `RESET`."""
     return STEPS if policy is None or reads_prompt(policy) else RESET
 
 
@@ -128,7 +127,7 @@ def prompt_in(policy: object | None) -> str:
 
 
 def policy_features(obs_type: str = PIXELS) -> dict[str, PolicyFeature]:
-    """Return LeRobot's description of actions and observations, by the environment's names."""
+    """Return LeRobot's features of actions and observations, by the environment's names."""
     from lerobot.configs import FeatureType, PolicyFeature
 
     shapes: dict[str, tuple[FeatureType, tuple[int, ...]]] = {
@@ -141,7 +140,7 @@ def policy_features(obs_type: str = PIXELS) -> dict[str, PolicyFeature]:
 
 
 def policy_names(obs_type: str = PIXELS) -> dict[str, str]:
-    """Return the policy's name for each of `policy_features`."""
+    """Return the environment's name -> the policy's name of each feature."""
     return {
         "action": "action",
         **_pictures(obs_type),
@@ -151,23 +150,23 @@ def policy_names(obs_type: str = PIXELS) -> dict[str, str]:
 
 
 def _pictures(obs_type: str) -> dict[str, str]:
-    """Return the pictures' names, here and at the policy."""
+    """Return the environment's name -> the policy's name of each picture."""
     return {} if obs_type == OBJECTS else {f"pixels/{name}": f"observation.images.{name}" for name in CAMERAS}
 
 
 def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
-    """Return the space of observations, with the actions of the scripted expert or the blind routine on request.
+    """Return the space of observations.
 
     Args:
-        settings: of the environment. ``step`` is `NO_CLOCK` or `ENDED` in the execution of strict tasks.
-        longest: most control steps of an execution.
+        settings: settings of the environment.
+        longest: maximum number of control steps of an execution.
     """
     reach = np.repeat(np.array([3.0, 2 * np.pi, 0.1], np.float32), (3, 3, 2))  # m, rad, m
     longest += PROMPT_HORIZON + IDLE_STEPS
     parts: dict[str, spaces.Space[Any]] = {
         "agent_pos": spaces.Box(-reach, reach, (PROPRIO_DIM,), np.float32),
-        # LeRobot passes numeric keys that it does not know on as `observation.<key>`, so a policy with a memory can
-        # tell by itself when each row of a batch starts and stands still.
+        # LeRobot passes unknown numeric keys to the policy as `observation.<key>`. From these two, a policy with a
+        # memory recognises in each row of a batch when an episode starts and when it is frozen.
         "phase": spaces.Box(PROMPT, EXECUTION, (1,), np.float32),
         "step": spaces.Box(ENDED, longest, (1,), np.float32),
     }
@@ -190,7 +189,7 @@ def action_space() -> spaces.Space[NDArray[np.float32]]:
 
 
 def blank(space: spaces.Space[Any]) -> Any:
-    """Return an observation of nothing: zeros of the space's shapes."""
+    """Return zeros in the shapes of a space."""
     if isinstance(space, spaces.Dict):
         return {key: blank(part) for key, part in space.items()}
     return np.zeros(space.shape or (), space.dtype)
@@ -200,14 +199,14 @@ def blank(space: spaces.Space[Any]) -> Any:
 
 
 class Observer:
-    """Pictures and objects of the observations, which take time: drawn only where they are needed.
+    """Render pictures and compute objects only for frames that are read.
 
     Args:
         obs_type: one of `OBS_TYPES`.
 
     Attributes:
-        needed: whether the policy reads the frames that follow. Otherwise an observation repeats an earlier one; the
-            first and the last frame of the execution are always current.
+        needed: whether the policy reads the following frames. If not, observations repeat an earlier frame, except
+            for the first and the last frame of the execution.
     """
 
     def __init__(self, obs_type: str) -> None:
@@ -218,37 +217,37 @@ class Observer:
         """Observe the first frame of an episode."""
         self.needed = True
         self._picture_step: int | None = None
-        self._pictures_rest = self._objects_rest = False
+        self._pictures_at_rest = self._objects_at_rest = False
         self.observe(episode, recorded=False)
 
     def observe(self, episode: Episode, *, recorded: bool) -> None:
-        """Take in the present frame, as far as it is needed; ``recorded``: in a video."""
+        """Observe the current frame if it is needed; ``recorded``: it is part of a video."""
         always = episode.done or episode.step_index == episode.exec_start
-        if not episode.still:
-            self._pictures_rest = self._objects_rest = False
-        if self._has_objects and (always or self.needed) and not self._objects_rest:
+        if not episode.at_rest:
+            self._pictures_at_rest = self._objects_at_rest = False
+        if self._has_objects and (always or self.needed) and not self._objects_at_rest:
             self._objects = episode.objects()
-            self._objects_rest = episode.still
+            self._objects_at_rest = episode.at_rest
         if self._has_pictures and (always or self.needed or recorded):
-            self._draw(episode)
+            self._render(episode)
 
-    def _draw(self, episode: Episode) -> None:
-        if not self._pictures_rest:  # a scene at rest is drawn once
+    def _render(self, episode: Episode) -> None:
+        if not self._pictures_at_rest:  # render a scene at rest once
             self._images: dict[str, Image] = episode.images()
-        self._pictures_rest = episode.still
+        self._pictures_at_rest = episode.at_rest
         self._picture_step = episode.step_index
 
     def observation(self) -> dict[str, Any]:
-        """Return the pictures and objects of an episode's observation, see `observation_space`."""
+        """Return the pictures and objects of the observation, see `observation_space`."""
         found: dict[str, Any] = {}
         if self._has_pictures:
             found["pixels"] = dict(self._images)
         if self._has_objects:
-            found["environment_state"] = self._objects.copy()  # repeated where it is not read
+            found["environment_state"] = self._objects.copy()  # may be returned again
         return found
 
     def frame(self, episode: Episode) -> NDArray[np.uint8]:
-        """Return both cameras annotated: as they were drawn last, or now where observations hold no pictures."""
+        """Return both annotated cameras: last rendered, or rendered now if observations contain no pictures."""
         if not self._has_pictures and self._picture_step != episode.step_index:
-            self._draw(episode)
+            self._render(episode)
         return annotate(self._images, episode)

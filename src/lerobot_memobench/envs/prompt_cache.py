@@ -1,7 +1,7 @@
-"""Play a demonstration prompt: simulate it, or restore it from the user's cache folder, equal to the bit.
+"""Play a demonstration prompt: simulate it, or restore it bit for bit from the user's cache folder.
 
-A prompt depends on task, variant and seed, not on the policy. Its file holds the snapshot after each control step.
-``MEMOBENCH_PROMPT_CACHE=off`` neither reads nor writes files.
+A prompt depends on task, variant and seed, not on the policy. Its file contains the snapshot after each control step.
+``MEMOBENCH_PROMPT_CACHE=off`` turns the cache off.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ logger = logging.getLogger(__name__)
 
 VARIABLE = "MEMOBENCH_PROMPT_CACHE"
 LARGEST = 2 << 30
-"""Bytes of all files together: several thousand prompts of 0.2 to 0.7 MB. Those used least recently are removed."""
+"""Maximum bytes of all files: several thousand prompts of 0.2 to 0.7 MB. The least recently used ones are removed."""
 PACKAGES = ("mujoco", "numpy", "scipy", "robosuite")
 SOURCES = ("tasks", "sim", "experts", "envs")
 
 
 class Frames(NamedTuple):
-    """A prompt of ``n`` control steps; the arrays of its file.
+    """The arrays of a file with a prompt of ``n`` control steps.
 
     Attributes:
-        actions: (n, 7) float32, that moved the arm.
+        actions: (n, 7) float32, executed actions.
         physics: (n, `Simulation.physics_dim`) float64, `Snapshot.physics` after each step.
         controller: (n, 14) float64, goal position (3), goal rotation (9) and gripper (2) of the snapshot.
         goes_on: (n,) bool, of the snapshot.
-        highlights: (n, 4) float64, position and radius; NaN where nothing is highlighted.
-        shown: () bool, whether the prompt showed what it had to.
+        highlights: (n, 4) float64, position and radius; NaN without a highlight.
+        shown: () bool, whether the prompt succeeded.
     """
 
     actions: NDArray[np.float32]
@@ -58,21 +58,21 @@ class Frames(NamedTuple):
 
 
 class Prompt:
-    """Simulate a prompt, a control step at a time.
+    """Simulate a prompt step by step.
 
     Args:
-        sim: the running scene, at the episode's initial state.
-        longest: control steps after which the prompt ends.
-        file: where it is kept once it is over; None: nowhere.
+        sim: running scene in the episode's initial state.
+        longest: maximum number of control steps.
+        file: cache file of the finished prompt; None for no file.
 
     Attributes:
-        over: no step is left.
-        shown: whether it showed what it had to, once it is over.
-        observed: whether anything reads its frames before its end; a restored prompt leaves out the others.
+        over: whether the prompt has ended.
+        succeeded: whether the prompt succeeded, once it has ended.
+        observed: whether frames before the end are read; if not, a restored prompt skips them.
     """
 
     over = False
-    shown = False
+    succeeded = False
     observed = True
 
     def __init__(self, demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> None:
@@ -83,8 +83,8 @@ class Prompt:
         self._frames: list[tuple[NDArray[np.float32], Snapshot, tuple[Highlight, ...]]] = []
 
     def step(self) -> NDArray[np.float32]:
-        """Advance by one control step and return the action that moved the arm, (7,)."""
-        file, self._file = self._file, None  # a prompt in which an error was raised is not kept
+        """Advance by one control step and return the executed action (7,)."""
+        file, self._file = self._file, None  # do not store a prompt that raised an error
         action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
         if self._next is not None:
             action = np.array(self._next, dtype=np.float32)
@@ -92,7 +92,7 @@ class Prompt:
         self._steps += 1
         self._next = next(self._actions, None)
         self.over = self._next is None or self._steps >= self._longest
-        self.shown = self._demonstrator.shown
+        self.succeeded = self._demonstrator.succeeded
         self._file = file
         if file is not None:
             self._frames.append((action, self._sim.snapshot(), self._sim.highlights))
@@ -102,28 +102,28 @@ class Prompt:
 
     def _as_arrays(self) -> Frames:
         actions, snapshots, lit = zip(*self._frames, strict=True)
-        nothing = (np.nan,) * 4
+        no_highlight = (np.nan,) * 4
         return Frames(
             np.array(actions),
-            np.array([one.physics for one in snapshots]),
-            np.array([[*one.goal_position, *one.goal_rotation.flat, *one.gripper] for one in snapshots]),
-            np.array([one.goes_on for one in snapshots]),
-            np.array([(*found[0].position, found[0].radius) if found else nothing for found in lit]),
-            np.array(self.shown),
+            np.array([snapshot.physics for snapshot in snapshots]),
+            np.array([[*each.goal_position, *each.goal_rotation.flat, *each.gripper] for each in snapshots]),
+            np.array([snapshot.goes_on for snapshot in snapshots]),
+            np.array([(*found[0].position, found[0].radius) if found else no_highlight for found in lit]),
+            np.array(self.succeeded),
         )
 
 
 class RestoredPrompt(Prompt):
-    """Restore what `Prompt` has kept, a control step at a time."""
+    """Restore a stored prompt step by step."""
 
     def __init__(self, sim: Simulation, frames: Frames) -> None:
         self._sim, self._kept, self._steps = sim, frames, 0
 
     def step(self) -> NDArray[np.float32]:
-        """Go on to the next control step and return the action that moved the arm, (7,)."""
+        """Advance by one control step and return the executed action (7,)."""
         kept, k = self._kept, self._steps
         self._steps += 1
-        self.over, self.shown = self._steps == len(kept.actions), bool(kept.shown)
+        self.over, self.succeeded = self._steps == len(kept.actions), bool(kept.shown)
         if self.observed or self.over:
             position, rotation, gripper = np.split(kept.controller[k], [3, 12])
             snapshot = Snapshot(kept.physics[k], position, rotation.reshape(3, 3), gripper, bool(kept.goes_on[k]))
@@ -134,16 +134,16 @@ class RestoredPrompt(Prompt):
 
 
 def prompt_of(demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> Prompt:
-    """Return a prompt that is restored if ``file`` holds it, and simulated otherwise. Arguments are `Prompt`'s."""
+    """Return a prompt that is restored if ``file`` contains it, else simulated. Arguments: see `Prompt`."""
     frames = None if file is None else _read(file, sim.physics_dim)
     return Prompt(demonstrator, sim, longest, file) if frames is None else RestoredPrompt(sim, frames)
 
 
 def prompt_file(task: Task, seed: int, scene_hash: str) -> Path | None:
-    """Return where the prompt of a task's variant and a seed is kept; None where the cache is off.
+    """Return the cache file of a prompt; None if the cache is off.
 
-    The name is a hash of all that the prompt depends on. The hash of the initial scene, bit for bit the result of 250
-    physics steps, also sets apart machines that compute otherwise.
+    The name is a hash of everything that affects the prompt. It includes the hash of the initial scene, the result of
+    250 physics steps, which separates machines with different arithmetic.
     """
     if os.environ.get(VARIABLE, "").lower() in ("off", "0", "false", "no"):
         return None
@@ -153,7 +153,7 @@ def prompt_file(task: Task, seed: int, scene_hash: str) -> Path | None:
 
 @cache
 def _code() -> tuple[str, ...]:
-    """Return what computes a prompt: sources, versions of libraries, Python, processor."""
+    """Return the sources, library versions, Python version and processor that compute a prompt."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256((package / "protocol.py").read_bytes())
     for source in sorted(file for part in SOURCES for file in (package / part).rglob("*.py")):
@@ -162,37 +162,37 @@ def _code() -> tuple[str, ...]:
 
 
 def _read(file: Path, physics_dim: int) -> Frames | None:
-    """Return the prompt that a file holds, None where it is missing, damaged or another one."""
+    """Return the prompt in a file; None if the file is missing, damaged or of another prompt."""
     try:
         with np.load(file, allow_pickle=False) as stored:
             name, frames = str(stored["name"]), Frames(*(stored[field] for field in Frames._fields))
-    except Exception:  # damaged files raise errors of every type: zipfile's, zlib's, NumPy's, the system's
+    except Exception:  # damaged files raise errors of zipfile, zlib, NumPy and the system
         return None
     n = frames.actions.size // ACTION_DIM
     shapes = (n, ACTION_DIM), (n, physics_dim), (n, 14), (n,), (n, 4), ()
     found = [(array.shape, array.dtype.char) for array in frames]
     if n == 0 or found != [*zip(shapes, "fdd?d?", strict=True)] or name != file.name:
         return None
-    with contextlib.suppress(OSError):  # a folder that cannot be written
+    with contextlib.suppress(OSError):  # read-only folder
         os.utime(file)
     return frames
 
 
 def _write(file: Path, frames: Frames) -> None:
-    """Write a prompt, and remove the files that were used least recently beyond `LARGEST` bytes."""
+    """Write a prompt; remove the least recently used files beyond `LARGEST` bytes."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with draft_of(file) as draft:
             np.savez_compressed(draft, name=np.array(file.name), **frames._asdict())
         _make_room(file.parent)
     except OSError as error:
-        _warn(f"prompts cannot be kept in {file.parent} ({error.strerror or error}); {VARIABLE}=off turns this off")
+        _warn(f"prompts cannot be cached in {file.parent} ({error.strerror or error}); set {VARIABLE}=off")
 
 
 def _make_room(folder: Path) -> None:
     found = []
-    for file in folder.glob("*.npz"):  # drafts of killed processes too
-        with contextlib.suppress(FileNotFoundError):  # another process makes room
+    for file in folder.glob("*.npz"):  # includes drafts of killed processes
+        with contextlib.suppress(FileNotFoundError):  # removed by another process
             found.append((file.stat().st_mtime_ns, file.stat().st_size, file))
     excess = sum(size for _, size, _ in found) - LARGEST
     for _, size, file in sorted(found):

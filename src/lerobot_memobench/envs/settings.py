@@ -1,7 +1,7 @@
-"""Settings of an environment: name, type, default, meaning and values, each in one place.
+"""Settings of an environment: name, type, default, meaning and accepted values.
 
-The LeRobot configuration, the gymnasium environment, the episode, the evaluation's file and vla-evaluation-harness take
-an `EnvSettings` whole. To add a setting, add a field here and the code that acts on it.
+LeRobot configuration, gymnasium environment, episode, evaluation file and vla-evaluation-harness all use `EnvSettings`.
+To add a setting, add a field here and the code that applies it.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS,
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
-"""Values of ``obs_type``, by LeRobot's names."""
+"""Values of ``obs_type``; the first two are LeRobot's names."""
 
 AUTO, STEPS, RESET = "auto", "steps", "reset"
 PROMPT_IN = (AUTO, STEPS, RESET)
-"""Values of ``prompt_in``. A policy that reads prompts declares ``reads_prompt: ClassVar[bool] = True`` on the class of
-its configuration: it waits while `observation.phase` is 0 and discards planned actions when it becomes 1. For any other
-policy the prompt plays within `reset`. ``auto`` chooses by the policy; where no policy is known, it means ``steps``."""
+"""Values of ``prompt_in``. A policy that reads prompts declares ``reads_prompt: ClassVar[bool] = True`` in the class of
+its configuration. It waits while `observation.phase` is 0 and discards planned actions when it becomes 1. For other
+policies the prompt plays in `reset`. ``auto`` chooses by the policy; without a known policy it means ``steps``."""
 
 REFERENT_VALUES = (*REFERENTS, DRAWN)
-"""Values of ``referent``; the last one is that of strict tasks alone."""
+"""Values of ``referent``; strict tasks always use the last one."""
 QUALITIES = ("fast", "default", "high")
 EVERY = -1
 """Value of ``videos``: record every episode."""
 SLOWEST = 10
-"""Most control steps per action, see ``speed``."""
+"""Maximum number of control steps per action, see ``speed``."""
 
 IDLE, GOALS, STRICT_GOALS = "idle", "goals", 2
-"""Keys of strict tasks in a protocol: control steps that the robot idles at most before the execution, and the revision
-of the goals. Revision 1 could be reached without a memory, by notes in the scene and a clock."""
+"""Protocol keys of strict tasks: maximum idle steps before the execution, and revision of the goals. Goals of revision
+1 could be reached without memory, by marks in the scene and a clock."""
 UPSTREAM_ONLY = {
     **{"suite": PUBLISHED, "referent": REFERENTS[0], "oracle_memory": False},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False},
 }
-"""The one value that a setting has in the authors' evaluation."""
+"""Settings with a fixed value in the authors' evaluation."""
 
 
 def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None) -> Any:
@@ -58,40 +58,40 @@ def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int |
 
     Args:
         meaning: one line for the reference.
-        values: accepted values; any of the type when empty.
-        least: smallest whole number accepted.
+        values: accepted values; empty for any value of the type.
+        least: smallest accepted integer.
     """
     return field(default=default, metadata={"meaning": meaning, "values": tuple(values), "least": least})
 
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """Settings of one environment; see each field's ``metadata["meaning"]``, which the reference prints.
+    """Settings of one environment; ``metadata["meaning"]`` of each field is its entry in the reference.
 
     Raises:
-        MemobenchError: a value is not accepted, or two settings exclude each other.
+        MemobenchError: a value is not accepted, or two settings are incompatible.
     """
 
-    suite: str = setting(PUBLISHED, "the published tasks, or strict: 30 variants that need a memory", SUITES)
-    world: str = setting(MEMOBENCH, "this package's scenes, or the paper's, of LIBERO's assets", WORLDS)
+    suite: str = setting(PUBLISHED, "published tasks, or strict: 30 variants that need a memory", SUITES)
+    world: str = setting(MEMOBENCH, "scenes of this package, or of the paper with LIBERO's assets", WORLDS)
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
-    obs_type: str = setting(PIXELS, "observations besides the arm's state: pictures, object slots, or both", OBS_TYPES)
+    obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
     referent: str = setting(
-        "fixed", "the published goals, or drawn by seed; strict tasks are always drawn", REFERENT_VALUES
+        "fixed", "published goals, or goals drawn by the seed; strict tasks always draw", REFERENT_VALUES
     )
-    demonstration_prompt: bool = setting(True, "object and procedural tasks begin with their demonstration prompt")
-    prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or within reset", PROMPT_IN)
+    demonstration_prompt: bool = setting(True, "object and procedural tasks start with their demonstration prompt")
+    prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or in reset", PROMPT_IN)
     horizon: int = setting(HORIZON, "execution steps per episode", least=1)
-    replan_steps: int | None = setting(None, "actions executed per prediction; pauses keep such chunks whole", least=1)
-    render: str = setting("default", "fast has no shadows; high is for films, at ten times the cost", QUALITIES)
+    replan_steps: int | None = setting(None, "actions executed per prediction; pauses start between chunks", least=1)
+    render: str = setting("default", "fast has no shadows; high is for figures and ten times slower", QUALITIES)
     oracle_memory: bool = setting(False, "the instruction ends with the completed checkpoints (oracle memory control)")
     pause_steps: int = setting(0, "control steps of each pause, at moments drawn by the seed (pause control)", least=0)
-    speed: float = setting(1.0, "1, 0.5, 0.33 and so on: an action takes 1, 2, 3 control steps (speed control)")
-    evidence: bool = setting(False, "each scene is run with each variant of its task (evidence control)")
-    expert_action: bool = setting(False, "offer the scripted expert's action as observation.expert_action")
-    blind_action: bool = setting(False, "offer the blind published routine's as observation.blind_action")
-    videos: int = setting(0, "episodes of each task that are recorded as videos, from the first; -1 all", least=EVERY)
+    speed: float = setting(1.0, "1, 0.5, 0.33, ...: an action takes 1, 2, 3, ... control steps (speed control)")
+    evidence: bool = setting(False, "run each scene with each variant of its task (evidence control)")
+    expert_action: bool = setting(False, "add the scripted expert's action as observation.expert_action")
+    blind_action: bool = setting(False, "add the blind published routine's action as observation.blind_action")
+    videos: int = setting(0, "number of first episodes of each task recorded as videos; -1 for all", least=EVERY)
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -100,19 +100,19 @@ class EnvSettings:
             check_choice("referent", self.referent, REFERENTS)
         if abs(steps_per_action(self.speed) * self.speed - 1) > 0.02 or not 1 / SLOWEST <= self.speed <= 1:
             raise MemobenchError(
-                f"speed is {self.speed!r}; expected 1, 0.5, 0.33, 0.25 and so on down to {1 / SLOWEST}: an action "
-                "takes a whole number of control steps"
+                f"speed is {self.speed!r}; expected 1, 0.5, 0.33, 0.25 and so on down to {1 / SLOWEST}, so that an "
+                "action takes a whole number of control steps"
             )
         if self.suite == STRICT:
-            check_world("", self.world, self.suite)
+            check_world(self.world, self.suite)
             self._set(referent=DRAWN)
         if self.protocol == UPSTREAM:
             self._follow_upstream()
         if self.evidence:
-            check_referent("", self.referent)
+            check_referent(self.referent)
 
     def _check(self, name: str, kind: str, accepted: Mapping[str, Any]) -> None:
-        """Check the type of a value, and against the values that are accepted."""
+        """Check the type of a setting, and its accepted values."""
         value = getattr(self, name)
         optional = value is None and kind.endswith("| None")
         if kind.startswith("int") and not optional:
@@ -128,13 +128,13 @@ class EnvSettings:
             check_choice(name, value, accepted["values"])
 
     def _follow_upstream(self) -> None:
-        """Set the values of the authors' evaluation; refuse others."""
+        """Set the values of the authors' evaluation; raise for conflicting ones."""
         for name, value in UPSTREAM_ONLY.items():
             asked = getattr(self, name)
             if asked != value:
                 raise MemobenchError(
-                    f"{name} is {str(asked).lower()}; protocol={UPSTREAM}, the authors' evaluation, has "
-                    f"{name}={str(value).lower()} only, so leave one of the two out"
+                    f"{name} is {str(asked).lower()}, but protocol={UPSTREAM}, the authors' evaluation, requires "
+                    f"{name}={str(value).lower()}; leave one of the two out"
                 )
         self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
 
@@ -143,37 +143,37 @@ class EnvSettings:
             object.__setattr__(self, name, value)
 
     def changed(self, **changes: Any) -> EnvSettings:
-        """Return settings with other values.
+        """Return a copy with changed values.
 
         Raises:
-            MemobenchError: an unknown setting, or a value that is not accepted.
+            MemobenchError: a setting is unknown, or a value is not accepted.
         """
         known = [each.name for each in fields(self)]
         for name in changes:
             if name not in known:
-                raise MemobenchError(f"there is no setting {name!r} of an environment; {nearest(name, known)}")
+                raise MemobenchError(f"unknown environment setting {name!r}; {nearest(name, known)}")
         return replace(self, **changes)
 
     @property
     def protocol_block(self) -> dict[str, Any]:
-        """The settings that must agree for two evaluations to be one, or to be compared."""
+        """Settings that must agree to join or compare two evaluations."""
         agreed = {name: value for name, value in asdict(self).items() if name not in NOT_COMPARED}
         return {**agreed, **revision(self.suite)}
 
 
 NOT_COMPARED = ("expert_action", "blind_action", "videos")
-"""Settings on which no rollout depends."""
+"""Settings without effect on rollouts."""
 SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED)
-"""Settings on which rollouts depend."""
+"""Settings with an effect on rollouts."""
 
 
 def revision(suite: str) -> dict[str, int]:
-    """Return the part of a suite's protocol that changed with versions: idling and goals of strict tasks."""
+    """Return protocol entries of a suite that changed with versions: idling and goals of strict tasks."""
     return {IDLE: IDLE_STEPS, GOALS: STRICT_GOALS} if suite == STRICT else {}
 
 
 def steps_per_action(speed: float) -> int:
-    """Return how many control steps an action takes at a speed."""
+    """Return the number of control steps per action."""
     return round(1 / speed)
 
 

@@ -1,7 +1,6 @@
-"""Videos of evaluations: frames annotated with the task and its checkpoints, encoded beside the simulation.
+"""Videos of evaluations: frames annotated with task and checkpoints, encoded while the simulation runs.
 
-LeRobot keeps every frame of its first ten episodes in memory and leaves out the last one, in which the goal comes
-true. These are written as the episode goes, and show its end.
+LeRobot's own videos keep all frames of ten episodes in memory and omit the last frame, in which the goal becomes true.
 """
 
 from __future__ import annotations
@@ -29,16 +28,16 @@ if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
 
 BAND = 64
-"""Height of the text over the pictures, pixels."""
+"""Height of the text above the pictures, pixels."""
 CLOCK = 96
-"""Width that is left to the clock, pixels."""
+"""Width reserved for the clock, pixels."""
 CLOCK_BOTTOM = 24
-"""Height from the upper edge to under the clock, pixels."""
+"""Lower edge of the clock, pixels from the top."""
 MARGIN = 8
-"""Left free on both sides, pixels."""
+"""Left and right margin, pixels."""
 _BACKGROUND, _TEXT, _FAINT = (24, 26, 30), (240, 240, 240), (150, 155, 165)
 OPERATION_COLOURS = {"S": (86, 180, 233), "U": (230, 159, 0), "C": (0, 158, 115)}
-"""Storage, Update, Compression: Okabe and Ito's palette, apart for the colour-blind too."""
+"""Storage, Update, Compression in Okabe and Ito's palette, which colour-blind readers can distinguish."""
 _PROMPT_COLOUR = (204, 121, 167)
 
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -50,7 +49,7 @@ def _font(size: int) -> Font:
 
 
 def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[str, Font]:
-    """Shrink a text until it fits, then cut it."""
+    """Shrink a text until it fits; truncate it at the smallest size."""
     for points in range(size, 8, -1):
         if draw.textlength(text, font=_font(points)) <= width:
             return text, _font(points)
@@ -60,10 +59,10 @@ def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[s
 
 
 def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[np.uint8]:
-    """Return a frame (BAND + height, 2 · width, 3) uint8 of the present step.
+    """Return a frame (BAND + height, 2 · width, 3) uint8 of the current step.
 
-    It shows both cameras, the task, the checkpoint being worked on, and a tick for each one done. The band is drawn
-    again when a checkpoint is done, the clock's word and digits never.
+    It shows both cameras, the instruction, the next checkpoint, and a tick for each completed one. The text is cached
+    between checkpoints, the clock's word and digits for the whole process.
     """
     pictures = list(images.values())
     height, width = pictures[0].shape[0], sum(picture.shape[1] for picture in pictures)
@@ -74,7 +73,6 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     now = "watch the prompt" if prompt else "done" if episode.success else f"next: {episode.subgoal()}"
     frame[:BAND] = _band(width, episode.task.language, operations, done, now, prompt)
     pieces = ("prompt ", *str(episode.step_index)) if prompt else ("step ", *str(episode.exec_steps))
-    # Only as wide as the clock is, so that it covers nothing.
     clock = np.concatenate([_piece(piece, prompt) for piece in pieces], axis=1)
     frame[:CLOCK_BOTTOM, width - MARGIN - clock.shape[1] : width - MARGIN] = clock
     np.concatenate(pictures, axis=1, out=frame[BAND:])
@@ -85,7 +83,7 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
 def _band(
     width: int, language: str, operations: tuple[str, ...], done: int, now: str, prompt: bool
 ) -> NDArray[np.uint8]:
-    """All of the text but the clock, (BAND, width, 3)."""
+    """Return the text without the clock, (BAND, width, 3)."""
     band = Image.new("RGB", (width, BAND), _BACKGROUND)
     draw = ImageDraw.Draw(band)
     text, font = _fit(draw, language, 14, width - CLOCK)
@@ -101,14 +99,14 @@ def _band(
 
 @lru_cache(maxsize=64)
 def _piece(text: str, prompt: bool) -> NDArray[np.uint8]:
-    """The clock's word or a digit, (height, width, 3)."""
+    """Return the clock's word or a digit, (height, width, 3)."""
     piece = Image.new("RGB", (round(_font(13).getlength(text)), CLOCK_BOTTOM), _BACKGROUND)
     ImageDraw.Draw(piece).text((0, 5), text, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13))
     return np.asarray(piece)
 
 
 def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done: bool) -> None:
-    """A box at ``x`` pixels: ticked, or with the letter of what memory has to do."""
+    """Draw a box at ``x`` pixels with a tick, or with the letter of the memory operation."""
     colour = OPERATION_COLOURS[operation]
     box = (x, 34, x + 20, 54)
     draw.rounded_rectangle(box, 4, fill=colour if done else None, outline=colour, width=2)
@@ -121,31 +119,31 @@ def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done:
 # --- writing ---
 
 LAST_FRAMES = 20
-"""How often the final frame is repeated: a second to see how it ended."""
+"""Repetitions of the final frame: one second."""
 AHEAD = 2
-"""Frames that may wait for the encoder: as many are in memory. A third one waits to be added."""
+"""Maximum number of frames that wait for the encoder; adding another one blocks."""
 FORMAT = "yuv420p"
-"""How pixels are stored."""
+"""Pixel format of the file."""
 
 
 class _DiscardedError(Exception):
-    """The video is not wanted."""
+    """The video was discarded."""
 
 
 @cache
 def _encoder(process: int) -> ThreadPoolExecutor:
-    """Return the one thread of this process that encodes; one that was forked has none of its parent's."""
+    """Return the encoder thread of this process; a forked process needs its own."""
     return ThreadPoolExecutor(1, "video")
 
 
 class VideoRecorder:
-    """Write frames to an MP4 that appears under its name only when it is whole.
+    """Write frames to an MP4 file that appears under its name only when it is complete.
 
-    Opening, encoding and writing happen in the order of the calls, in a thread; PyAV and x264 let others compute
-    meanwhile. `add` and `finish` raise a `MemobenchError` when the video cannot be written; then `discard` it.
+    A thread opens, encodes and writes in the order of the calls; PyAV and x264 release the GIL. `add` and `finish`
+    raise a `MemobenchError` if the video cannot be written; call `discard` then.
 
     Args:
-        path: the file to be.
+        path: the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -157,18 +155,18 @@ class VideoRecorder:
         self._error: Exception | None = None
 
     def add(self, frame: NDArray[np.uint8]) -> None:
-        """Append a frame (height, width, 3); height and width must be even and stay the same. It stays the caller's."""
+        """Append a copy of a frame (height, width, 3); height and width must be even and constant."""
         from av import VideoFrame
 
         self._size = height, width = self._size or (frame.shape[0], frame.shape[1])
         picture = self._next() if len(self._waiting) == AHEAD else VideoFrame(width, height, "rgb24")
-        plane = picture.planes[0]  # its lines may be longer than the picture is wide
+        plane = picture.planes[0]  # lines may be padded
         lines = np.frombuffer(plane, np.uint8).reshape(height, plane.line_size)
         lines[:, : 3 * width].reshape(height, width, 3, copy=False)[:] = frame
         self._later(self._encode, picture)
 
     def finish(self) -> Path | None:
-        """Hold the last frame, close the file and give it its name; None when there were no frames."""
+        """Repeat the last frame and complete the file; return its path, None without frames."""
         if not self._waiting:
             return None
         while self._waiting:
@@ -178,38 +176,38 @@ class VideoRecorder:
         return self._path
 
     def discard(self) -> None:
-        """Throw an unfinished video away, with the frames that wait to be encoded."""
+        """Delete an unfinished video and the frames that wait for the encoder."""
         self._error = _DiscardedError()
         wait(self._waiting)
         self._waiting.clear()
-        with suppress(_DiscardedError), self._writing:  # an error is what makes a draft go
+        with suppress(_DiscardedError), self._writing:  # an error removes the draft
             if self._container is not None:
-                with suppress(Exception):  # what is thrown away may end as it likes
+                with suppress(Exception):  # the file is removed anyway
                     self._container.close()
                 self._container = None
             raise _DiscardedError
 
     def _later(self, work: Callable[[VideoFrame], None], picture: VideoFrame) -> None:
-        """Have the thread do something to a picture."""
+        """Submit work on a picture to the thread."""
         self._waiting.append(_encoder(os.getpid()).submit(self._do, work, picture))
 
     def _next(self) -> VideoFrame:
-        """Wait until the oldest of what waits is done; return its picture, which is free again."""
+        """Wait for the oldest submitted work; return its picture for reuse."""
         picture = self._waiting.popleft().result()
         if self._error is not None:
-            reason = getattr(self._error, "strerror", None)  # what the system or FFmpeg says
+            reason = getattr(self._error, "strerror", None)  # of the system or FFmpeg
             if reason is None:
                 raise self._error
             raise MemobenchError(
-                f"the video {self._path} cannot be written ({reason}); make room there, choose another output_dir=, or "
-                "record none with videos=0"
+                f"the video {self._path} cannot be written ({reason}); free disk space, choose another output_dir=, or "
+                "set videos=0"
             ) from self._error
         return picture
 
     # --- in the thread ---
 
     def _do(self, work: Callable[[VideoFrame], None], picture: VideoFrame) -> VideoFrame:
-        """Do it, unless an error came before: FFmpeg ends the process when it is handed more after one."""
+        """Do the work unless an error occurred before: after an error, FFmpeg ends the process on the next call."""
         if self._error is None:
             try:
                 work(picture)
@@ -218,7 +216,7 @@ class VideoRecorder:
         return picture
 
     def _encode(self, picture: VideoFrame) -> None:
-        """Append what is in the picture; the encoder copies it, converted."""
+        """Append a picture; the encoder converts and copies it."""
         if self._container is None:
             self._open(picture)
         self._container.mux(self._stream.encode(picture))
@@ -228,15 +226,14 @@ class VideoRecorder:
 
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._container = av.open(str(self._writing.enter_context(draft_of(self._path.absolute()))), "w", format="mp4")
-        # Ultrafast costs a tenth of a rendered frame, and more threads only add to it; crf 20 keeps small text
-        # readable.
+        # Ultrafast takes a tenth of the time of rendering; more threads are slower. crf 20 keeps small text readable.
         options = {"preset": "ultrafast", "crf": "20", "threads": "1"}
         self._stream = self._container.add_stream("libx264", rate=CONTROL_HZ, options=options)
         self._stream.height, self._stream.width = picture.height, picture.width
         self._stream.pix_fmt = FORMAT
 
     def _end(self, picture: VideoFrame) -> None:
-        """Repeat the last picture, which is converted once, and let the file take its name."""
+        """Repeat the last picture and complete the file."""
         last = picture.reformat(format=FORMAT)
         for _ in range(LAST_FRAMES):
             last.pts = None  # the encoder numbers it

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, UNTOLD
+from lerobot_memobench.envs.episode_log import OMITTED, POLICY
 from lerobot_memobench.evaluation.metrics import Record, policy_inputs, stand_ins_of
 from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
@@ -47,13 +47,13 @@ def protocol_phrases(run: Run) -> list[str]:
     records = run.records
     return [
         f"{of_all(records, 'suite')} suite",
-        *(f"{key} {value}" for key in ("world", "protocol") if (value := of_all(records, key)) != UNTOLD[key]),
+        *(f"{key} {value}" for key in ("world", "protocol") if (value := of_all(records, key)) != OMITTED[key]),
         *([count_of(len(missing), "stand-in")] if (missing := stand_ins_of(records)) else []),
         f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
         *_seeds(run),
         _extent(records),
         *_replan(records),
-        *(f"{name}={run.protocol[name]:g}" for name in PACE if run.protocol.get(name, UNTOLD[name]) != UNTOLD[name]),
+        *(f"{name}={run.protocol[name]:g}" for name in PACE if run.protocol.get(name, OMITTED[name]) != OMITTED[name]),
         *(["each scene with each variant"] if run.protocol.get("evidence") else []),
     ]
 

@@ -16,8 +16,8 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import (
     EXTENT,
     MOST_EPISODES,
+    OMITTED,
     POLICY,
-    UNTOLD,
     differences,
     notes_on_not_run,
     read_episodes,
@@ -51,7 +51,7 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     folder = Path(folder)
     card = read_evaluation(folder)
     told: dict[str, Any] = card.get("protocol", {})
-    if not {*EXTENT, *SETTINGS} - {*UNTOLD} <= set(told):
+    if not {*EXTENT, *SETTINGS} - {*OMITTED} <= set(told):
         told = {**protocol_of_log(read_episodes(folder)), **told}
     return {**told, POLICY: card.get(POLICY) or told.get(POLICY) or {}}
 
@@ -66,7 +66,7 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     seeded = all(record.get("seed") is not None for record in records)
     values: dict[str, set[Any]] = {
         "seed_base": {seed_base(record) for record in records if seeded},
-        **{key: {of_all(records, key)} - {UNTOLD[key]} for key in ("suite", "world", "protocol")},
+        **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", "world", "protocol")},
         **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
     }
     for key, distinct in values.items():
@@ -85,7 +85,7 @@ def of_all(records: Iterable[Mapping[str, Any]], key: str) -> str:
     Raises:
         MemobenchError: they are of several.
     """
-    there = {record.get(key, UNTOLD[key]) for record in records} or {UNTOLD[key]}
+    there = {record.get(key, OMITTED[key]) for record in records} or {OMITTED[key]}
     if len(there) > 1:
         raise MemobenchError(
             f"the rollouts are of the {key}s {' and '.join(sorted(there))}; report each {key} by itself"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from lerobot_memobench.envs.episode_log import UNTOLD
+from lerobot_memobench.envs.episode_log import OMITTED
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
@@ -379,7 +379,7 @@ def departures(run: Run) -> list[str]:
     if counts != {PAPER_EPISODES}:
         low, high = min(counts), max(counts)
         found.append(f"{low if low == high else f'{low} to {high}'} episodes of each instead of {PAPER_EPISODES}")
-    known = {**UNTOLD, **run.protocol}
+    known = {**OMITTED, **run.protocol}
     for key, value in PAPER_PROTOCOL.items():
         if key in known and known[key] != value:
             found.append(f"{key.replace('_', ' ')} {known[key]} instead of {value}")

@@ -35,14 +35,14 @@ class PromptDemonstrator:
         rng: random source of small variations.
 
     Attributes:
-        shown: whether the last prompt succeeded, for example whether a routine reached its goal.
+        succeeded: whether the last prompt succeeded, for example whether a routine reached its goal.
     """
 
     def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
         assert task.prompt is not None
         self._task, self._sim, self._rng = task, sim, rng
         self._prompt = task.prompt
-        self.shown = False
+        self.succeeded = False
 
     def actions(self) -> Iterator[NDArray[np.float32]]:
         """Yield the actions (7,) of the prompt, one per control step."""
@@ -72,7 +72,7 @@ class PromptDemonstrator:
         expert = Expert(self._task, self._sim, self._rng)
         while not expert.done:
             yield expert.act()
-        self.shown = expert.succeeded
+        self.succeeded = expert.succeeded
         yield from go_home(expert.hand, position, rotation)
 
     def _hide(self) -> Steps:
@@ -87,13 +87,13 @@ class PromptDemonstrator:
         for atom in (*hidden, HAND_HOME):
             yield from expert.achieve(atom)
         yield from expert.hand.wait(PAUSE_STEPS, OPEN)
-        self.shown = all(self._sim.holds(atom) for atom in (*hidden, HAND_HOME))
+        self.succeeded = all(self._sim.holds(atom) for atom in (*hidden, HAND_HOME))
 
     def _pick(self, hand: Hand) -> Steps:
         place, turned = self._sim.asset_pose(self._referent())
         held = yield from pick(hand, self._referent())
         if held is not None:
-            self.shown = True
+            self.succeeded = True
             yield from hand.wait(PAUSE_STEPS, CLOSED)
             yield from put_at(hand, held, place, turned)
 
@@ -106,12 +106,12 @@ class PromptDemonstrator:
         for height in (0.0, 0.05, 0.0):
             yield from hand.move(above + height * UP, rotation, CLOSED, tolerance=0.008, speed=0.6, timeout=60)
         yield from hand.wait(PAUSE_STEPS, CLOSED)
-        self.shown = bool(np.linalg.norm((hand.position - place)[:2]) < 0.03)
+        self.succeeded = bool(np.linalg.norm((hand.position - place)[:2]) < 0.03)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.02)
 
     def _highlight(self, hand: Hand) -> Steps:
         self._sim.highlights = highlights_at(self._task, self._sim, PAUSE_STEPS)
-        self.shown = True
+        self.succeeded = True
         yield from hand.wait(HIGHLIGHT_STEPS, OPEN)
         self._sim.highlights = ()
 

@@ -1,6 +1,6 @@
 """The result card of an evaluation, ``evaluation.json``: everything needed to understand, repeat and check it.
 
-It is written when an evaluation starts, and again with the outcomes when it ends. `evaluation_file.WholeCard` lists its
+It is written when an evaluation starts, and again with the outcomes when it ends. `evaluation_file.Card` lists its
 parts.
 """
 
@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-from lerobot_memobench.envs.acting import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.envs.episode_log import INPUTS, key_of
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, FORMAT
 from lerobot_memobench.envs.observations import policy_inputs
@@ -21,6 +20,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
+from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.run.machine import run_facts
 from lerobot_memobench.run.plan import EvaluationPlan
 
@@ -259,7 +259,7 @@ def _json(card: Mapping[str, Any]) -> str:
 # --- whether an episode was drawn as it is drawn here ---
 
 
-def drawn_otherwise(records: Iterable[Mapping[str, Any]]) -> str | None:
+def first_variant_mismatch(records: Iterable[Mapping[str, Any]]) -> str | None:
     """Return the first episode of a log or card whose variant is not the one that its seed draws here, None for none.
 
     Before variants were drawn in balance, each seed drew its own by itself. Tasks of one's own are not looked at.

@@ -15,11 +15,10 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_memobench.envs.acting import acting
-from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.configuration_memobench import Opener
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.jobs.threads import limit_torch
+from lerobot_memobench.policies.lerobot_config import acting, quiet
 from lerobot_memobench.policies.memory_reads import ReadLog
 from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
 from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll

@@ -10,9 +10,9 @@ from functools import cache
 from importlib import metadata
 from typing import Any
 
-from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
+from lerobot_memobench.policies.lerobot_config import quiet
 
 PREFIX = "lerobot-"
 ROLES = {"eval": ACTING, "train": LEARNING}

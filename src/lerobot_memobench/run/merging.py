@@ -27,8 +27,8 @@ from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import (
-    drawn_otherwise,
     extended,
+    first_variant_mismatch,
     remove_card,
     with_episodes,
     write_card,
@@ -154,7 +154,7 @@ def _check_owners(
 
 def _check_draws(records: Mapping[Path, Sequence[Mapping[str, Any]]]) -> None:
     """Raise where some parts drew their variants as it is done here, and others by an earlier version's rule."""
-    otherwise = {folder: drawn_otherwise(lines) for folder, lines in records.items()}
+    otherwise = {folder: first_variant_mismatch(lines) for folder, lines in records.items()}
     strange = {folder: problem for folder, problem in otherwise.items() if problem is not None}
     if 0 < len(strange) < len(records):
         folder, problem = next(iter(strange.items()))

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
 from lerobot_memobench.envs.settings import OBJECTS, PIXELS
@@ -23,6 +22,7 @@ from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.compatibility import check_features
+from lerobot_memobench.policies.lerobot_config import overrides, quiet
 from lerobot_memobench.protocol import (
     EVALUATION_EPISODES,
     EVALUATION_SEED,
@@ -229,10 +229,10 @@ def check_scenes(plan: EvaluationPlan) -> None:
 def _check_simulator(environment: MemobenchEnvConfig) -> None:
     """Refuse a machine on which every episode would fail: no arm or no assets."""
     from lerobot_memobench.sim.robot import robosuite_version
-    from lerobot_memobench.sim.worlds import KINDS
+    from lerobot_memobench.sim.worlds import WORLDS
 
     robosuite_version()
-    KINDS[environment.world].check()
+    WORLDS[environment.world].check()
 
 
 def _output(asked: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> Path:

@@ -21,7 +21,7 @@ from typing import Any
 from draccus.utils import is_enum, is_literal, is_union
 from lerobot.configs.eval import EvalPipelineConfig
 
-from lerobot_memobench.envs.episode_log import MOST_EPISODES, UNTOLD, differences, read_log
+from lerobot_memobench.envs.episode_log import MOST_EPISODES, OMITTED, differences, read_log
 from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import EnvSettings, revision
@@ -39,7 +39,7 @@ from lerobot_memobench.run.arguments import (
     without_none,
 )
 from lerobot_memobench.run.arguments import settings as settings_of
-from lerobot_memobench.run.card import checkpoint_files, detector_hash, drawn_otherwise, tree_hash
+from lerobot_memobench.run.card import checkpoint_files, detector_hash, first_variant_mismatch, tree_hash
 from lerobot_memobench.run.machine import PACKAGES, drawn_with, versions
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of_flags
@@ -93,14 +93,14 @@ def repeat(
     """
     card = repeatable_card(path, server)
     check_policy(card)
-    if (otherwise := drawn_otherwise(card["episodes"])) is not None:
+    if (otherwise := first_variant_mismatch(card["episodes"])) is not None:
         raise MemobenchError(
             f"the card's episodes drew their variants otherwise ({otherwise}): an earlier version ran them, which did "
             f"not draw in balance; repeat it with that version ({_version_of(card)})"
         )
     told = card["protocol"]
     for name, here in revision(told.get("suite", PUBLISHED)).items():
-        if (there := told.get(name, UNTOLD[name])) != here:
+        if (there := told.get(name, OMITTED[name])) != here:
             raise MemobenchError(
                 f"the card's protocol of strict tasks has {name}={there}, and this version {name}={here}: an earlier "
                 f"version ran it; repeat it with that version ({_version_of(card)})"

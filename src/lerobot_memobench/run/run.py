@@ -20,8 +20,8 @@ from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import (
     card_of,
-    drawn_otherwise,
     extended,
+    first_variant_mismatch,
     with_checkpoint,
     with_episodes,
     write_card,
@@ -148,7 +148,7 @@ def resumed_card(folder: Path, card: dict[str, Any], tell: Tell) -> dict[str, An
             f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "
             "settings to go on with it, or choose another output_dir="
         )
-    if (problem := drawn_otherwise(read_log(folder))) is not None:
+    if (problem := first_variant_mismatch(read_log(folder))) is not None:
         raise MemobenchError(
             f"the episodes in {folder} drew their variants otherwise ({problem}): an earlier version ran them, which "
             "did not draw in balance; go on with that version, or choose another output_dir="

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NotRequired
 
-from lerobot_memobench.envs.acting import SEALED_LEDGER, tree_hash
 from lerobot_memobench.envs.evaluation_file import SealedStart
 from lerobot_memobench.io import Malformed, checked, count_of, file_hash, parsed, telling_of_the_disk
 from lerobot_memobench.jobs.processes import taking_turns
@@ -31,6 +30,7 @@ from lerobot_memobench.policies.checkpoint import (
     local_folder,
     portable_path,
 )
+from lerobot_memobench.policies.lerobot_config import SEALED_LEDGER, tree_hash
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.machine import PACKAGES, versions
 from lerobot_memobench.run.plan import EvaluationPlan

@@ -14,13 +14,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.acting import parameters_of
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import LARGE, sharing
+from lerobot_memobench.policies.lerobot_config import parameters_of
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.card import card_of
 from lerobot_memobench.run.merging import SHARDS, merge_held

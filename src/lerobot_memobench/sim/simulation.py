@@ -22,7 +22,7 @@ from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
 from lerobot_memobench.sim.world import StartState
-from lerobot_memobench.sim.worlds import KINDS, get_scene
+from lerobot_memobench.sim.worlds import WORLDS, get_scene
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
 
@@ -98,7 +98,7 @@ class Simulation:
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
         self.stand_ins, self.opaque_group = scene.stand_ins, scene.opaque_group
-        kind = KINDS[task.world]
+        kind = WORLDS[task.world]
         self.world = kind.predicates(task, self.model, self.data, scene.assets)
         self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
         self._at_home: Snapshot | None = None

@@ -112,7 +112,7 @@ class Kind:
     check: Callable[[], object] = lambda: None
 
 
-KINDS: dict[str, Kind] = {
+WORLDS: dict[str, Kind] = {
     MEMOBENCH: Kind(build_scene, Placer, World),
     LIBERO: Kind(build_libero_scene, LiberoPlacer, LiberoWorld, check_assets),
 }
@@ -126,7 +126,7 @@ def get_scene(task: Task) -> Scene:
     if key in _scenes:
         _scenes.move_to_end(key)
         return _scenes[key]
-    scene = _scenes[key] = KINDS[task.world].build(task)
+    scene = _scenes[key] = WORLDS[task.world].build(task)
     while len(_scenes) > CACHED_SCENES:
         _scenes.popitem(last=False)
     return scene

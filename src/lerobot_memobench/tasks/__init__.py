@@ -1,1 +1,1 @@
-"""What is the benchmark? Tasks, checkpoints, formulas and the catalogue. No simulator, no torch."""
+"""Tasks, checkpoints, formulas and the catalogue, without simulator and torch."""

@@ -22,7 +22,6 @@ from lerobot_memobench.tasks.task import (
     MEMORY_TYPES,
     METADATA_FILE,
     PUBLISHED,
-    STRICT_FAILURES,
     SUITES,
     Checkpoint,
     MemoryType,
@@ -40,8 +39,8 @@ TASK_NUMBERS = re.compile(r"(\d+)(?:-(\d+))?")
 NUMERIC_ENTRY = re.compile(r"[\d -]*[\d-]")
 """An entry of digits, spaces and hyphens only; reported as a malformed number or range if it is not one."""
 
-BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
-"""Short demonstration task: only the prompt video shows which of three bowls is meant."""
+DEMO_TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
+"""Short task of the demo: only the demonstration prompt shows which of three bowls is correct."""
 
 _PROMPT_WORDS: tuple[tuple[str, PromptKind], ...] = (
     ("picked up", "pick"),
@@ -141,7 +140,7 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
         else:
             word = pieces[start].strip()
             if not word:
-                given = "nothing" if not spec.strip() else f"an empty entry in {spec!r}"
+                given = "no name" if not spec.strip() else f"an empty entry in {spec!r}"
                 raise MemobenchError(
                     f"found {given} among the tasks; expected 'all', or names, numbers or memory types separated by "
                     "single commas"
@@ -251,15 +250,14 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
     text = read_text(folder / BDDL_FILE, "the scene, instruction and goal in BDDL")
     problem = parse_bddl(text, folder / BDDL_FILE)
     path = folder / METADATA_FILE
-    read = require_metadata or path.exists()
-    metadata = Metadata.read(path, problem) if read else Metadata(path, problem, {})
-    checkpoints = metadata.checkpoints()
-    memory_type = metadata.choice("memory_type", MEMORY_TYPES) or _infer_memory_type(folder, problem)
-    stated = "prompt" in metadata.data
+    metadata = Metadata(path, problem, present=require_metadata or path.exists())
+    data, checkpoints = metadata.data, metadata.checkpoints()
+    memory_type = data.get("memory_type") or _infer_memory_type(folder, problem)
+    prompt = metadata.prompt(data["prompt"], "prompt") if "prompt" in data else None
     return Task(
         name=folder.name,
         memory_type=memory_type,
-        family=metadata.text("family") or "unspecified",
+        family=data.get("family") or "unspecified",
         language=problem.language,
         objects=problem.objects,
         fixtures=problem.fixtures,
@@ -268,16 +266,16 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         objects_of_interest=problem.objects_of_interest,
         goal=problem.goal,
         checkpoints=checkpoints,
-        prompt=metadata.prompt() if stated else _infer_prompt(memory_type, problem, checkpoints),
+        prompt=prompt if "prompt" in data else _infer_prompt(memory_type, problem, checkpoints),
         variants=metadata.variants(),
-        demo_summary=metadata.text("demo_summary"),
+        demo_summary=data.get("demo_summary", ""),
         folder=folder,
         bddl_text=text,
-        metadata=metadata.data,
-        suite=metadata.choice("suite", SUITES, PUBLISHED),
-        derived_from=metadata.text("derived_from") or None,
-        drawn=metadata.flag("drawn"),
-        spoilt_as=metadata.choice("spoilt_as", STRICT_FAILURES),
+        metadata=dict(data),
+        suite=data.get("suite", PUBLISHED),
+        derived_from=data.get("derived_from") or None,
+        drawn=data.get("drawn", False),
+        spoilt_as=data.get("spoilt_as"),
     )
 
 

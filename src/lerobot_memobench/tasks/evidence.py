@@ -1,8 +1,8 @@
-"""Determine which variant an execution acts on, and the chance level of a policy without memory.
+"""Determine the variant that an execution acts on, and the chance level of a policy without memory.
 
-Episodes run one scene with each variant of a task, so only the past differs. Most variants share an instruction: the
-demonstration prompt alone determines the correct answer. A policy without memory gives the same answer in all variants;
-its success rate is the chance level.
+Evidence episodes run one scene with each variant of a task, so only the past differs. Most variants share an
+instruction: the demonstration prompt alone determines the correct answer. A policy without memory gives the same answer
+in all variants; its success rate is the chance level.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ def scene_and_variant(task: Task, episode: int) -> tuple[int, int]:
     return episode // len(choices), choices[episode % len(choices)]
 
 
-def check_referent(prefix: str, referent: str) -> None:
-    """Check that evidence episodes may use all variants; ``prefix`` precedes setting names in the message.
+def check_referent(referent: str) -> None:
+    """Check that evidence episodes may use all variants.
 
     Raises:
         MemobenchError: ``referent`` allows the published variant only.
     """
     if referent == REFERENTS[0]:
         raise MemobenchError(
-            f"{prefix}evidence=true runs each scene with each variant, but {prefix}referent={referent} allows the "
-            f"published variant only; say referent={REFERENTS[1]}"
+            f"evidence=true runs each scene with each variant, but referent={referent} allows the published variant "
+            f"only; set referent={REFERENTS[1]}"
         )
 
 
@@ -66,14 +66,17 @@ class Choice:
 
     def __init__(self, task: Task) -> None:
         variants = _variants(task)
-        same = [one for one in variants if one.language == task.language]
-        rivals = same if len({one.goal for one in same}) > 1 else variants
+        same = [variant for variant in variants if variant.language == task.language]
+        candidates = same if len({variant.goal for variant in same}) > 1 else variants
         # Variants that share a goal are represented by the one that is run, else by the first.
-        self._variants = {one.goal: one.variant_index for one in reversed(rivals)} | {task.goal: task.variant_index}
+        indices = {variant.goal: variant.variant_index for variant in reversed(candidates)}
+        self._variants = indices | {task.goal: task.variant_index}
         self._evaluator = Evaluator(self._variants)
         self._first: int | None = None
         self._fitting = {
-            one.variant_index: handled_atoms(one) for one in rivals if one.variant_index in self._variants.values()
+            variant.variant_index: handled_atoms(variant)
+            for variant in candidates
+            if variant.variant_index in self._variants.values()
         }
         self._watched = list(dict.fromkeys(atom for order in self._fitting.values() for atom in order))
         self._handled: list[Atom] = []

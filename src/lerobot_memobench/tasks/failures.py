@@ -1,8 +1,7 @@
-"""Why a rollout failed: one class per rollout, from what its checkpoints show (paper, failure taxonomy).
+"""Classify a failed rollout by its checkpoints (paper, failure taxonomy).
 
-The paper's five classes are kept, and refined by two where they would name a memory's failure wrongly or
-not at all: the steps of a procedure in another order than its prompt's, and a horizon that is shorter than the
-protocol's.
+Two classes extend the paper's five, which would misclassify these rollouts: a procedure in another order than the
+prompt's, and a horizon below the protocol's.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ from lerobot_memobench.tasks.formula import Formula, Round, Then, When, children
 from lerobot_memobench.tasks.task import Task
 
 REFERENCE_DRIFT = "reference_drift"
-"""The class of a failure at a wrong referent."""
+"""The policy acted on a wrong referent."""
 WRONG_ORDER = "wrong_order"
-"""The class of a procedure whose steps were done in another order than the prompt showed."""
+"""The steps of a procedure were done in another order than in the prompt."""
 CUT_OFF = "cut_off"
-"""The class of a rollout that a horizon below the protocol's ended: it is unknown what it would have remembered."""
+"""A horizon below the protocol's ended the rollout; its memory is not assessed."""
 
 #: Failure classes of the published tasks, in the order of the report.
 FAILURES = (
@@ -27,12 +26,12 @@ FAILURES = (
     REFERENCE_DRIFT,
     "execution_failure",
 )
-#: Classes in addition to the paper's; a report names them where they occur.
+#: Classes in addition to the paper's; reports name those that occur.
 REFINED_FAILURES = (WRONG_ORDER, CUT_OFF)
 
 INVALID_ACTION, UNSTABLE_PHYSICS = "invalid_action", "unstable_physics"
 FAULTS = (INVALID_ACTION, UNSTABLE_PHYSICS)
-"""Classes of rollouts that were broken off, which show nothing of memory: invalid actions, unstable physics."""
+"""Classes of aborted rollouts, which do not assess memory."""
 
 _BY_OPERATION = {"S": "storage_failure", "U": "stale_memory", "C": "compression_collapse"}
 
@@ -45,14 +44,14 @@ def classify_failure(
     lost: bool = False,
     cut_off: bool = False,
 ) -> str | None:
-    """Return the failure class of an execution of ``task``, or None when it succeeded.
+    """Return the failure class of an execution of ``task``, None for a success.
 
     Args:
-        first_steps: (K,) per checkpoint the first execution step at which its predicate held, None for never.
-        success: the goal held at termination.
-        drift: another answer than the prompt's satisfied the relation (object and procedural tasks).
-        lost: the goal could no longer be reached (strict tasks).
-        cut_off: a horizon below the protocol's ended it.
+        first_steps: (K,) first execution step at which each checkpoint's predicate held; None for never.
+        success: whether the goal held at the end.
+        drift: whether a wrong answer was given (object and procedural tasks).
+        lost: whether the goal became unreachable (strict tasks).
+        cut_off: whether a horizon below the protocol's ended the episode.
     """
     if lost and task.spoilt_as is not None:
         return task.spoilt_as
@@ -67,10 +66,10 @@ def classify_failure(
 def classify(
     operations: Sequence[str], first_steps: Sequence[int | None], success: bool, drift: bool = False
 ) -> str | None:
-    """Return the paper's class, from the checkpoints' operation labels ("S", "U" or "C") alone.
+    """Return the paper's class from the operation labels ("S", "U" or "C") of the checkpoints.
 
-    The first checkpoint that was never satisfied names the class. A drift explains why it is missing, so it
-    goes before; once every checkpoint was satisfied the memory did its work and the hand did not.
+    The first checkpoint that was never satisfied determines the class, unless a drift explains it. With all checkpoints
+    satisfied, the execution failed, not the memory.
     """
     if success:
         return None
@@ -81,7 +80,7 @@ def classify(
 
 
 def asks_order(goal: Formula) -> bool:
-    """Return whether a goal holds only after its parts have come true in an order."""
+    """Return whether a goal requires an order of its parts."""
     return any(isinstance(part, Then | When | Round) for part in _parts(goal))
 
 
@@ -92,7 +91,7 @@ def _parts(formula: Formula) -> Iterator[Formula]:
 
 
 def _out_of_order(first_steps: Sequence[int | None]) -> bool:
-    """Whether a checkpoint was satisfied before one that comes before it, or without it."""
+    """Return whether a checkpoint was satisfied before, or without, an earlier one."""
     earlier_missing, latest = False, 0
     for step in first_steps:
         if step is None:

@@ -212,7 +212,7 @@ def make_operator(
     made = OPERATORS[operator.lower()]
     counted = [_checked_number(number, made.__name__, where)] if takes_number(operator) else []
     if not parts:
-        raise MemobenchError(f"{where}: found {made.__name__} with nothing in it, expected at least one formula")
+        raise MemobenchError(f"{where}: found {made.__name__} without a formula, expected at least one")
     if len(parts) != _PARTS.get(made, len(parts)):
         raise MemobenchError(
             f"{where}: found {made.__name__} over {len(parts)} formulas, expected {_WORDS[_PARTS[made]]}"

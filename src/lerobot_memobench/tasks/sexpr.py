@@ -53,7 +53,7 @@ class Reader:
             assert items is not None
             if token == ")":
                 if len(stack) == 1:
-                    raise self.error(Node(line, 0), "a ')' that closes nothing", "'(' before it or the end of the file")
+                    raise self.error(Node(line, 0), "an unmatched ')'", "'(' before it or the end of the file")
                 stack.pop().end = match.end()
                 continue
             node = Node(line, match.start(), match.end(), token)

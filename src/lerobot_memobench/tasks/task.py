@@ -50,17 +50,17 @@ def referent_text(requested: str, drawn: bool) -> str:
     return DRAWN if drawn else requested
 
 
-def check_world(prefix: str, world: str, suite: str) -> None:
-    """Check that a world exists and supports a suite; ``prefix`` precedes setting names in the message.
+def check_world(world: str, suite: str) -> None:
+    """Check that a world exists and supports a suite.
 
     Raises:
         MemobenchError: the world is unknown or does not support the suite.
     """
-    check_choice(f"{prefix}world", world, WORLDS)
+    check_choice("world", world, WORLDS)
     if (suite, world) == (STRICT, LIBERO):
         raise MemobenchError(
-            f"{prefix}world={LIBERO} was asked for with {prefix}suite={STRICT}, but only world={MEMOBENCH} has the "
-            "detents and sealed drawers of strict tasks; leave one of the two out"
+            f"world={LIBERO} does not support suite={STRICT}: only world={MEMOBENCH} has the detents and sealed "
+            "drawers of strict tasks; leave one of the two out"
         )
 
 
@@ -197,7 +197,7 @@ class Task:
         Raises:
             MemobenchError: the world does not support the task's suite.
         """
-        check_world("", world, self.suite)
+        check_world(world, self.suite)
         published = self.published and self.published.in_world(world)
         return dataclasses.replace(self, world=world, published=published)
 
@@ -209,11 +209,11 @@ class Task:
     @property
     def title(self) -> str:
         """Instruction shared by all variants, or the task's name if their instructions differ."""
-        return self.name.replace("_", " ") if any(one.language for one in self.variants) else self.language
+        return self.name.replace("_", " ") if any(variant.language for variant in self.variants) else self.language
 
     @property
     def idles(self) -> bool:
-        """Whether the robot idles before the execution, so that its start time reveals nothing."""
+        """Whether the robot idles before the execution, so that its start time carries no information."""
         return self.suite == STRICT
 
     @property
@@ -248,7 +248,7 @@ class Task:
         if k == 0:
             return base
         if not 0 < k < self.num_variants:
-            raise MemobenchError(f"{self.name} has variants 0 to {self.num_variants - 1}, not {k}; pass one of those")
+            raise MemobenchError(f"{self.name} has variants 0 to {self.num_variants - 1}, not {k}; choose one of these")
         chosen = self.variants[k - 1]
         order = chosen.order or tuple(range(len(base.checkpoints)))
         goals = chosen.goals or tuple(rename(base.checkpoints[i].goal, chosen.substitute) for i in order)

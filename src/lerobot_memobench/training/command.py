@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, INFO_FILE, check_whole, naming_damage
-from lerobot_memobench.envs.command_line import quiet
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on
@@ -26,6 +25,7 @@ from lerobot_memobench.policies.checkpoint import (
     local_folder,
     read_json,
 )
+from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.run.arguments import (
     CONFIG_FILE,
     TRAINING_OPTIONS,

@@ -11,8 +11,8 @@ from lerobot.common.train_utils import resolve_resume_checkpoint
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_memobench.envs.command_line import overrides
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.lerobot_config import overrides
 from lerobot_memobench.training.checks import check_settings
 
 CHOICES = ["policy", "reward_model"]

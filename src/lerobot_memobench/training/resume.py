@@ -10,7 +10,6 @@ from pathlib import Path
 
 import yaml
 
-from lerobot_memobench.envs.command_line import overrides, quiet
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import (
     LAST,
@@ -22,6 +21,7 @@ from lerobot_memobench.policies.checkpoint import (
     read_json,
     text_of_link,
 )
+from lerobot_memobench.policies.lerobot_config import overrides, quiet
 from lerobot_memobench.run.arguments import (
     CONFIG_FILE,
     RECIPE,

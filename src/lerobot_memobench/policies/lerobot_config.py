@@ -1,0 +1,151 @@
+"""Configurations of LeRobot's policies: overrides, plain values, and a hash that identifies what acts."""
+
+from __future__ import annotations
+
+import datetime as dt
+import hashlib
+import json
+import logging
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.envs.episode_log import Acting
+from lerobot_memobench.envs.observations import policy_inputs
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.io import file_hash
+
+SEALED_LEDGER = "sealed_tests.jsonl"
+"""File in which `run.sealed` counts a policy's runs on the sealed seeds."""
+NOT_THE_CHECKPOINT = (
+    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes", SEALED_LEDGER),
+    *("training_curve.png", "training_curve.json"),
+)
+"""Files of a checkpoint folder that do not affect the policy's actions."""
+
+ELSEWHERE = (
+    *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
+    *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
+)
+"""Settings of where a policy runs or is published; its actions do not depend on them."""
+
+
+def overrides(key: str, flags: Sequence[str]) -> list[str]:
+    """Return the flags that set fields of a choice such as ``policy``, in the form that draccus reads."""
+    from lerobot.configs import parser
+
+    given = parser.get_cli_overrides(key, flags) or []
+    # LeRobot's parser takes these out before draccus reads.
+    return [flag for flag in given if not flag.startswith("--discover_packages_path")]
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Suppress LeRobot's log lines about plugins and configurations; the run logs them again."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(level)
+
+
+def encoded(policy: Any) -> dict[str, Any]:
+    """Return a policy's configuration as plain JSON values."""
+    import draccus
+
+    found = json.loads(json.dumps(draccus.encode(policy), default=str))
+    assert isinstance(found, dict)
+    return {**found, "type": policy.type}
+
+
+# --- identity ---
+
+
+def acting(policy: Any, path: str | None, seeds: range | None, settings: EnvSettings) -> Acting:
+    """Return the description of a policy for the episode log.
+
+    Args:
+        policy: its configuration.
+        path: its checkpoint; None for a policy without one.
+        seeds: seeds of the requested episodes, see `Acting`.
+        settings: settings of its environments.
+    """
+    run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
+    inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
+    return Acting(_identity(policy, path), inputs, run, seeds)
+
+
+def _identity(policy: Any, path: str | None) -> dict[str, Any]:
+    """Return a policy's type and one hash over its checkpoint and the settings that differ from it."""
+    weights = None if path is None else checkpoint_hash(path)
+    with quiet():
+        default = _default_config(policy, path)
+    facts = json.dumps([policy.type, weights, _changes(policy, default)], sort_keys=True, default=str)
+    found = {"type": policy.type, "identity": f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"}
+    return found | ({"sha256": weights} if path is not None and Path(path).is_dir() else {})
+
+
+def _default_config(policy: Any, path: str | None) -> Any:
+    """Return the configuration of a checkpoint, or the default one of a type."""
+    from lerobot.configs import PreTrainedConfig
+
+    if path is not None:
+        return PreTrainedConfig.from_pretrained(path)
+    try:
+        return type(policy)()
+    except TypeError:  # a plugin with a required setting
+        return policy
+
+
+def _changes(policy: Any, default: Any) -> dict[str, Any]:
+    """Return the settings that differ from the default; a file is represented by its hash."""
+    before, now = encoded(default), encoded(policy)
+    return {k: _content(v) for k, v in now.items() if k not in (*ELSEWHERE, "type") and before.get(k) != v}
+
+
+def _content(value: Any) -> Any:
+    return file_hash(Path(value)) if isinstance(value, str) and Path(value).is_file() else value
+
+
+def checkpoint_hash(path: str) -> str:
+    """Return one hash for a checkpoint folder; for a repository, its name and the commit in the local cache."""
+    if Path(path).is_dir():
+        return tree_hash(checkpoint_files(Path(path)))
+    folder = _cached_folder(path)
+    return path if folder is None else f"{path}@{folder.name}"
+
+
+def parameters_of(path: str) -> int | None:
+    """Return the approximate number of parameters of a checkpoint: the size of its weights divided by four bytes.
+
+    Args:
+        path: folder or repository; the result is None for one that is not on this machine.
+    """
+    folder: Path | None = Path(path).expanduser()
+    if folder is not None and not folder.is_dir():
+        folder = _cached_folder(path)
+    sizes = [] if folder is None else [file.stat().st_size for file in folder.glob("*model*.safetensors")]
+    return sum(sizes) // 4 if sizes else None
+
+
+def _cached_folder(repository: str) -> Path | None:
+    """Return the local copy of a repository, None without one."""
+    from huggingface_hub import try_to_load_from_cache
+
+    found = try_to_load_from_cache(repository, "config.json")
+    return Path(found).parent if isinstance(found, str) else None
+
+
+def checkpoint_files(folder: Path) -> dict[str, str]:
+    """Return name -> SHA-256 of the files of a checkpoint."""
+    files = sorted(path for path in folder.iterdir() if path.is_file() and path.name not in NOT_THE_CHECKPOINT)
+    return {path.name: file_hash(path) for path in files}
+
+
+def tree_hash(files: Mapping[str, str]) -> str:
+    """Return one SHA-256 over the lines ``<sha256>  <name>`` in the order of names, as sha256sum prints them."""
+    lines = "".join(f"{files[name]}  {name}\n" for name in sorted(files))
+    return hashlib.sha256(lines.encode()).hexdigest()

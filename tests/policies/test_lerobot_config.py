@@ -1,0 +1,112 @@
+"""The identity of a policy in logs: it follows checkpoint and settings, and separates evaluations."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+
+from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, read_episodes, write_episodes
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
+from lerobot_memobench.envs.settings import OBJECTS, EnvSettings
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records import read_protocol, read_runs
+from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchRandomConfig
+from lerobot_memobench.policies.lerobot_config import acting
+from lerobot_memobench.run.merging import merge
+from lerobot_memobench.sim.object_layout import SIZE
+
+TASK = "turn_on_the_stove_and_turn_it_off"
+POSES = "privileged object state"
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return two small ACT checkpoints that differ only in their random weights."""
+    sizes: dict[str, Any] = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1}
+    sizes |= {"chunk_size": 4, "n_action_steps": 4, "use_vae": False, "pretrained_backbone_weights": None}
+    inputs = {
+        "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
+        "observation.environment_state": PolicyFeature(FeatureType.ENV, (SIZE,)),
+    }
+    action = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
+    config = ACTConfig(device="cpu", push_to_hub=False, input_features=inputs, output_features=action, **sizes)
+    shapes = {key: feature.shape for key, feature in {**inputs, **action}.items()}
+    stats = {key: {"mean": torch.zeros(shape), "std": torch.ones(shape)} for key, shape in shapes.items()}
+    folders = []
+    for seed in range(2):
+        torch.manual_seed(seed)
+        folder = tmp_path_factory.mktemp(f"act_{seed}")
+        for part in (ACTPolicy(config), *make_pre_post_processors(config, dataset_stats=stats)):
+            part.save_pretrained(folder)
+        folders.append(folder)
+    return folders
+
+
+def evaluated(policy: Path, out: Path, *more: str) -> int:
+    words = [f"tasks={TASK}", "horizon=3", "env.render=fast", "videos=0", "batch_size=1"]
+    return main(["eval", "env=memobench", f"policy={policy}", *words, f"output_dir={out}", *more])
+
+
+def test_resume_and_merge_refuse_another_policy(tmp_path: Path, checkpoints: list[Path]) -> None:
+    (first, second), out = checkpoints, tmp_path / "out"
+    assert evaluated(first, out, "episodes=1") == 0
+    (record,) = read_episodes(out)
+    assert record["run"]
+    assert (record["inputs"], record["policy"][:4]) == (POSES, "act ")
+    assert json.loads((out / EVALUATION_FILE).read_text())["protocol"]["inputs"] == POSES
+    assert json.loads((out / "report.json").read_text())["inputs"] == POSES
+    for policy, more in ((second, ()), (first, ("replan=2",))):
+        assert evaluated(policy, out, "episodes=1", "resume=true", *more) == 2
+    assert read_episodes(out) == [record]
+    assert evaluated(first, out, "episodes=2", "resume=true", "device=cpu", "replan=4") == 0
+    found = read_episodes(out)
+    assert [each["episode"] for each in found] == [0, 1]
+    assert (len({each["policy"] for each in found}), len({each["run"] for each in found})) == (1, 2)
+
+    merged = tmp_path / "merged"
+    assert merge(merged, [out]) == []
+    assert read_protocol(merged)["inputs"] == POSES
+    assert evaluated(second, tmp_path / "other", "episodes=1") == 0
+    with pytest.raises(MemobenchError, match=r"policy\.sha256"):
+        merge(tmp_path / "both", [out, tmp_path / "other"])
+    mixed = [*found, *({**each, "episode": 9} for each in read_episodes(tmp_path / "other"))]
+    write_episodes(tmp_path / "mixed", mixed)
+    with pytest.raises(MemobenchError, match="2 policies"):
+        read_runs([tmp_path / "mixed"])
+
+
+def test_identity_follows_checkpoint_and_settings(checkpoints: list[Path]) -> None:
+    def identity(path: Path = checkpoints[0], **changes: Any) -> str:
+        config = PreTrainedConfig.from_pretrained(path)
+        for name, value in changes.items():
+            setattr(config, name, value)
+        return str(acting(config, str(path), None, EnvSettings()).policy["identity"])
+
+    assert identity() == identity(device="cuda")
+    assert len({identity(), identity(n_action_steps=2), identity(checkpoints[1])}) == 3
+    found = acting(MemobenchRandomConfig(), None, range(7, 9), EnvSettings())
+    assert (found.inputs, found.counts(8), found.counts(9)) == ("nothing", True, False)
+    unknown = UNKNOWN_POLICY
+    assert (unknown.protocol, unknown.line, unknown.counts(3)) == ({}, {}, True)
+
+
+def test_lerobot_commands_log_no_policy_and_use_separate_folders(tmp_path: Path) -> None:
+    for _ in range(2):  # LeRobot's training creates environments for each of its evaluations
+        config = MemobenchEnvConfig(tasks=TASK, obs_type=OBJECTS, horizon=1, log_dir=str(tmp_path / "run"))
+        (env,) = config.create_envs(1)["temporal"].values()
+        env.reset(seed=[7])
+        env.step([[0.0] * 7])
+        env.close()
+    runs = read_runs([tmp_path / "run", tmp_path / "run" / "evaluation-2"])
+    assert [len(run.records) for run in runs] == [1, 1]
+    assert [run.protocol["policy"] for run in runs] == [{}, {}]
