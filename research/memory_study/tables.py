@@ -17,9 +17,9 @@ from lerobot_memobench.evaluation.statistics import Estimate
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES
-from research.learning.results import adjusted, average_success, contrast, contrasts_table, episodes_of, markdown
 from research.memory_study.cells import Cell, difference
-from research.memory_study.grid import AFTER, ROLLOUTS, SEALED, TRAINING, Grid, after, word_of
+from research.memory_study.contrasts import Contrast, adjusted, average_success, contrast, episodes_of
+from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid
 
 REFERENCES = ("no memory", "clock only", "frames")
 """Rows from which the others' differences are told."""
@@ -50,7 +50,6 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         ("Success by task", _by_task(rows, grid.suites[suite].ceilings)),
         ("How rollouts ended, all training seeds together", _endings(rows)),
         ("Other conditions of the rollouts, first training seed", _conditions(rows)),
-        ("Success and satisfied checkpoints by updates", _by_updates(rows)),
         *((f"Minus *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
         ("The sealed test", _sealed(rows)),
         *((f"The sealed test, minus *{name}*", _differences(rows, name, SEALED)) for name in REFERENCES),
@@ -115,22 +114,13 @@ def evaluated(cell: Cell, part: str) -> bool:
 
 
 def _check_policies(rows: Rows) -> None:
-    """Refuse a cell whose parts are of two policies, and a policy that two cells are of; a log tells its weights' hash.
-
-    An evaluation of an earlier checkpoint is of other weights.
-    """
-    of_policy: dict[str, Path] = {}
+    """Refuse a cell whose evaluations are of two policies, by the hash of their weights in the logs."""
     for cell in (cell for cells in rows.values() for cell in cells):
-        parts = [part for part in cell.parts if not part.startswith(AFTER) and evaluated(cell, part)]
-        folders = [cell.evaluation(part) for part in parts]
-        found = {one["policy"]: folder for folder in folders for one in _rollouts(folder) if one.get("policy")}
+        folders = [cell.evaluation(part) for part in cell.parts if evaluated(cell, part)]
+        found = {line["policy"]: folder for folder in folders for line in _rollouts(folder) if line.get("policy")}
         if len(found) > 1:
-            told = " and ".join(map(str, found.values()))
-            raise MemobenchError(f"{told} are of two policies; remove what is of the older one, and run it again")
-        for policy, folder in found.items():
-            if other := of_policy.get(policy):
-                raise MemobenchError(f"{other} and {folder} are of one policy; remove the one that is wrong")
-            of_policy[policy] = folder
+            both = " and ".join(map(str, found.values()))
+            raise MemobenchError(f"{both} are of two policies; remove the older one's and run it again")
 
 
 def report(cell: Cell, part: str) -> dict[str, Any]:
@@ -298,29 +288,6 @@ def _condition(cell: Cell, part: str, parts: Sequence[str]) -> str:
     return told
 
 
-def curves(rows: Rows) -> dict[str, list[tuple[int, list[dict[str, float | None]]]]]:
-    """Return row -> updates and the averages of each training seed then, of the rows with earlier checkpoints."""
-    found = {}
-    for row, cells in rows.items():
-        points = []
-        for updates in cells[0].grid.rows[cells[0].row].after:
-            told = [report(cell, part)["average"] for cell in cells if evaluated(cell, part := after(updates))]
-            points += [(updates, told)] if told else []
-        if points:
-            whole = int(word_of(cells[0].training_words(), "steps") or 0)
-            found[row] = [*points, (whole, [report(cell, ROLLOUTS)["average"] for cell in cells])]
-    return found
-
-
-def _by_updates(rows: Rows) -> str:
-    lines = [
-        [row, str(updates), str(len(told)), *(_mean([one[metric] for one in told]) for metric in METRICS)]
-        for row, points in curves(rows).items()
-        for updates, told in points
-    ]
-    return markdown(("", "updates", "training seeds", *METRICS), lines) if lines else ""
-
-
 def _sealed(rows: Rows) -> str:
     lines = []
     for row, cells in rows.items():
@@ -341,7 +308,36 @@ def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
         if row != reference and shared:
             others = [base[cell.seed] for cell in shared]
             found[row] = contrast(_runs(shared, part), _runs(others, part), row, reference)
-    return contrasts_table(adjusted(found), reference) if found else ""
+    return _contrasts_table(adjusted(found), reference) if found else ""
+
+
+def _contrasts_table(found: Mapping[str, Contrast], reference: str) -> str:
+    lines = [
+        [
+            f"{name} minus {reference}",
+            str(each.episodes),
+            f"{100 * each.value:+.1f}",
+            f"{100 * each.low:+.1f} to {100 * each.high:+.1f}",
+            _probability(each.p),
+            ", ".join(f"{100 * value:+.0f}" for value in each.of_seeds),
+            _probability(each.p_of_seeds),
+            EMPTY if each.detectable is None else f"{100 * each.detectable:.1f}",
+        ]
+        for name, each in found.items()
+    ]
+    tests = ("p of episodes (Holm)", "of training seeds", "p of training seeds (Holm)")
+    return markdown(("", "episodes", "difference, points", "95 %", *tests, "detectable"), lines)
+
+
+def _probability(p: float | None) -> str:
+    if p is None:
+        return EMPTY
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows))
 
 
 def _costs(rows: Rows) -> str:

@@ -46,15 +46,6 @@ def necessity(
         "outputs/necessity"
     ),
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    page: Annotated[
-        Path | None, typer.Option(help="Markdown page whose table is made anew, between its marks.")
-    ] = None,
-    beside: Annotated[
-        Path | None,
-        typer.Option(
-            help="necessity.json of the published tasks; the page's table then shows them beside their strict tasks."
-        ),
-    ] = None,
     memoryless: Annotated[
         list[Path] | None,
         typer.Option(help="Evaluation of a trained policy without a memory, shown beside the bounds; repeatable."),
@@ -62,23 +53,12 @@ def necessity(
 ) -> None:
     """Find frames that look alike and need different answers: lower bounds of what a policy without memory reaches."""
     from lerobot_memobench.tasks.task import REFERENTS
-    from research import pages
-    from research.necessity.report import (
-        STUDY,
-        put_into_page,
-        read_results,
-        terminal_table,
-        write,
-    )
+    from research.necessity.report import terminal_table, write
     from research.necessity.settings import Settings
     from research.necessity.study import PIECES, make
     from research.necessity.trained import read_evaluations, with_evaluations
 
-    # Now, not after the simulation.
-    published = None if beside is None else read_results(beside)
     evaluated = read_evaluations(memoryless or [])
-    if page is not None:
-        pages.around(page, STUDY)
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
     studies = _studies([get_task(name) for name in resolve_tasks(tasks, suite)], referents, settings, out)
@@ -88,8 +68,6 @@ def necessity(
             make(studies, piece, workers, _telling(count))
     results = with_evaluations([study.result() for study in studies], evaluated)
     written = write(out, results)
-    if page is not None:
-        written.append(put_into_page(page, results, published))
     screen.print(terminal_table(results), crop=False)
     for path in written:
         screen.print(str(path), soft_wrap=True)

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure
-from lerobot_memobench.io import read_json, write_file
+from lerobot_memobench.io import write_file
 from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.task import DRAWN, REFERENTS
-from research import pages
-from research.necessity.study import KeptResult, Result, pictures_path
+from lerobot_memobench.tasks.task import DRAWN
+from research.necessity.study import Result, pictures_path
 from research.necessity.trained import in_words as rate_in_words
 
 if TYPE_CHECKING:
@@ -55,38 +54,7 @@ def verdict(result: Result) -> str:
     return "cut off" if any_order["cut_off"] else "not found"
 
 
-# --- published tasks beside their strict tasks ---
-
-HEADINGS = (
-    *("published task", "best map ≥", "without a memory"),
-    *("its strict task", "goals", "as it happens ≥", "with step ≥", "any order ≥", "any order, prob. ≥", "search"),
-    *("trained policy", "expert", "without a memory"),
-)
-
-
-def side_by_side(published: Sequence[Result], strict: Sequence[Result]) -> str:
-    """Return a Markdown table with a row per strict task, and a summary; published goals are the fixed ones."""
-    fixed = {result["task"]: result for result in published if result["referent"] == REFERENTS[0]}
-    lines = ["| " + " | ".join(HEADINGS) + " |", "|---" * len(HEADINGS) + "|"]
-    for result in strict:
-        name = get_task(result["task"]).derived_from or ""
-        row = [f"`{name}`", *_published(fixed.get(name)), f"`{result['task']}`", *_strict(result)]
-        lines.append("| " + " | ".join(row) + " |")
-    lines += ["", bounds(strict)]
-    return "\n".join(lines) + "\n"
-
-
-def _published(result: Result | None) -> list[str]:
-    """Return the cells of a published task: the best map that was found, in any order, and the verdict."""
-    if result is None or result["in_order"] is None:
-        return [NOT_APPLICABLE] * 2
-    found = (result["any_order"] or {}).get("deterministic", 0.0)
-    return [figure(max(found, result["in_order"]["as_it_happens"])), verdict(result)]
-
-
-def _strict(result: Result) -> list[str]:
-    """Return the cells of a strict task."""
-    return [str(result["variants"]), *_bounds_of(result), *_expert(result), verdict(result)]
+# --- lower bounds ---
 
 
 def _bounds_of(result: Result) -> list[str]:
@@ -351,36 +319,6 @@ def _ways(results: Sequence[Result]) -> list[str]:
 
 
 # --- files ---
-
-STUDY = "necessity"
-"""As in ``python -m research.necessity``."""
-
-
-def read_results(path: Path) -> list[Result]:
-    """Return the results that another run wrote into its ``necessity.json``.
-
-    Raises:
-        MemobenchError: it is missing, cannot be read or holds something else.
-    """
-    advice = f"name the {JSON_FILE} that `python -m research.necessity` wrote"
-    try:
-        found: list[Result] = read_json(path, list[KeptResult], advice)
-    except FileNotFoundError:
-        raise MemobenchError(f"there is no {path}; {advice}") from None
-    return found
-
-
-def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result] | None = None) -> Path:
-    """Put the table into a Markdown page, between its two marks; return the page.
-
-    Args:
-        beside: results of the published tasks; then the table shows those beside the strict tasks of ``results``.
-
-    Raises:
-        MemobenchError: see `pages.around`.
-    """
-    table = markdown(results) if beside is None else side_by_side(beside, results)
-    return pages.put_into(page, STUDY, table.rstrip("\n"))
 
 
 def write(out: Path, results: Sequence[Result]) -> list[Path]:

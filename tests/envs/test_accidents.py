@@ -59,7 +59,7 @@ def seeds_of(task: Task) -> list[int]:
 @pytest.mark.parametrize("name", ALL)
 def test_the_blind_routine_solves_what_asks_for_the_published_one_and_nothing_else(name: str) -> None:
     """Every published task. Of the strict ones no counting, order or finding one; of referents and procedures the
-    episodes that happen to ask for what the published task asks for (docs/research/strict_suite.md)."""
+    episodes that happen to ask for what the published task asks for (results/strict_suite.md)."""
     task = get_task(name)
     if task.suite == PUBLISHED:
         assert rolled(name, Episode.blind_action, HORIZON).success

@@ -51,7 +51,7 @@ FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
 }
-"""Frames of a demonstration, prompt included, on average over the full runs (docs/research/demonstration_runs.md).
+"""Frames of a demonstration, prompt included, on average over the full runs (results/demonstrations.md).
 Frames in which a robot idles take next to no time and room."""
 FRAME_BYTES, PICTURES_BYTES = 800, 5_400
 """Bytes of a frame without pictures, and of both cameras' videos per frame at 256 × 256."""
