@@ -2,7 +2,7 @@
 
 ``rollouts.parquet`` has a row per rollout: the evaluation's name, and the fields of its line in the log.
 ``evaluations.parquet`` has a row per evaluation, or training: its name, its card without episodes (JSON), the command
-and what it took. A name is the path of its folder below the folder that it was kept from.
+and its cost. A name is the path of its folder below the folder that it was kept from.
 """
 
 from __future__ import annotations

@@ -184,7 +184,7 @@ def problems_of_tables(page: Path) -> list[str]:
     for row, cells, source in rows_of(page):
         figures = source_of(page, source)
         if figures is None and NOT_KEPT not in source:
-            found.append(f"{page.name}: {row[0]} links nothing to recompute it from and lacks {NOT_KEPT!r}")
+            found.append(f"{page.name}: {row[0]} links no source and lacks {NOT_KEPT!r}")
         for name, cell in cells.items():
             if figures is not None and cell != figures.get(name):
                 found.append(f"{page.name}: {row[0]} has {name} {cell}, and {figures.get(name)} by its source")

@@ -36,10 +36,10 @@ def study(
     only: Annotated[list[str] | None, typer.Option(help="A suite, a row or seed=N; repeatable.")] = None,
     plan: Annotated[bool, typer.Option("--plan", help="Print missing cells and an estimate of the time.")] = False,
     keep: Annotated[
-        Path | None, typer.Option(help="Add evaluated cells to the Parquet tables in this folder; run nothing.")
+        Path | None, typer.Option(help="Add evaluated cells to the Parquet tables in this folder, then stop.")
     ] = None,
     kept: Annotated[
-        Path | None, typer.Option(help="Make tables and figure of the cells kept in this folder; run nothing.")
+        Path | None, typer.Option(help="Make tables and figure of the cells kept in this folder, then stop.")
     ] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder of the figure; --out by default.")] = None,
     sealed: Annotated[bool, typer.Option("--sealed", help="Run the sealed test too: once, last.")] = False,

@@ -122,7 +122,7 @@ class Cell:
         return self.folder / f"{folder_name(part)}.log"
 
     def run(self) -> None:
-        """Train, then evaluate; skip what has ended.
+        """Train, then evaluate; skip commands that have ended.
 
         Raises:
             MemobenchError: a command failed, or an earlier result was made by other words than the grid's.

@@ -43,11 +43,11 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     return save(figure, path)
 
 
-def _draw_row(axis: Any, place: int, told: dict[str, Any] | None, measure: str) -> None:
-    if told is None or not told[measure]:
+def _draw_row(axis: Any, place: int, row: dict[str, Any] | None, measure: str) -> None:
+    if row is None or not row[measure]:
         axis.text(1, place, "not run", va="center", fontsize=7, color="grey")
         return
-    of_seeds, without = told[measure], told["without"][measure]
+    of_seeds, without = row[measure], row["without"][measure]
     average = mean(of_seeds)
     axis.barh(place, average, 0.7, color=MEASURES[measure][1], alpha=0.75)
     axis.plot(of_seeds, [place] * len(of_seeds), "o", color="black", markersize=3)

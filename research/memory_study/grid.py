@@ -186,7 +186,7 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
     Several words of one kind are alternatives; words of different kinds must all hold.
 
     Raises:
-        MemobenchError: a word names nothing.
+        MemobenchError: an unknown word.
     """
     suites, rows, seeds = set[str](), set[str](), set[int]()
     for word in only:
@@ -198,7 +198,7 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
             seeds.add(int(match[1]))
         else:
             known = [*grid.suites, *grid.rows, "seed=0"]
-            raise MemobenchError(f"--only {word!r} is no suite, row or seed of the study; {nearest(word, known)}")
+            raise MemobenchError(f"--only {word!r} is not a suite, row or seed of the study; {nearest(word, known)}")
     return [
         (suite, row, seed)
         for suite, row, seed in grid.places()

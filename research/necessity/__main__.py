@@ -48,10 +48,10 @@ def necessity(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     memoryless: Annotated[
         list[Path] | None,
-        typer.Option(help="Evaluation of a trained policy without a memory, shown beside the bounds; repeatable."),
+        typer.Option(help="Evaluation of a trained policy without a memory, added to the table; repeatable."),
     ] = None,
 ) -> None:
-    """Find frames that look alike and need different answers: lower bounds of what a policy without memory reaches."""
+    """Find frames that look alike and need different answers: lower bounds of a policy without a memory."""
     from lerobot_memobench.tasks.task import REFERENTS
     from research.necessity.report import terminal_table, write
     from research.necessity.settings import Settings
@@ -65,7 +65,7 @@ def necessity(
     screen = console()
     for piece, unit in PIECES.items():
         with counting(screen, unit) as count:
-            make(studies, piece, workers, _telling(count))
+            make(studies, piece, workers, _progress(count))
     results = with_evaluations([study.result() for study in studies], evaluated)
     written = write(out, results)
     screen.print(terminal_table(results), crop=False)
@@ -73,15 +73,15 @@ def necessity(
         screen.print(str(path), soft_wrap=True)
 
 
-def _telling(count: Count) -> ProgressCallback:
-    def tell(news: Advance) -> None:
+def _progress(count: Count) -> ProgressCallback:
+    def show(news: Advance) -> None:
         count(news.done, news.total, f"{news.task_name}, seed {news.seed}", found=news.found)
 
-    return tell
+    return show
 
 
 def _studies(tasks: Sequence[Task], referents: Sequence[str], settings: Settings, out: Path) -> list[Study]:
-    """Return every task with every setting of the referent that says something of its own."""
+    """Return every task with every setting of the referent in which it differs."""
     from research.necessity.settings import settings_of
     from research.necessity.study import Study
 

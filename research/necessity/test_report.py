@@ -87,7 +87,7 @@ def test_a_drawn_task_has_one_setting_and_all_its_goals() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "expected"),
     [
         ("(open wooden_cabinet_1_top_region)", "open the top drawer"),
         ("(On butter_5 plate_1)", "put butter 5 on plate"),
@@ -96,5 +96,5 @@ def test_a_drawn_task_has_one_setting_and_all_its_goals() -> None:
         ("(sequence a b)", "sequence a b"),
     ],
 )
-def test_answers_are_titles_and_no_predicates(answer: str, said: str) -> None:
-    assert in_words(answer) == said
+def test_answers_in_words(answer: str, expected: str) -> None:
+    assert in_words(answer) == expected
