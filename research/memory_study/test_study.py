@@ -467,7 +467,7 @@ def test_cells_are_kept_and_restored(no_memory: Cell, frames: Cell, tmp_path: Pa
     evaluate(no_memory, ROLLOUTS)
     assert main([*given, "--keep", str(tmp_path / "kept")]) == 0
     evaluate(frames, ROLLOUTS, "evidence")
-    assert main([*given, "--keep", str(tmp_path / "kept")]) == 0
+    assert main([*given, "--only", "frames, no time", "--keep", str(tmp_path / "kept")]) == 0
     given[1] = str(tmp_path / "again")
     assert main([*given, "--kept", str(tmp_path / "kept")]) == 0
     text = (tmp_path / "again" / "study.md").read_text()

@@ -80,7 +80,6 @@ class Bench:
             (lambda _: report([str(self.run)], list(ReportFormat), None, self.out), 30),
             (lambda _: report([str(self.run), f"b={self.other}"], list(ReportFormat), None, None), 20),
             (lambda _: report([str(self.run), str(self.other)], html=self.out / "html"), 20),
-            (lambda _: report([str(self.run)], figures=self.out / "figures"), 5),
             (lambda _: compare(str(self.run), str(self.other), ["scene_hash"], permutations=100), 30),
             (lambda _: merge(self.out, [self.run]), 20),
             (lambda _: merge(self.run, [self.other]), 20),
