@@ -4,7 +4,7 @@
 
 All runs are public commands. The second part is a task that begins with a demonstration prompt, under the expert and
 the two policies of the package. The three act in the same scenes, of the first evaluation seeds, on privileged object
-state. A policy without a memory guesses; twelve episodes show it. Given again, the demo continues what is missing.
+state. A policy without a memory guesses; twelve episodes show it. The same command resumes.
 
 | output | |
 |---|---|

@@ -149,8 +149,8 @@ def draw_correlations(rows: Sequence[Row]) -> Figure:
                     place.scatter(x, y, 16, facecolors=face, edgecolors=colour, marker=marker, lw=0.8, clip_on=False)
                 if found:
                     r = pearson(found)
-                    said = "r not defined" if r is None else f"r = {r:.2f}"
-                    titles.append(f"{'paper' if published else 'here'}: {said} ({len(found)} points)")
+                    correlation = "r not defined" if r is None else f"r = {r:.2f}"
+                    titles.append(f"{'paper' if published else 'here'}: {correlation} ({len(found)} points)")
             place.set_title("\n".join(titles), fontsize=8)
             place.set_xlabel(f"{metric}, %")
             place.set_xlim(-4, 104)

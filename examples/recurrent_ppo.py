@@ -36,7 +36,7 @@ class FirstCheckpoint(gymnasium.Wrapper[np.ndarray, np.ndarray, dict[str, Any], 
     Observation (13,): the hand and the knob from it (dm), the knob's angle (rad) and rotation. While the hand hides the
     knob its numbers are 0, as in the environment's observation. Action (3,): displacement, for `REPEAT` control steps.
     Random actions do not reach the checkpoint, so the way to it is paid too: a hand that comes closer, a knob that
-    turns. What is gained and lost again adds up to nothing.
+    turns. A gain that is lost again adds up to 0.
     """
 
     def __init__(self, env: gymnasium.Env[dict[str, Any], np.ndarray], first_seed: int) -> None:
@@ -52,7 +52,7 @@ class FirstCheckpoint(gymnasium.Wrapper[np.ndarray, np.ndarray, dict[str, Any], 
         return self._read(observation), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Repeat an action; pay the checkpoint, and what was gained on the way to it."""
+        """Repeat an action; pay the checkpoint and the progress towards it."""
         before, reached = self._potential, False
         for k in range(REPEAT):
             self.unwrapped.need_observation(k == REPEAT - 1)  # the others are not read: faster by half

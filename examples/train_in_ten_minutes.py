@@ -3,8 +3,8 @@
     python examples/train_in_ten_minutes.py --out outputs/bowl
 
 Two CPU cores, no GPU, no pictures. The task: a demonstration prompt shows butter being put into one of three equal
-bowls; afterwards nothing in the scene tells which. `--smoke` does the same at a size that teaches nothing, in a minute.
-Given again, it goes on with what is not there yet.
+bowls; afterwards all bowls look the same. `--smoke` runs the same in a minute, too short to learn.
+The same command resumes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 POLICIES = {"memory": (), "no_memory": ("policy.memory_fusion=none",)}
-"""Name -> what its training is told beside what both share."""
+"""Name -> settings of its training, in addition to the shared ones."""
 
 
 def command(*arguments: str) -> list[str]:
@@ -47,7 +47,7 @@ def main() -> None:
         *("--perturb", "--no-images", "--workers", workers, "--out", str(data)),
     )
     if subprocess.run(generate, check=False).returncode > 1:  # 1: the expert failed at some scenes
-        sys.exit("no demonstrations; the reason stands above")
+        sys.exit("no demonstrations; see the reason above")
 
     trainings: dict[Path, subprocess.Popen[bytes]] = {}
     for name, own in POLICIES.items():

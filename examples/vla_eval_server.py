@@ -54,7 +54,7 @@ class MemoryPolicyServer(LeRobotModelServer):
         return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
-        """Return the conventions of what is read."""
+        """Return the conventions of the inputs."""
         return {**dict.fromkeys(CAMERAS, IMAGE_RGB), "state": STATE_EEF_POS_AA_GRIP, "language": LANGUAGE}
 
     def predict(self, obs: dict[str, Any], ctx: SessionContext) -> dict[str, Any]:

@@ -24,11 +24,8 @@ from typing import Any, Literal, NotRequired, Union, get_args, get_origin, get_t
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "lerobot_memobench"
 DOCS = ROOT / "docs"
-NECESSITY = {
-    "published": DOCS / "research" / "memory_necessity.md",
-    "strict": DOCS / "research" / "strict_suite.md",
-}
-"""Notes whose tables say what a policy without a memory reaches."""
+NECESSITY = ROOT / "results" / "necessity.parquet"
+"""Per task, the best rates that were found for a policy without a memory."""
 SHEET = DOCS / "figures" / "tasks.png"
 """Initial scenes of all published tasks, from `scripts/gallery.py`."""
 SHEET_SIDE = 256
@@ -37,10 +34,14 @@ COPIES = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "develop/contributing.md",
     "research/README.md": "develop/lab.md",
-    "src/lerobot_memobench/policies/shipped/memobench_small/README.md": "research/cards/memobench_small.md",
+    "src/lerobot_memobench/policies/shipped/memobench_small/README.md": "results/cards/memobench_small.md",
     "src/lerobot_memobench/policies/shipped/memobench_small_memoryless/README.md": (
-        "research/cards/memobench_small_memoryless.md"
+        "results/cards/memobench_small_memoryless.md"
     ),
+    **{
+        f"results/{page.name}": f"results/{page.name.replace('README', 'index')}"
+        for page in sorted((ROOT / "results").glob("*.md"))
+    },
 }
 """Pages that lie elsewhere in the repository -> where the site has them."""
 
@@ -425,13 +426,13 @@ def python_page() -> str:
 
 
 def needs(suite: str) -> dict[str, dict[str, tuple[str, str]]]:
-    """Return task -> referent -> (best rate found without a memory in %, verdict), from the note's table."""
+    """Return task -> referent -> (best rate found without a memory in %, verdict)."""
+    import pyarrow.parquet as pq
+
     found: dict[str, dict[str, tuple[str, str]]] = {}
-    for line in NECESSITY[suite].read_text().splitlines():
-        row = [part.strip() for part in line.strip("| ").split(" | ")]
-        if len(row) == 13 and (name := re.fullmatch(r"\w+: `([^`]+)`", row[0])):
-            rates = [float(text.split()[0]) for text in (row[6], row[9], row[10]) if text != "–"]
-            found.setdefault(name[1], {})[row[1]] = (f"{max(rates):.0f} %", row[12])
+    for row in pq.read_table(NECESSITY, filters=[("suite", "==", suite)]).to_pylist():
+        rates = [row[key] for key in ("fixed_map", "any_order", "any_order_probabilities") if row[key] is not None]
+        found.setdefault(row["task"], {})[row["referent"]] = (f"{max(rates):.0f} %", row["memory_needed"])
     return found
 
 
@@ -458,7 +459,7 @@ def tasks_page(suite: str) -> str:
     parts = [
         f"# {title}",
         "A card per task, made from its files. *Without a memory* is the best rate that was found for a policy that "
-        "decides from pictures alone ([how](../research/memory_necessity.md)): a lower bound. The hand's pose and a "
+        "decides from pictures alone ([how](../results/necessity.md)): a lower bound. The hand's pose and a "
         "clock may tell more.",
     ]
     if suite == "strict":

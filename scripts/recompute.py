@@ -1,37 +1,43 @@
-"""Recompute the published figures from what the repository keeps, and fail where a page says otherwise.
+"""Recompute the published figures from the kept rollouts; fail where a page differs.
 
-``python scripts/recompute.py`` goes through README and ``docs/benchmark/results.md``. The last cell of a table's row
-says where its figures come from: a log below ``docs/research/logs``, whose episodes are counted again; the table of a
-shipped policy's card; what `memobench describe` wrote of demonstrations. A row whose figures cannot be recomputed
-says *log not kept*. Claims in other places stand in ``docs/research/figures.md``, each with what its
-source says: both must be there, word for word.
+``python scripts/recompute.py`` checks README, ``docs/benchmark/results.md`` and ``results/demonstrations.md``. The
+last cell of a table's row names the source of its figures: an evaluation in ``results/*/rollouts.parquet``, a run in
+``results/demonstrations.parquet``, or the table of a shipped policy's card. A row that cannot be recomputed has *log
+not kept*. Claims in other places are listed in ``results/figures.md``, each with the words of its source: both must be
+there.
 
-``python scripts/recompute.py keep FOLDER NAME`` keeps the log and card of an evaluation as ``docs/research/logs/NAME``,
-compressed, and prints its row.
+``python scripts/recompute.py keep FOLDER NAME`` adds an evaluation to ``results/evaluations`` and prints its row.
+``python scripts/recompute.py restore TABLES NAME FOLDER`` writes a kept evaluation as a folder that commands read.
 """
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.evidence import Evidence
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, mean_row, percent
-from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.evaluation.report import keep_log
-from lerobot_memobench.io import packed
-from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.task import MEMORY_TYPES
+import pyarrow.parquet as pq
 
 ROOT = Path(__file__).parents[1]
-NOTES = ROOT / "docs" / "research"
-LOGS = NOTES / "logs"
-PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmark" / "results.md")
-CLAIMS = NOTES / "figures.md"
+sys.path.insert(0, str(ROOT))  # `research` is not installed
+
+from lerobot_memobench.errors import MemobenchError, nearest  # noqa: E402
+from lerobot_memobench.evaluation.evidence import Evidence  # noqa: E402
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, mean_row, percent  # noqa: E402
+from lerobot_memobench.evaluation.records import read_runs  # noqa: E402
+from lerobot_memobench.evaluation.report import write_report  # noqa: E402
+from lerobot_memobench.tasks.catalogue import get_task  # noqa: E402
+from lerobot_memobench.tasks.task import MEMORY_TYPES  # noqa: E402
+from research.kept import ROLLOUTS as ROLLOUT_TABLE  # noqa: E402
+from research.kept import keep, restore  # noqa: E402
+
+RESULTS = ROOT / "results"
+EVALUATIONS = RESULTS / "evaluations"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmark" / "results.md", RESULTS / "demonstrations.md")
+CLAIMS = RESULTS / "figures.md"
 NOT_KEPT = "log not kept"
 ROLLOUTS = "rollouts"
 FOLLOWS, CHANCE, SCENES = "follows", "chance", "scenes"
@@ -39,7 +45,7 @@ FOLLOWS, CHANCE, SCENES = "follows", "chance", "scenes"
 INTERVAL = re.compile(r"[\d.]+\s\[[\d.]+–[\d.]+\]")
 
 Figures = Mapping[str, str]
-"""Heading of a column -> what stands below it."""
+"""Heading of a column -> the figure in it."""
 Tables = list[tuple[list[str], list[list[str]]]]
 """Headings and rows of each table of a page."""
 
@@ -55,52 +61,57 @@ def in_words(rate: Rate) -> str:
 
 
 def with_interval(*parts: float) -> str:
-    """Return a value and the ends of its interval, of 0 to 1, as documents write them."""
-    told = map(percent, parts)
-    value, low, high = (f"{part:.0f}" if part in (0, 100) else f"{part:.1f}" for part in told)
+    """Return a value and the ends of its interval, from 0 to 1, as documents write them."""
+    value, low, high = (
+        f"{part:.0f}" if part in (0, 100) else f"{part:.1f}" for part in map(percent, parts) if part is not None
+    )
     return f"{value} [{low}–{high}]"
 
 
-def figures_of_tasks(tasks: Mapping[str, Row]) -> Figures:
+def of_tasks(tasks: Mapping[str, Row]) -> Figures:
     """Return the average's metrics, the SR of memory types and the number of rollouts, from rates per task."""
     types = {
         memory_type: mean_row(row for name, row in tasks.items() if get_task(name).memory_type == memory_type)
         for memory_type in MEMORY_TYPES
     }
-    there = {memory_type: row for memory_type, row in types.items() if row["SR"].value is not None}
-    average = mean_row(there.values())
+    present = {memory_type: row for memory_type, row in types.items() if row["SR"].value is not None}
+    average = mean_row(present.values())
     return {
         **{metric: in_words(average[metric]) for metric in METRICS},
-        **{memory_type: f"{percent(row['SR'].value):.1f}" for memory_type, row in there.items()},
+        **{memory_type: f"{percent(row['SR'].value):.1f}" for memory_type, row in present.items()},
         ROLLOUTS: f"{sum(row['SR'].n for row in tasks.values()):,}",
     }
 
 
-def of_log(folder: Path) -> Figures:
-    """Return the figures of a kept log, by the report's own sums."""
+def of_evaluation(folder: Path) -> Figures:
+    """Return the figures of an evaluation, counted as the report counts them."""
     (run,) = read_runs([folder])
-    summary, found = run.summary, run.evidence.average if run.evidence else None
+    summary, evidence = run.summary, run.evidence.average if run.evidence else None
     return {
-        **(of_evidence(found) if found else {}),
+        **(of_evidence(evidence) if evidence else {}),
         **{metric: in_words(summary.average[metric]) for metric in METRICS},
         **{name: f"{percent(row['SR'].value):.1f}" for name, row in summary.memory_types.items()},
         ROLLOUTS: f"{summary.rollouts:,}",
     }
 
 
-def of_evidence(found: Evidence) -> Figures:
-    """Return how often choices followed the evidence, and could have without the past, and in how many scenes."""
-    rate = found.rates[FOLLOWS]
-    told = with_interval(rate.value, rate.low, rate.high)
-    return {FOLLOWS: told, CHANCE: f"{percent(found.chance):.1f}", SCENES: str(found.scenes)}
+def of_evidence(evidence: Evidence) -> Figures:
+    """Return how often choices followed the evidence, the chance without the past, and the number of scenes."""
+    rate = evidence.rates[FOLLOWS]
+    assert None not in (rate.value, rate.low, rate.high)
+    return {
+        FOLLOWS: with_interval(*(rate.value or 0.0, rate.low or 0.0, rate.high or 0.0)),
+        CHANCE: f"{percent(evidence.chance):.1f}",
+        SCENES: str(evidence.scenes),
+    }
 
 
 def of_card(page: Path) -> Figures:
     """Return the figures of the table per task in a shipped policy's card."""
     for head, rows in tables(page):
         if head[1:] == [ROLLOUTS, *METRICS]:
-            found = {row[0]: row[1:] for row in rows if row[0] not in (*MEMORY_TYPES, "average")}
-            return figures_of_tasks({name: _row(int(cells[0]), cells[1:]) for name, cells in found.items()})
+            cells = {row[0]: row[1:] for row in rows if row[0] not in (*MEMORY_TYPES, "average")}
+            return of_tasks({name: _row(int(count), rates) for name, (count, *rates) in cells.items()})
     raise MemobenchError(f"{page} has no table of rollouts and metrics per task")
 
 
@@ -112,24 +123,21 @@ def _row(rollouts: int, cells: list[str]) -> Row:
     }
 
 
-def of_demonstrations(page: Path) -> Figures:
-    """Return the expert's SR from the page that `memobench describe` wrote of its demonstrations."""
-    text = page.read_text()
-    if found := re.search(r"^All (\d+) seeds asked for were solved", text, re.MULTILINE):
-        lost, asked = 0, int(found[1])
-    elif found := re.search(r"^\*\*(\d+) of (\d+) seeds asked for have no demonstration", text, re.MULTILINE):
-        lost, asked = int(found[1]), int(found[2])
-    else:
-        raise MemobenchError(f"{page} does not say how many seeds were solved")
-    return {"SR": in_words(Rate(1 - lost / asked, asked)), ROLLOUTS: f"{asked:,}"}
+def of_demonstrations(file: Path, run: str) -> Figures:
+    """Return the expert's SR on the seeds of a run."""
+    table = pq.read_table(file, columns=["run", "solved"]).to_pydict()
+    solved = [done for name, done in zip(table["run"], table["solved"], strict=True) if name == run]
+    if not solved:
+        raise MemobenchError(f"{file} has no run {run!r}; {nearest(run, set(table['run']))}")
+    return {"SR": in_words(Rate(sum(solved) / len(solved), len(solved))), ROLLOUTS: f"{len(solved):,}"}
 
 
-SOURCES: dict[str, Callable[[Path], Figures]] = {
-    r"(logs/[\w-]+|study/[\w/-]+)(?=/)": of_log,
-    r"\w+/README\.md": of_card,
-    r"\w+/tables\.md": of_demonstrations,
-}
-"""Ending of a link's target, as far as it names the source -> what reads it."""
+@cache
+def of_kept(kept: Path, name: str) -> Figures:
+    """Return the figures of a kept evaluation."""
+    with tempfile.TemporaryDirectory() as folder:
+        restore(kept, Path(folder), [name])
+        return of_evaluation(Path(folder) / name)
 
 
 # --- pages ---
@@ -146,10 +154,14 @@ def tables(page: Path) -> Tables:
 
 def source_of(page: Path, cell: str) -> Figures | None:
     """Return the figures of the source that a cell links, None where it links none that can be recomputed."""
-    for target in re.findall(r"\]\(([^)#]+)", cell):
-        for ending, read in SOURCES.items():
-            if found := re.search(f"^.*{ending}", target):
-                return read((page.parent / found[0]).resolve())
+    for name, target in re.findall(r"\[`?([^\]`]+)`?\]\(([^)#]+)\)", cell):
+        file = (page.parent / target).resolve()
+        if file.name == ROLLOUT_TABLE:
+            return of_kept(file.parent, name)
+        if file.name == "demonstrations.parquet":
+            return of_demonstrations(file, name)
+        if file.name == "README.md" and file.parent.name.startswith("memobench_"):
+            return of_card(file)
     return None
 
 
@@ -162,46 +174,46 @@ def rows_of(page: Path) -> Iterator[tuple[list[str], Figures, str]]:
         known = [name for name in head if name in (*METRICS, *MEMORY_TYPES, ROLLOUTS, FOLLOWS, CHANCE, SCENES)]
         for row in rows:
             if {"SR", "temporal"} & set(known) or any(map(INTERVAL.search, row)):
-                told = {name: row[head.index(name)] for name in known}
-                yield row, {name: cell for name, cell in told.items() if cell}, row[-1]
+                cells = {name: row[head.index(name)] for name in known}
+                yield row, {name: cell for name, cell in cells.items() if cell}, row[-1]
 
 
 def problems_of_tables(page: Path) -> list[str]:
-    """Return what is wrong with the rows of results of a page: a difference, or no word on where they are from."""
+    """Return the errors in a page's rows of results: figures that differ from the source, or no source."""
     found = []
-    for row, told, source in rows_of(page):
+    for row, cells, source in rows_of(page):
         figures = source_of(page, source)
         if figures is None and NOT_KEPT not in source:
-            found.append(f"{page.name}: {row[0]} links nothing to recompute it from, and does not say {NOT_KEPT!r}")
-        for name, cell in told.items():
+            found.append(f"{page.name}: {row[0]} links no source and lacks {NOT_KEPT!r}")
+        for name, cell in cells.items():
             if figures is not None and cell != figures.get(name):
                 found.append(f"{page.name}: {row[0]} has {name} {cell}, and {figures.get(name)} by its source")
     return found
 
 
 def problems_of_prose(page: Path, claims: Path = CLAIMS) -> list[str]:
-    """Return the intervals outside a page's tables that the list of claims does not have."""
+    """Return the intervals outside a page's tables that the list of claims lacks."""
     prose = _flat(re.sub(r"^\|.*\n", "", page.read_text(), flags=re.MULTILINE))
     listed = " ".join(claim for where, claim, *_ in _claims(claims) if _place(claims, where) == page.resolve())
     return [
-        f"{page.name}: {one} stands in no table, and is not in {claims.name}"
-        for one in INTERVAL.findall(prose)
-        if one not in listed
+        f"{page.name}: {interval} is in no table, and not in {claims.name}"
+        for interval in INTERVAL.findall(prose)
+        if interval not in listed
     ]
 
 
 def problems_of_claims(claims: Path = CLAIMS) -> list[str]:
-    """Return which claims, or what their sources say, do not stand where the list has them."""
+    """Return the claims, and the words of their sources, that the named pages lack."""
     return [
-        f"{place.name} does not say {text!r}, as {claims.name} has it"
-        for page, claim, source, said, *_ in _claims(claims)
-        for place, text in ((_place(claims, page), claim), (_place(claims, source), said))
+        f"{place.name} does not contain {text!r}, which {claims.name} lists"
+        for page, claim, source, words, *_ in _claims(claims)
+        for place, text in ((_place(claims, page), claim), (_place(claims, source), words))
         if _flat(text) not in _flat(place.read_text())
     ]
 
 
 def _claims(page: Path) -> list[list[str]]:
-    """Return the rows of the list of claims: page, claim, source, what the source says, whether a log is kept."""
+    """Return the rows of the list of claims: page, claim, source, words of the source, whether rollouts are kept."""
     return [row for head, rows in tables(page) if head[:2] == ["page", "it says"] for row in rows]
 
 
@@ -214,28 +226,41 @@ def _place(page: Path, link: str) -> Path:
 
 
 def _flat(text: str) -> str:
-    """Return text on one line, without emphasis: a sentence may be broken anywhere, and stand in a table."""
+    """Return text on one line, without emphasis: a sentence may be broken anywhere, and be in a table."""
     return " ".join(text.replace("*", "").replace("|", " ").replace("\n> ", " ").split())
 
 
-# --- keeping a log ---
+# --- keeping ---
 
 
-def keep(folder: Path, name: str) -> str:
-    """Compress the log and the card of an evaluation into the notes; return its row."""
-    kept = LOGS / name
-    keep_log(folder, kept)
-    row = of_log(kept)
-    if row != of_log(folder):
-        raise MemobenchError(f"the log in {kept} does not tell what the one in {folder} does")
-    return f"| {' | '.join(row.values())} | [log](../research/logs/{name}/{packed(Path(MERGED_FILE))}) |"
+def keep_evaluation(folder: Path, name: str) -> str:
+    """Add an evaluation to the results under a name; return its row for a table of results."""
+    write_report(folder)  # merges the workers' files
+    with tempfile.TemporaryDirectory() as root:
+        (Path(root) / name).symlink_to(folder.resolve())
+        keep(Path(root), [name], EVALUATIONS)
+    row = of_kept(EVALUATIONS, name)
+    if row != of_evaluation(folder):
+        raise MemobenchError(f"{EVALUATIONS} gives other figures for {name!r} than {folder}; this is a bug")
+    return f"| {' | '.join(row.values())} | [`{name}`](../../results/evaluations/{ROLLOUT_TABLE}) |"
 
 
 def main(words: list[str]) -> int:
     """Run the command line; return the exit status."""
-    if words[:1] == ["keep"]:
-        print(keep(Path(words[1]), words[2]))
-        return 0
+    match words:
+        case ["keep", folder, name]:
+            print(keep_evaluation(Path(folder), name))
+            return 0
+        case ["restore", kept, name, folder]:
+            with tempfile.TemporaryDirectory(dir=Path(folder).resolve().parent) as root:
+                restore(Path(kept), Path(root), [name])
+                (Path(root) / name).rename(folder)
+            return 0
+        case []:
+            pass
+        case _:
+            print(__doc__, file=sys.stderr)
+            return 2
     checks = (problems_of_tables, problems_of_prose)
     problems = [*(problem for page in PAGES for check in checks for problem in check(page)), *problems_of_claims()]
     for page in PAGES:
@@ -246,4 +271,7 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except MemobenchError as error:
+        sys.exit(f"recompute: {error}")

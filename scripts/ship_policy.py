@@ -1,9 +1,9 @@
-"""Put a trained policy into the package: its weights in bfloat16, and a card with what made it and what it solves.
+"""Put a trained policy into the package: its weights in bfloat16, and a card with its training and its results.
 
     python scripts/ship_policy.py outputs/joint/policies/memory-0 memobench_small --rollouts outputs/eval/small
 
-The rollouts are those of the folder that this writes (policy=memobench_small), so that what is told is what is shipped:
-write once without them, evaluate, and write again. Later rollouts of the same weights are told by
+The card's rollouts are of the shipped weights: run once without rollouts, evaluate the written folder
+(policy=memobench_small), and run again. Put later rollouts of the same weights into the card by
 
     python scripts/ship_policy.py memobench_small memobench_small --rollouts outputs/eval/later
 """
@@ -104,8 +104,8 @@ def card(
         "```bash",
         *(
             line
-            for told, before in zip(runs, [begun, *runs], strict=False)
-            for line in training(told, before, begun is not None or len(runs) > 1)
+            for run, before in zip(runs, [begun, *runs], strict=False)
+            for line in training(run, before, begun is not None or len(runs) > 1)
         ),
         "```",
         *([] if rollouts is None else results(name, rollouts)),
@@ -114,7 +114,7 @@ def card(
 
 
 def began_with(shipped: Path) -> str:
-    """Return that the first training began with a policy of the package, by its folder, and of which commit that is."""
+    """Return a sentence on the shipped policy, with its commit, from whose weights the first training began."""
     of = git(shipped, "log", "-1", "--format=%h", "--", ".")
     return f"It went on from `{shipped.name}` as of commit `{of}`, whose card says how that was made."
 
@@ -122,32 +122,32 @@ def began_with(shipped: Path) -> str:
 def trainings(source: Path) -> list[dict[str, Any]]:
     """Return the settings of the trainings that led to a checkpoint, one from the weights of the other.
 
-    A policy of the package knows of none; it stands for its own by its name.
+    A policy of the package has no record of its training; its name is returned instead.
     """
     if not (source / TRAINED).is_file():
         policy = json.loads((source / "config.json").read_text())
         return [{"shipped": source.name, "folder": source, "policy": policy}]
-    told: dict[str, Any] = json.loads((source / TRAINED).read_text())
-    begun = told["policy"].get("pretrained_path")  # of a training that went on after an interruption: its own
-    another = begun is not None and not Path(begun).is_relative_to(told["output_dir"])
-    return [*(trainings(Path(begun)) if another else []), told]
+    run: dict[str, Any] = json.loads((source / TRAINED).read_text())
+    begun = run["policy"].get("pretrained_path")  # of a training that went on after an interruption: its own
+    another = begun is not None and not Path(begun).is_relative_to(run["output_dir"])
+    return [*(trainings(Path(begun)) if another else []), run]
 
 
-def training(told: dict[str, Any], before: dict[str, Any] | None, named: bool) -> list[str]:
-    """Return the command of a training, from the weights of the one ``before`` if there is one.
+def training(run: dict[str, Any], before: dict[str, Any] | None, named: bool) -> list[str]:
+    """Return the command of a training, from the weights of the training ``before`` if there is one.
 
     Args:
-        named: whether it says its folder, because there are several.
+        named: whether the command names its folder, because there are several.
     """
-    policy = told["policy"]
+    policy = run["policy"]
     if before is None:
         kind = f"policy=memobench_mem perception={policy['perception']} size={policy['size']}"
     else:
         kind = f"policy={before.get('shipped') or place(before['output_dir'])}"
-    words = [f"dataset={place(told['dataset']['root'])}", *settings(policy, before and before["policy"])]
-    words += [f"{key}={told[key]}" for key in ("batch_size", "steps", "seed")]
-    words += [f"output_dir={place(told['output_dir'])}"] if named else []
-    chosen = told["dataset"].get("episodes")
+    words = [f"dataset={place(run['dataset']['root'])}", *settings(policy, before and before["policy"])]
+    words += [f"{key}={run[key]}" for key in ("batch_size", "steps", "seed")]
+    words += [f"output_dir={place(run['output_dir'])}"] if named else []
+    chosen = run["dataset"].get("episodes")
     some = [] if chosen is None else [f"    {episodes(chosen)} \\"]
     return [f"lerobot train {kind} \\", *some, f"    {shlex.join(words)}"]
 
@@ -160,18 +160,18 @@ def episodes(chosen: Sequence[int]) -> str:
 
 
 def place(folder: str | Path) -> str:
-    """Return where a command of a card has what was in a folder here."""
+    """Return the path of a local folder in the commands of a card."""
     return f"outputs/{Path(folder).name}"
 
 
 def settings(policy: dict[str, Any], before: dict[str, Any] | None = None) -> list[str]:
-    """Return what was said of a policy in training: what is not as its size and perception have it, or ``before``."""
+    """Return the settings that differ from the defaults of the policy's size and perception, or from ``before``."""
     usual = encoded(MemobenchMemConfig(device="cpu", size=policy["size"], perception=policy["perception"]))
     known = usual | (before or {})
-    said = {key: policy[key] for key in sorted({*usual} & {*policy} - {*ELSEWHERE, *OF_THE_DATA})}
+    given = {key: policy[key] for key in sorted({*usual} & {*policy} - {*ELSEWHERE, *OF_THE_DATA})}
     return [
         f"policy.{key}={value if isinstance(value, str) else json.dumps(value)}"
-        for key, value in said.items()
+        for key, value in given.items()
         if value != known[key]
     ]
 
@@ -179,8 +179,8 @@ def settings(policy: dict[str, Any], before: dict[str, Any] | None = None) -> li
 def demonstrations(
     runs: Sequence[dict[str, Any]], trained_on: dict[str, Any], merged: Mapping[Path, Sequence[Path]]
 ) -> list[str]:
-    """Return what a policy was trained on and the commands that made it, by the manifests in the datasets' folders."""
-    roots = [Path(told["dataset"]["root"]) for told in runs]
+    """Return the demonstrations of a training and their commands, by the manifests in the datasets' folders."""
+    roots = [Path(run["dataset"]["root"]) for run in runs]
     try:
         parts = dict.fromkeys(part for root in roots for part in generated(root, merged))
         manifests = {part: read_manifest(part) for part in parts}
@@ -208,7 +208,7 @@ def demonstrations(
 
 
 def generated(root: Path, merged: Mapping[Path, Sequence[Path]]) -> list[Path]:
-    """Return the datasets that were generated, of which ``root`` was merged; itself if it was not."""
+    """Return the generated datasets that were merged into ``root``; itself if it was generated."""
     return [part for own in merged[root] for part in generated(own, merged)] if root in merged else [root]
 
 
@@ -223,7 +223,7 @@ def merging(root: Path, parts: Sequence[Path]) -> list[str]:
 
 
 def generation(request: dict[str, Any]) -> list[str]:
-    """Return the words of `memobench generate` that ask for what a manifest says was asked for."""
+    """Return the words of `memobench generate` of a manifest's request."""
     suite = get_task(request["tasks"][0]).suite
     every = sorted(request["tasks"]) == sorted(task_names(suite=suite))
     options = {
@@ -244,12 +244,12 @@ def generation(request: dict[str, Any]) -> list[str]:
 
 def driver(request: dict[str, Any]) -> str | None:
     """Return the policy that moved the arm, as a command names it; None if none did."""
-    name, _, _ = (request.get("policy") or "").rpartition(" ")  # told with a hash of its weights
+    name, _, _ = (request.get("policy") or "").rpartition(" ")  # followed by a hash of its weights
     return (name if name in shipped_policies() else place(name)) if name else None
 
 
 def results(name: str, rollouts: Path) -> list[str]:
-    """Return what an evaluation says, as a table."""
+    """Return the results of an evaluation, as a table."""
     report = json.loads((rollouts / REPORT_JSON).read_text())
     rows = {**report["memory_types"], "average": report["average"], **report["tasks"]}
     body = [
@@ -257,8 +257,8 @@ def results(name: str, rollouts: Path) -> list[str]:
         for scope, row in rows.items()
     ]
     head = ["| | rollouts | SR | MSR | MUR | MCR |", "|---|---|---|---|---|---|"]
-    said = f"`lerobot eval env=memobench policy={name} referent=random`, evaluation seeds from 7 on, sha256 of its log"
-    return ["", f"{said} `{file_hash(rollouts / MERGED_FILE)}`:", "", *head, *body]
+    words = f"`lerobot eval env=memobench policy={name} referent=random`, evaluation seeds from 7 on, sha256 of its log"
+    return ["", f"{words} `{file_hash(rollouts / MERGED_FILE)}`:", "", *head, *body]
 
 
 def retell(name: str, rollouts: Path) -> Path:
@@ -285,7 +285,7 @@ if __name__ == "__main__":
         action="append",
         default=[],
         metavar=("DATASET", "PART"),
-        help="a dataset trained on, and those that lerobot-edit-dataset made it of; may be said again, in order",
+        help="a training dataset, and those that lerobot-edit-dataset merged into it; repeatable, in order",
     )
     parser.add_argument(
         "--commit",
@@ -293,7 +293,7 @@ if __name__ == "__main__":
         action="append",
         default=[],
         metavar=("DATASET", "COMMIT"),
-        help="by which a dataset was made, where the expert has changed since; may be said again",
+        help="commit of a dataset's expert, where the expert has changed since; repeatable",
     )
     given = parser.parse_args()
     parts = {whole: parts for whole, *parts in given.merged}

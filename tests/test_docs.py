@@ -1,4 +1,4 @@
-"""The documents: links lead somewhere, commands are understood, hashes stay in the research notes, README is short."""
+"""The documents: links lead somewhere, commands are understood, hashes stay in the results, README is short."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, Literal, Optional
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import typer
 from PIL import Image
@@ -35,6 +37,7 @@ from lerobot_memobench.run.arguments import (
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.settings import read_settings
 from lerobot_memobench.training.command import take_training_options
+from research import kept
 from tests.support.logs import rollout
 from tests.support.scripts import load_script
 
@@ -43,11 +46,9 @@ recompute = load_script("recompute")
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-NOTES = DOCS / "research"
+RESULTS = sorted((ROOT / "results").glob("*.md"))
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("**/*.md")])
-DOCUMENTS = [*PAGES, *sorted(ROOT.glob("src/**/*.md"))]
-BY_HAND = [page for page in PAGES if NOTES not in page.parents or page.name in ("index.md", "logs.md")]
-"""What is kept up to date; notes are frozen."""
+DOCUMENTS = [*PAGES, *RESULTS, *sorted(ROOT.glob("src/**/*.md"))]
 MADE = {(DOCS / path).resolve() for path in (*reference.PAGES, *reference.COPIES.values())}
 """Pages that the site's build makes."""
 BLOCK = re.compile(r"```.*?```", re.DOTALL)
@@ -115,7 +116,7 @@ def of_a_laboratory(text: str) -> list[str]:
     return [found[0] for pattern in (HASH, PROCESSOR) for found in pattern.finditer(text)]
 
 
-@pytest.mark.parametrize("document", BY_HAND, ids=name)
+@pytest.mark.parametrize("document", PAGES, ids=name)
 def test_hashes_commits_and_processors_stay_in_the_notes(document: Path) -> None:
     assert not of_a_laboratory(document.read_text())
 
@@ -126,9 +127,14 @@ def test_what_belongs_into_the_notes_is_found() -> None:
     ]
 
 
-@pytest.mark.parametrize("note", sorted(set(NOTES.glob("*.md")) - {NOTES / "index.md"}), ids=name)
-def test_notes_are_dated(note: Path) -> None:
-    assert re.search(r"\b(20\d\d-\d\d-\d\d|\d{1,2} [A-Z][a-z]+ 20\d\d)\b", "\n".join(note.read_text().splitlines()[:6]))
+LISTS = ("README.md", "figures.md")
+
+
+@pytest.mark.parametrize("page", [page for page in RESULTS if page.name not in LISTS], ids=name)
+def test_results_are_dated_and_short(page: Path) -> None:
+    text = page.read_text()
+    assert re.search(r"\b\d{1,2} [A-Z][a-z]+ 20\d\d\b", "\n".join(text.splitlines()[:6]))
+    assert len([word for word in text.split() if word != "|"]) <= 1000
 
 
 def test_readme_is_short() -> None:
@@ -150,7 +156,7 @@ def test_site_is_built_strictly(tmp_path: Path) -> None:
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "The memory study" in (tmp_path / "research/study/index.html").read_text()
+    assert "The memory study" in (tmp_path / "results/study/index.html").read_text()
 
 
 # --- figures ---
@@ -166,12 +172,12 @@ def test_claims_and_their_sources_stand_where_the_list_has_them() -> None:
     assert recompute.problems_of_claims() == []
 
 
-def test_every_log_is_among_the_results() -> None:
-    """Or, of a comparison with stock LIBERO, on the page of the paper's world."""
-    there = {folder.name for folder in recompute.LOGS.iterdir() if folder.is_dir()}
+def test_kept_evaluations_are_named_in_pages() -> None:
+    """Those of a comparison with stock LIBERO on the page of the paper's world."""
+    there = set(pq.read_table(recompute.EVALUATIONS / "evaluations.parquet")["evaluation"].to_pylist())
     results, world = (
-        set(re.findall(r"research/logs/([\w-]+)/", page.read_text()))
-        for page in (recompute.PAGES[1], ROOT / "docs" / "develop" / "paper_world.md")
+        set(re.findall(r"\[`(\w+)`\]\(\S+evaluations/rollouts.parquet\)", page.read_text()))
+        for page in (recompute.PAGES[1], DOCS / "develop" / "paper_world.md")
     )
     assert results | {name for name in world if name.startswith("bridge_")} == there
 
@@ -189,40 +195,34 @@ def test_a_rate_as_documents_write_it(rate: Rate, words: str) -> None:
     assert recompute.in_words(rate) == words
 
 
-def test_logs_are_small() -> None:
-    assert sum(file.stat().st_size for file in recompute.LOGS.glob("**/*")) < 2_000_000
+def test_tables_of_results_are_small() -> None:
+    assert sum(file.stat().st_size for file in recompute.RESULTS.glob("**/*.parquet")) < 2_000_000
 
 
 HEAD = "| policy | SR | MSR | MUR | MCR | rollouts | |\n|---|---|---|---|---|---:|---|\n"
 KEPT = "75.0 [30.1–95.4]"
+ONE = "[`one`](rollouts.parquet)"
 
 
 @pytest.mark.parametrize(
     ("row", "problem"),
     [
-        (f"| a | {KEPT} | {KEPT} | – | – | 4 | [log](logs/one/episodes.jsonl) |", None),
-        (f"| a | {KEPT} | | | | | [log](logs/one/episodes.jsonl) |", None),
-        (
-            "| a | 76.0 [30.1–95.4] | | | | 4 | [log](logs/one/episodes.jsonl) |",
-            "SR 76.0 .*, and 75.0 .* by its source",
-        ),
-        (f"| a | {KEPT} | | | | 5 | [log](logs/one/episodes.jsonl) |", "rollouts 5, and 4 by its source"),
-        (f"| a | {KEPT} | | | | 4 | [note](note.md) |", "does not say 'log not kept'"),
+        (f"| a | {KEPT} | {KEPT} | – | – | 4 | {ONE} |", None),
+        (f"| a | {KEPT} | | | | | {ONE} |", None),
+        (f"| a | 76.0 [30.1–95.4] | | | | 4 | {ONE} |", "SR 76.0 .*, and 75.0 .* by its source"),
+        (f"| a | {KEPT} | | | | 5 | {ONE} |", "rollouts 5, and 4 by its source"),
+        (f"| a | {KEPT} | | | | 4 | [note](note.md) |", "lacks 'log not kept'"),
         (f"| a | {KEPT} | | | | 4 | [note](note.md), log not kept |", None),
-        ("| a | 100 [96.3–100] | | | | 100 | [seeds](run/tables.md) |", None),
-        ("| a | 100 [96.3–100] | | | | 100 | [seeds](short/tables.md) |", "100 .*, and 99.0 .* by its source"),
+        ("| a | 100 [96.3–100] | | | | 100 | [`run`](demonstrations.parquet) |", None),
+        ("| a | 100 [96.3–100] | | | | 100 | [`short`](demonstrations.parquet) |", "100 .*, and 99.0 .* by its source"),
     ],
 )
 def test_a_figure_that_differs_from_its_source_is_found(tmp_path: Path, row: str, problem: str | None) -> None:
     task = "turn_on_the_stove_and_turn_it_off"
-    lines = [rollout(task, "temporal", "S", [k > 0], k > 0, k) for k in range(4)]
-    episode_log.write_episodes(tmp_path / "logs" / "one", lines)
-    for folder, told in (
-        ("run", "All 100 seeds asked for were solved"),
-        ("short", "**1 of 100 seeds asked for have no"),
-    ):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "tables.md").write_text(f"{told} demonstration here.\n")
+    keep_one(tmp_path, [rollout(task, "temporal", "S", [k > 0], k > 0, k) for k in range(4)])
+    runs = ["run"] * 100 + ["short"] * 100
+    table = pa.table({"run": runs, "solved": [True] * 199 + [False]})
+    pq.write_table(table, tmp_path / "demonstrations.parquet")
     page = tmp_path / "page.md"
     page.write_text(f"{HEAD}{row}\n")
     found = recompute.problems_of_tables(page)
@@ -230,14 +230,20 @@ def test_a_figure_that_differs_from_its_source_is_found(tmp_path: Path, row: str
     assert problem is None or re.search(problem, found[0])
 
 
+def keep_one(folder: Path, lines: list[dict[str, Any]]) -> None:
+    """Keep a log under the name ``one`` in the folder's tables."""
+    episode_log.write_episodes(folder / "logs" / "one", lines)
+    kept.keep(folder / "logs", ["one"], folder)
+
+
 def test_rows_of_evidence_are_recomputed(tmp_path: Path) -> None:
     """One scene of two variants, of which both were answered by the first."""
     task = "put_the_butter_into_the_bowl_from_the_prompt_video"
     asked = [{"episode": k, "variant": k, "variants": 2, "choice": 0, "chance": 0.5} for k in (0, 1)]
     lines = [rollout(task, "object", "S", [True], one["choice"] == one["variant"], 7) | one for one in asked]
-    episode_log.write_episodes(tmp_path / "logs" / "one", lines)
-    page, log = tmp_path / "page.md", "[log](logs/one/episodes.jsonl)"
-    interval = recompute.of_log(tmp_path / "logs" / "one")["follows"]
+    keep_one(tmp_path, lines)
+    page, log = tmp_path / "page.md", ONE
+    interval = recompute.of_kept(tmp_path, "one")["follows"]
     assert interval.startswith("50.0 [")
     for told, wrong in ((interval, 0), ("90.0 [80–100]", 1)):
         page.write_text(f"| policy | follows | chance | |\n|---|---|---|---|\n| a | {told} | 50.0 | {log} |\n")
@@ -274,7 +280,7 @@ def commands(document: Path) -> Iterator[list[str]]:
                 yield words
 
 
-TYPED = [(document, words) for document in BY_HAND for words in commands(document)]
+TYPED = [(document, words) for document in [*PAGES, *RESULTS] for words in commands(document)]
 
 
 @pytest.mark.parametrize(("document", "words"), TYPED, ids=lambda it: name(it) if isinstance(it, Path) else it[0])

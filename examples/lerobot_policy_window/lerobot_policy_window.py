@@ -66,7 +66,7 @@ class WindowConfig(PreTrainedConfig):
 
 
 class Row:
-    """What is kept of one environment of a rollout: tokens of its past, planned actions, its last phase and step."""
+    """State of one environment of a rollout: tokens of its past, planned actions, its last phase and step."""
 
     def __init__(self, span):
         self.past, self.queue, self.clock = deque(maxlen=span), deque(), None
@@ -137,7 +137,7 @@ class WindowPolicy(PreTrainedPolicy):
         for row, token, clock in zip(self.rows, self.tokens(batch), clocks, strict=True):
             if clock[1] == -1 or clock != row.clock:  # -1: strict, no clock; a row that is over repeats its frame
                 row.past.append(token)
-            if clock[1] == 0:  # a phase begins: what was planned before it is void
+            if clock[1] == 0:  # a phase begins: earlier plans are void
                 row.queue.clear()
             row.clock = clock
         acting = [row for row in self.rows if row.clock[0] == 1]

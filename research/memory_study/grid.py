@@ -1,4 +1,4 @@
-"""The study as data: what is trained on what, and how it is evaluated; read from a YAML file."""
+"""The grid of the study, read from a YAML file: suites, rows, training seeds and controls."""
 
 from __future__ import annotations
 
@@ -15,31 +15,27 @@ from lerobot_memobench.tasks.catalogue import resolve_tasks
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 ROLLOUTS = "rollouts"
-"""The evaluation itself, beside a cell's controls."""
+"""The evaluation of a cell; its controls have names of their own."""
 SEALED = "sealed"
-"""The evaluation on sealed seeds, which is run when all else is done, and counted."""
-TRAINING, POLICY, AFTER = "training", "policy", "after"
+"""The evaluation on sealed seeds: run once, last."""
+TRAINING, POLICY = "training", "policy"
 SEED = r"seed=(\d+)"
-"""How a training seed is named on the command line."""
-RESERVED = (ROLLOUTS, SEALED, TRAINING, POLICY, AFTER)
-"""How folders and files of a cell are called, or begin."""
+"""A training seed on the command line."""
+GRID_FILE = Path(__file__).with_name("grid.yaml")
+RESERVED = (ROLLOUTS, SEALED, TRAINING, POLICY)
+"""Names of folders and files of a cell."""
 PLACES = ("output_dir", "resume", "config_path")
-"""Words of a command that say where it writes, and from where it goes on."""
-
-
-def after(updates: int) -> str:
-    """Return what the evaluation of the checkpoint of so many updates is called."""
-    return f"{AFTER} {updates}"
+"""Words of a command that name its folders."""
 
 
 @dataclass(frozen=True)
 class Suite:
-    """What is learned and rolled out.
+    """Tasks, their demonstrations and their evaluation.
 
     Attributes:
         demonstrations: words of ``memobench generate``. evaluation: of ``lerobot eval env=memobench``.
-        tasks: tasks or memory types that are learned and rolled out; none: all.
-        whole: whether the demonstrations are of all tasks, others' frames not drawn, and count in normalisation alone.
+        tasks: tasks or memory types to learn and roll out; none: all.
+        whole: demonstrations are of all tasks; frames of the others only count in normalisation.
         ceilings: task -> best success without a memory, per cent: found (``research.necessity``), or exact.
     """
 
@@ -51,26 +47,26 @@ class Suite:
 
     @property
     def name(self) -> str:
-        """Return which suite it is of: ``published`` or ``strict``."""
+        """``published`` or ``strict``."""
         return word_of(self.evaluation, "suite") or PUBLISHED
 
     @property
     def demonstration_words(self) -> list[str]:
-        """Return the words of ``memobench generate``, the tasks among them unless the whole suite is shown."""
+        """Words of ``memobench generate``, with the tasks unless the whole suite is demonstrated."""
         return [*self.demonstrations, *(["--tasks", ",".join(self.tasks)] if self.tasks and not self.whole else [])]
 
     @property
     def task_words(self) -> list[str]:
-        """Return the words of an evaluation of these tasks."""
+        """Words of an evaluation of these tasks."""
         return [f"tasks={','.join(self.tasks)}"] if self.tasks else []
 
     @property
     def weight_words(self) -> list[str]:
-        """Return the words of a training of ``memobench_mem`` that draws these tasks alone, of a whole suite's."""
+        """Words of a training of ``memobench_mem`` that draws only these tasks from a whole suite's."""
         others = (kind for kind in MEMORY_TYPES if kind not in self.tasks)
         weights = dict.fromkeys(self.tasks, 1) | dict.fromkeys(others, 0)
-        told = ", ".join(f"{name}: {weight}" for name, weight in weights.items())
-        return [f"policy.task_weights={{{told}}}"] if self.tasks and self.whole else []
+        listed = ", ".join(f"{name}: {weight}" for name, weight in weights.items())
+        return [f"policy.task_weights={{{listed}}}"] if self.tasks and self.whole else []
 
 
 @dataclass(frozen=True)
@@ -79,10 +75,9 @@ class Row:
 
     Attributes:
         training: words of ``lerobot train``. evaluation: of ``lerobot eval env=memobench``.
-        policy: which policy is trained, in words of ``lerobot train``; none: the grid's.
-        seeds: training seeds, the first so many numbers. controls: names of those that its first one runs.
-        after: updates after which each training is evaluated too, from the checkpoint that it kept then.
-        privileged: whether it is given what the others are not, in training or in rollouts.
+        policy: words of ``lerobot train`` that choose the policy; none: the grid's.
+        seeds: number of training seeds, from 0 on. controls: names of controls that seed 0 runs.
+        privileged: the row has inputs, in training or rollouts, that the others lack.
     """
 
     training: list[str] = field(default_factory=list)
@@ -90,21 +85,12 @@ class Row:
     policy: list[str] = field(default_factory=list)
     seeds: int = 1
     controls: list[str] = field(default_factory=list)
-    after: list[int] = field(default_factory=list)
     privileged: bool = False
 
 
 @dataclass(frozen=True)
-class Tuning:
-    """Updates and validation rollouts of each task by which a learning rate is chosen."""
-
-    steps: int = 3000
-    episodes: int = 3
-
-
-@dataclass(frozen=True)
 class Grid:
-    """All rows, suites and seeds, and what they share."""
+    """All rows and suites, and their shared words."""
 
     policy: list[str]
     training: list[str]
@@ -113,40 +99,40 @@ class Grid:
     rows: dict[str, Row]
     controls: dict[str, list[str]] = field(default_factory=dict)
     sealed: list[str] = field(default_factory=list)
-    learning_rates: list[float] = field(default_factory=list)
-    tuning: Tuning = field(default_factory=Tuning)
 
     def __post_init__(self) -> None:
         if not self.rows or not self.suites:
-            raise MemobenchError("a study needs rows and suites, and has none; name some in its file")
-        for what, names in (("rows", self.rows), ("controls", self.controls), ("suites", self.suites)):
+            raise MemobenchError("the study's file has no rows or no suites; name at least one of each")
+        for kind, names in (("rows", self.rows), ("controls", self.controls), ("suites", self.suites)):
             folders = [folder_name(name) for name in names]
-            if twice := [name for name, folder in zip(names, folders, strict=True) if folders.count(folder) > 1]:
-                raise MemobenchError(f"the {what} {', '.join(twice)} have one folder; rename one")
+            if same := [name for name, folder in zip(names, folders, strict=True) if folders.count(folder) > 1]:
+                raise MemobenchError(f"the {kind} {', '.join(same)} have the same folder; rename one")
         for name in self.rows:
             if re.search(r"[|\n]|\(privileged\)$", name) or name in self.suites or re.fullmatch(SEED, name):
-                raise MemobenchError(f"a row is called {name!r}, and --only or a table would not tell it; rename it")
+                raise MemobenchError(
+                    f"invalid name of a row: {name!r} is a suite, a seed, or breaks a table; rename it"
+                )
         for name in self.controls:
-            if folder_name(name).partition("_")[0] in RESERVED:
-                raise MemobenchError(f"a control is called {name!r}, as something else of a cell; rename it")
+            if folder_name(name) in RESERVED:
+                raise MemobenchError(f"invalid name of a control: {name!r} is reserved; rename it")
         for name, suite in self.suites.items():
             self._check_suite(name, suite)
-            known = resolve_tasks(suite.tasks or "all", suite.name)
-            if strangers := [task for task in suite.ceilings if task not in known]:
-                raise MemobenchError(f"suite {name!r} has a ceiling of {strangers[0]}; {nearest(strangers[0], known)}")
         for name, row in self.rows.items():
             self._check_row(name, row)
 
     def _check_suite(self, name: str, suite: Suite) -> None:
-        told = suite.demonstrations
-        shown = told[told.index("--suite") + 1] if "--suite" in told[:-1] else PUBLISHED
-        if shown != suite.name:
+        words = suite.demonstrations
+        demonstrated = words[words.index("--suite") + 1] if "--suite" in words[:-1] else PUBLISHED
+        if demonstrated != suite.name:
             raise MemobenchError(
-                f"suite {name!r} learns from suite {shown} and is rolled out on {suite.name}; name one"
+                f"suite {name!r} has demonstrations of suite {demonstrated} and rollouts of {suite.name}; name the same"
             )
-        if own := [word for word in told if word in ("--tasks", "--out", "--workers")]:
-            raise MemobenchError(f"suite {name!r} has {own[0]} in demonstrations; the study says that itself")
+        if own := [word for word in words if word in ("--tasks", "--out", "--workers")]:
+            raise MemobenchError(f"suite {name!r} has {own[0]} in demonstrations; the study sets it: leave it out")
         _refuse_words(f"suite {name!r}, evaluation", suite.evaluation, (*PLACES, "tasks", "policy"))
+        known = resolve_tasks(suite.tasks or "all", suite.name)
+        if unknown := [task for task in suite.ceilings if task not in known]:
+            raise MemobenchError(f"suite {name!r} has a ceiling of {unknown[0]}; {nearest(unknown[0], known)}")
 
     def _check_row(self, name: str, row: Row) -> None:
         _refuse_words(f"row {name!r}, training", [*self.training, *row.training], (*PLACES, "seed", "dataset"))
@@ -157,15 +143,7 @@ class Grid:
             if control not in self.controls:
                 raise MemobenchError(f"row {name!r} names the control {control!r}; {nearest(control, self.controls)}")
         if row.seeds < 1:
-            raise MemobenchError(f"row {name!r} has seeds: {row.seeds}; expected how many trainings, at least 1")
-        words = [*self.training, *row.training]
-        steps, every = (word_of(words, key) for key in ("steps", "save_freq"))
-        for updates in row.after:
-            if not steps or not every or updates < 1 or updates >= int(steps) or updates % int(every):
-                raise MemobenchError(
-                    f"row {name!r} has after: {updates}, and no checkpoint is kept then (steps={steps}, "
-                    f"save_freq={every}); name a multiple of save_freq below steps"
-                )
+            raise MemobenchError(f"row {name!r} has seeds: {row.seeds}; expected at least 1")
 
     def places(self) -> Iterator[tuple[str, str, int]]:
         """Yield suite, row and training seed of every cell: the first seeds of all rows before the second ones."""
@@ -175,16 +153,16 @@ class Grid:
 
 
 def _refuse_words(where: str, words: Iterable[str], keys: Iterable[str]) -> None:
-    """Refuse what the study says itself, or what would make a row another test than its neighbours."""
+    """Refuse words that the study sets itself, the same for all rows."""
     if own := [key for key in keys if word_of(words, key) is not None]:
-        raise MemobenchError(f"{where}: {own[0]}= is the study's to say, the same for all rows; leave it out")
+        raise MemobenchError(f"{where}: {own[0]}= is set by the study, the same for all rows; leave it out")
 
 
 def read_grid(path: Path) -> Grid:
     """Read a study's file.
 
     Raises:
-        MemobenchError: it is none, or a row, control or field is not known.
+        MemobenchError: it cannot be read, or a row, control or field is unknown.
     """
     try:
         with path.open(encoding="utf-8") as file:
@@ -194,12 +172,12 @@ def read_grid(path: Path) -> Grid:
     except MemobenchError:
         raise
     except FileNotFoundError:
-        raise MemobenchError(f"there is no file {path}; name the study's by --grid") from None
-    except Exception as error:  # draccus and PyYAML answer by their own kinds of error
+        raise MemobenchError(f"there is no file {path}; name the study's file by --grid") from None
+    except Exception as error:  # draccus and PyYAML have errors of their own
         cause = error.__cause__
         if isinstance(cause, MemobenchError):
             raise cause from None
-        raise MemobenchError(f"{path} is no study's file: {cause or error}") from None
+        raise MemobenchError(f"invalid study's file {path}: {cause or error}") from None
 
 
 def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
@@ -208,7 +186,7 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
     Several words of one kind are alternatives; words of different kinds must all hold.
 
     Raises:
-        MemobenchError: a word names nothing.
+        MemobenchError: an unknown word.
     """
     suites, rows, seeds = set[str](), set[str](), set[int]()
     for word in only:
@@ -220,7 +198,7 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
             seeds.add(int(match[1]))
         else:
             known = [*grid.suites, *grid.rows, "seed=0"]
-            raise MemobenchError(f"--only {word!r} is no suite, row or seed of the study; {nearest(word, known)}")
+            raise MemobenchError(f"--only {word!r} is not a suite, row or seed of the study; {nearest(word, known)}")
     return [
         (suite, row, seed)
         for suite, row, seed in grid.places()
@@ -229,7 +207,7 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
 
 
 def folder_name(name: str) -> str:
-    """Return what the folders of a row, a control or a suite are called."""
+    """Return the name of the folder of a row, a control or a suite."""
     return re.sub(r"\W+", "_", name)
 
 
@@ -239,11 +217,11 @@ def word_of(words: Iterable[str], key: str) -> str | None:
 
 
 def _check_keys(node: yaml.Node | None) -> None:
-    """Refuse a key that stands twice: YAML would take the last, and say nothing."""
+    """Refuse a key that is given twice: YAML would silently take the last."""
     if isinstance(node, yaml.MappingNode):
         keys = [key.value for key, _ in node.value]
         if twice := [key for key in keys if keys.count(key) > 1]:
-            raise MemobenchError(f"{twice[0]!r} stands twice{node.start_mark}; rename one")
+            raise MemobenchError(f"{twice[0]!r} is given twice{node.start_mark}; rename one")
     for child in node.value if isinstance(node, yaml.CollectionNode) else ():
         for part in child if isinstance(child, tuple) else (child,):
             _check_keys(part)

@@ -1,4 +1,4 @@
-"""Tables of the study: what each row solves and satisfies, follows and loses, and how it differs from a reference."""
+"""Tables of the study: rates and evidence of each row, controls, and differences from references."""
 
 from __future__ import annotations
 
@@ -17,86 +17,86 @@ from lerobot_memobench.evaluation.statistics import Estimate
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES
-from research.learning.results import adjusted, average_success, contrast, contrasts_table, episodes_of, markdown
 from research.memory_study.cells import Cell, difference
-from research.memory_study.grid import AFTER, ROLLOUTS, SEALED, TRAINING, Grid, after, word_of
+from research.memory_study.contrasts import Contrast, adjusted, average_success, contrast, episodes_of
+from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid
 
 REFERENCES = ("no memory", "clock only", "frames")
-"""Rows from which the others' differences are told."""
+"""Rows from which the differences of the others are computed."""
 EVIDENCE = "evidence"
-"""The control that stands beside the rows; the others have a table of their own."""
+"""The control with columns in the first table; the others have a table of their own."""
 FOUND_WITHOUT = "best found without a memory"
 EMPTY = "–"
 
 Rows = Mapping[str, Sequence[Cell]]
-"""Title of a row -> its cells that have been evaluated, in the order of training seeds."""
+"""Title of a row -> its evaluated cells, in the order of training seeds."""
 
 
 def tables(grid: Grid, out: Path, suite: str) -> str:
     """Return the Markdown of a suite's rows; "" where none is evaluated.
 
-    A row counts as soon as one of its training seeds has been evaluated; the table says how many have.
+    A row is shown as soon as one of its training seeds has been evaluated, with their number.
 
     Raises:
-        MemobenchError: what is evaluated is of another grid, or of one policy under two names.
+        MemobenchError: a result is of another grid, or a cell of two policies.
     """
     rows = evaluated_rows(grid, out, suite)
     if not rows:
         return ""
     _check_policies(rows)
     parts = [
-        ("What is solved, and whether it follows the evidence", _summary(rows, grid.suites[suite].ceilings)),
+        ("Success, and choices that follow the evidence", _summary(rows, grid.suites[suite].ceilings)),
         ("Rates by memory type and operation", _by_memory_type(rows)),
         ("Success by task", _by_task(rows, grid.suites[suite].ceilings)),
         ("How rollouts ended, all training seeds together", _endings(rows)),
         ("Other conditions of the rollouts, first training seed", _conditions(rows)),
-        ("Success and satisfied checkpoints by updates", _by_updates(rows)),
         *((f"Minus *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
         ("The sealed test", _sealed(rows)),
         *((f"The sealed test, minus *{name}*", _differences(rows, name, SEALED)) for name in REFERENCES),
-        ("What a cell takes, beside other work", _costs(rows)),
+        ("Cost of a cell, on a shared machine", _costs(rows)),
     ]
     return "\n\n".join([f"## {suite}", *(f"### {title}\n\n{table}" for title, table in parts if table)])
 
 
 def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, Any]]:
-    """Return title of a row -> SR ("solved") and "follows" of each training seed, and the best of both "without" the
-    past; per cent.
+    """Return title of a row -> "solved" (SR) and "follows" per training seed, and the best of both "without" the past.
+
+    Per cent.
     """
     found, ceiling = {}, _ceiling(grid.suites[suite].ceilings)
     for row, cells in evaluated_rows(grid, out, suite).items():
         evidence = _evidence(cells)
         found[row] = {
             "solved": [report(cell, ROLLOUTS)["average"]["SR"] for cell in cells],
-            "follows": [told["follows"]["percent"] for told in evidence],
+            "follows": [each["follows"]["percent"] for each in evidence],
             "without": {"solved": ceiling, "follows": evidence[0]["chance"] if evidence else None},
         }
     return found
 
 
-# -- what there is ----------------------------------------------------------------------------------------------------
+# -- evaluated cells --------------------------------------------------------------------------------------------------
 
 
 def titles(grid: Grid) -> list[str]:
-    """Return what the rows are called in tables and figures, in their order."""
+    """Return the titles of the rows in tables and figures, in their order."""
     return [name + (" (privileged)" if row.privileged else "") for name, row in grid.rows.items()]
 
 
 def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
-    """Return the rows of a suite of which a training seed is evaluated, by their titles.
+    """Return title -> evaluated cells of the rows of a suite.
 
     Raises:
         MemobenchError: a training, or an evaluation, is of other words than the grid's.
     """
     found: dict[str, list[Cell]] = {}
-    for title, (row, told) in zip(titles(grid), grid.rows.items(), strict=True):
-        for cell in (Cell(grid, out, suite, row, seed) for seed in range(told.seeds)):
+    for title, (name, row) in zip(titles(grid), grid.rows.items(), strict=True):
+        for cell in (Cell(grid, out, suite, name, seed) for seed in range(row.seeds)):
             trained = cell.done(TRAINING)  # once, for all its evaluations
             if evaluated(cell, ROLLOUTS):
                 if not trained:
                     raise MemobenchError(
-                        f"{cell.evaluation(ROLLOUTS)} is of a training that {cell.log(TRAINING).with_suffix('.json')} "
-                        f"does not tell to have ended; restore that file, or remove {cell.folder}"
+                        f"{cell.evaluation(ROLLOUTS)} is of a training that has not ended by "
+                        f"{cell.log(TRAINING).with_suffix('.json')}; restore that file, or remove {cell.folder}"
                     )
                 found.setdefault(title, []).append(cell)
     return found
@@ -108,36 +108,27 @@ def evaluated(cell: Cell, part: str) -> bool:
     Raises:
         MemobenchError: it is of other words than the grid's, or a log is there without them.
     """
-    told, folder = cell.log(part).with_suffix(".json"), cell.evaluation(part)
-    if folder.is_dir() and not told.exists():
-        raise MemobenchError(f"{folder} is there, and {told}, which says by which command, is gone; remove the folder")
+    command, folder = cell.log(part).with_suffix(".json"), cell.evaluation(part)
+    if folder.is_dir() and not command.exists():
+        raise MemobenchError(f"{folder} exists, but {command} with its command is missing; remove the folder")
     return part in cell.parts and cell.done(part)
 
 
 def _check_policies(rows: Rows) -> None:
-    """Refuse a cell whose parts are of two policies, and a policy that two cells are of; a log tells its weights' hash.
-
-    An evaluation of an earlier checkpoint is of other weights.
-    """
-    of_policy: dict[str, Path] = {}
+    """Refuse a cell whose evaluations are of two policies, by the hash of their weights in the logs."""
     for cell in (cell for cells in rows.values() for cell in cells):
-        parts = [part for part in cell.parts if not part.startswith(AFTER) and evaluated(cell, part)]
-        folders = [cell.evaluation(part) for part in parts]
-        found = {one["policy"]: folder for folder in folders for one in _rollouts(folder) if one.get("policy")}
+        folders = [cell.evaluation(part) for part in cell.parts if evaluated(cell, part)]
+        found = {line["policy"]: folder for folder in folders for line in _rollouts(folder) if line.get("policy")}
         if len(found) > 1:
-            told = " and ".join(map(str, found.values()))
-            raise MemobenchError(f"{told} are of two policies; remove what is of the older one, and run it again")
-        for policy, folder in found.items():
-            if other := of_policy.get(policy):
-                raise MemobenchError(f"{other} and {folder} are of one policy; remove the one that is wrong")
-            of_policy[policy] = folder
+            both = " and ".join(map(str, found.values()))
+            raise MemobenchError(f"{both} are of two policies; remove the older one's and run it again")
 
 
 def report(cell: Cell, part: str) -> dict[str, Any]:
     """Return the figures of an evaluation, counted from its log.
 
     Raises:
-        MemobenchError: its card tells another command than the cell's, or more rollouts than there are.
+        MemobenchError: its card has another command than the cell, or asks for more rollouts than exist.
     """
     return _figures(cell.evaluation(part), tuple(cell.carded_words(part)))
 
@@ -149,8 +140,8 @@ def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
         differ = difference((word for word in start.get("command", ()) if word != "resume=true"), words)
         if differ is not None:
             raise MemobenchError(
-                f"{folder} is of another evaluation than its cell's, by its card: {differ[:80]!r} stands in one of "
-                "them alone; remove the folder and evaluate the cell again"
+                f"{folder} is of another evaluation than its cell's: only one of their commands has {differ[:80]!r}; "
+                "remove the folder and evaluate the cell again"
             )
     asked, there = len(run.protocol["tasks"]) * run.protocol["episodes"], len(run.records)
     if there != asked:
@@ -167,15 +158,9 @@ def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
 
 
 def _percentages(row: Mapping[str, Rate]) -> dict[str, Any]:
-    """Return a report's figures, not rounded: means of training seeds are taken of them."""
+    """Return figures that are not rounded, for means over training seeds."""
     rates = {metric: None if (value := row[metric].value) is None else 100 * value for metric in METRICS}
     return {"n": row["SR"].n, **rates}
-
-
-def named_rollouts(grid: Grid, out: Path, suite: str) -> list[tuple[str, Path]]:
-    """Return name and folder of every evaluation of a suite's rows, as a report tells them apart."""
-    rows = evaluated_rows(grid, out, suite)
-    return [(f"{row}, seed {cell.seed}", cell.evaluation(ROLLOUTS)) for row, cells in rows.items() for cell in cells]
 
 
 @cache
@@ -188,9 +173,9 @@ def _runs(cells: Sequence[Cell], part: str = ROLLOUTS) -> list[list[Record]]:
 
 
 def _evidence(cells: Sequence[Cell]) -> list[dict[str, Any]]:
-    """Return "follows", "chance" and "scenes" of each training seed; [] where no task tells a chance."""
+    """Return "follows", "chance" and "scenes" of each training seed; [] where no task has a chance."""
     reports = [report(cell, EVIDENCE).get("evidence") for cell in cells if evaluated(cell, EVIDENCE)]
-    return [told["average"] for told in reports if told and told["average"]]
+    return [found["average"] for found in reports if found and found["average"]]
 
 
 # -- tables -----------------------------------------------------------------------------------------------------------
@@ -216,23 +201,23 @@ def _ceiling(ceilings: Mapping[str, float]) -> float | None:
 
 def _summary_line(row: str, cells: Sequence[Cell]) -> list[str]:
     reports = [report(cell, ROLLOUTS) for cell in cells]
-    told = [EMPTY] * 3
+    columns = [EMPTY] * 3
     if evidence := _evidence(cells):
         follows = evidence[0]["follows"]
         rate = f"{follows['percent']:.1f} ({follows['low']:.1f}–{follows['high']:.1f})"
-        told = [rate, f"{evidence[0]['chance']:.1f}", str(evidence[0]["scenes"])]
+        columns = [rate, f"{evidence[0]['chance']:.1f}", str(evidence[0]["scenes"])]
     return [
         row,
         str(len(cells)),
         *_with_interval(average_success(_runs(cells))),
         ", ".join(f"{report['average']['SR']:.0f}" for report in reports),
         *(_average(reports, metric) for metric in METRICS[1:]),
-        *told,
+        *columns,
     ]
 
 
 def _by_memory_type(rows: Rows) -> str:
-    """Return the table as the paper's: four rates of each memory type."""
+    """Return a table like the paper's: four rates of each memory type."""
     header = ("", *(f"{kind} {metric}" for kind in MEMORY_TYPES for metric in METRICS))
     lines = []
     for row, cells in rows.items():
@@ -273,7 +258,7 @@ def _endings(rows: Rows) -> str:
 
 
 def _conditions(rows: Rows) -> str:
-    """Return SR in each control that has no column beside the rows, and its change from the same scenes without it."""
+    """Return SR in each other control, and its change from the same scenes without the control."""
     first = {row: cells[0] for row, cells in rows.items() if cells[0].seed == 0}
     parts = dict.fromkeys(part for cell in first.values() for part in cell.grid.rows[cell.row].controls)
     there = {row: [part for part in parts if part != EVIDENCE and evaluated(cell, part)] for row, cell in first.items()}
@@ -289,36 +274,13 @@ def _conditions(rows: Rows) -> str:
 
 def _condition(cell: Cell, part: str, parts: Sequence[str]) -> str:
     """Return SR in a control, and its change from the first other part with the same episodes, points and interval."""
-    told = _average([report(cell, part)], "SR")
+    success = _average([report(cell, part)], "SR")
     runs = _runs([cell], part)
     for other in (ROLLOUTS, *parts[: parts.index(part)]):
         if episodes_of(without := _runs([cell], other)) == episodes_of(runs):
             change = contrast(runs, without, part, other)
-            return f"{told} ({100 * change.value:+.1f}, {100 * change.low:+.1f} to {100 * change.high:+.1f})"
-    return told
-
-
-def curves(rows: Rows) -> dict[str, list[tuple[int, list[dict[str, float | None]]]]]:
-    """Return row -> updates and the averages of each training seed then, of the rows with earlier checkpoints."""
-    found = {}
-    for row, cells in rows.items():
-        points = []
-        for updates in cells[0].grid.rows[cells[0].row].after:
-            told = [report(cell, part)["average"] for cell in cells if evaluated(cell, part := after(updates))]
-            points += [(updates, told)] if told else []
-        if points:
-            whole = int(word_of(cells[0].training_words(), "steps") or 0)
-            found[row] = [*points, (whole, [report(cell, ROLLOUTS)["average"] for cell in cells])]
-    return found
-
-
-def _by_updates(rows: Rows) -> str:
-    lines = [
-        [row, str(updates), str(len(told)), *(_mean([one[metric] for one in told]) for metric in METRICS)]
-        for row, points in curves(rows).items()
-        for updates, told in points
-    ]
-    return markdown(("", "updates", "training seeds", *METRICS), lines) if lines else ""
+            return f"{success} ({100 * change.value:+.1f}, {100 * change.low:+.1f} to {100 * change.high:+.1f})"
+    return success
 
 
 def _sealed(rows: Rows) -> str:
@@ -341,11 +303,40 @@ def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
         if row != reference and shared:
             others = [base[cell.seed] for cell in shared]
             found[row] = contrast(_runs(shared, part), _runs(others, part), row, reference)
-    return contrasts_table(adjusted(found), reference) if found else ""
+    return _contrasts_table(adjusted(found), reference) if found else ""
+
+
+def _contrasts_table(found: Mapping[str, Contrast], reference: str) -> str:
+    lines = [
+        [
+            f"{name} minus {reference}",
+            str(each.episodes),
+            f"{100 * each.value:+.1f}",
+            f"{100 * each.low:+.1f} to {100 * each.high:+.1f}",
+            _probability(each.p),
+            ", ".join(f"{100 * value:+.0f}" for value in each.of_seeds),
+            _probability(each.p_of_seeds),
+            EMPTY if each.detectable is None else f"{100 * each.detectable:.1f}",
+        ]
+        for name, each in found.items()
+    ]
+    tests = ("p of episodes (Holm)", "of training seeds", "p of training seeds (Holm)")
+    return markdown(("", "episodes", "difference, points", "95 %", *tests, "detectable"), lines)
+
+
+def _probability(p: float | None) -> str:
+    if p is None:
+        return EMPTY
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows))
 
 
 def _costs(rows: Rows) -> str:
-    """Return what a training took on the clock, beside other work, and a control step of a rollout, all included."""
+    """Return wall time of a training, and of a control step of a rollout, on a shared machine."""
     lines = []
     for row, cells in rows.items():
         trained = [cost[TRAINING].wall_s / 60 for cell in cells if TRAINING in (cost := cell.costs())]

@@ -1,4 +1,4 @@
-"""The expert under two versions of MuJoCo: outcomes, final states and first pictures beside each other.
+"""The expert under two versions of MuJoCo: outcomes, final states and first pictures compared.
 
 Each side runs in a process of its own, which finds its MuJoCo first on its path, and writes one file per task. A file
 that is there is not made again, so a study that was ended goes on.

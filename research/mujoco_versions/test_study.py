@@ -1,4 +1,4 @@
-"""What differs between two versions of MuJoCo is counted by hand; the same version differs in nothing."""
+"""Differences of two versions of MuJoCo, counted by hand; a version equals itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TASK = "open_and_close_the_microwave"
 
 
 def side(out: Path, mujoco: str, **changes: Any) -> None:
-    """Write what one side did: two episodes of a scene of three bodies and pictures of 2 × 2 pixels."""
+    """Write the results of a side: two episodes of a scene of three bodies and pictures of 2 × 2 pixels."""
     columns = {
         "seed": np.array([7, 8]),
         "start": np.zeros((2, 3, 3)),

@@ -46,64 +46,42 @@ def necessity(
         "outputs/necessity"
     ),
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    page: Annotated[
-        Path | None, typer.Option(help="Markdown page whose table is made anew, between its marks.")
-    ] = None,
-    beside: Annotated[
-        Path | None,
-        typer.Option(
-            help="necessity.json of the published tasks; the page's table then shows them beside their strict tasks."
-        ),
-    ] = None,
     memoryless: Annotated[
         list[Path] | None,
-        typer.Option(help="Evaluation of a trained policy without a memory, shown beside the bounds; repeatable."),
+        typer.Option(help="Evaluation of a trained policy without a memory, added to the table; repeatable."),
     ] = None,
 ) -> None:
-    """Find frames that look alike and need different answers: lower bounds of what a policy without memory reaches."""
+    """Find frames that look alike and need different answers: lower bounds of a policy without a memory."""
     from lerobot_memobench.tasks.task import REFERENTS
-    from research import pages
-    from research.necessity.report import (
-        STUDY,
-        put_into_page,
-        read_results,
-        terminal_table,
-        write,
-    )
+    from research.necessity.report import terminal_table, write
     from research.necessity.settings import Settings
     from research.necessity.study import PIECES, make
     from research.necessity.trained import read_evaluations, with_evaluations
 
-    # Now, not after the simulation.
-    published = None if beside is None else read_results(beside)
     evaluated = read_evaluations(memoryless or [])
-    if page is not None:
-        pages.around(page, STUDY)
     settings = Settings(episodes=episodes, budget=budget, tolerance=tolerance)
     referents = REFERENTS if referent is WhichReferent.BOTH else (referent.value,)
     studies = _studies([get_task(name) for name in resolve_tasks(tasks, suite)], referents, settings, out)
     screen = console()
     for piece, unit in PIECES.items():
         with counting(screen, unit) as count:
-            make(studies, piece, workers, _telling(count))
+            make(studies, piece, workers, _progress(count))
     results = with_evaluations([study.result() for study in studies], evaluated)
     written = write(out, results)
-    if page is not None:
-        written.append(put_into_page(page, results, published))
     screen.print(terminal_table(results), crop=False)
     for path in written:
         screen.print(str(path), soft_wrap=True)
 
 
-def _telling(count: Count) -> ProgressCallback:
-    def tell(news: Advance) -> None:
+def _progress(count: Count) -> ProgressCallback:
+    def show(news: Advance) -> None:
         count(news.done, news.total, f"{news.task_name}, seed {news.seed}", found=news.found)
 
-    return tell
+    return show
 
 
 def _studies(tasks: Sequence[Task], referents: Sequence[str], settings: Settings, out: Path) -> list[Study]:
-    """Return every task with every setting of the referent that says something of its own."""
+    """Return every task with every setting of the referent in which it differs."""
     from research.necessity.settings import settings_of
     from research.necessity.study import Study
 

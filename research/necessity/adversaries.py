@@ -4,8 +4,8 @@
 
 Each decision is a function of the present observation and the instruction. Between decisions the scripted hand moves.
 Strategies use the scene as a notebook (drawers ajar, moved objects, knobs between off and on), look into drawers, read
-the clock, or guess at the best odds. Rollouts begin where the prompt has ended and stop once nothing that the strategy
-does can change their result. They are appended to ``rollouts.jsonl``, scene by scene; the same command goes on.
+the clock, or guess at the best odds. Rollouts begin where the prompt has ended and stop once the strategy cannot change
+their result. They are appended to ``rollouts.jsonl``, scene by scene; the same command goes on.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from research.necessity.notes import Motion, leave_ajar, loose_object, opened_to
 LEVELS = ("bottom", "middle", "top")
 TIMES = ("once", "twice", "three times")
 NOTE = 0.03
-"""Distance that stands for one event where a drawer or an object is the note, m."""
+"""Distance that encodes one event where a drawer or an object is the note, m."""
 SLOT, PUNCTUAL = 32, 3
 """Control steps of a slot of the clock, and within how many of them the hand comes home that comes in it."""
 RETURN = 12
@@ -90,7 +90,7 @@ def counted(number: int, rest: int) -> float:
     return float(((1 - first) * (1 - later) ** (number - 1) * later).max())
 
 
-# --- what a strategy sees and can do ---
+# --- observations and actions of a strategy ---
 
 
 @dataclass
@@ -141,7 +141,7 @@ class Seat:
         return found * times if self.task.family == "counting" else found
 
     def placed(self) -> list[Atom]:
-        """Return what is to be carried where, once all events are done."""
+        """Return the object and its place, to be carried once all events are done."""
         return [atom for atom in atoms(self.task.goal) if atom.predicate == "on"]
 
     def do(self, *achieved: Atom) -> Motion:
@@ -150,7 +150,7 @@ class Seat:
             yield from self.expert.achieve(atom)
 
     def rest(self) -> Motion:
-        """Stay at home for longer than what says that the event has happened often enough."""
+        """Stay at home longer than the rest that ends the count."""
         for _ in range(45):
             yield self.expert.hand.toward(*self.sim.home, OPEN)
 
@@ -160,20 +160,20 @@ class Seat:
         return next((name for name in self.sim.world.joints if name != asked), asked)
 
     def moved(self) -> float:
-        """Return how far the object that serves as a note stands aside of its start, m; the start is known."""
+        """Return the distance of the note object from its known start, m."""
         name = loose_object(self.task)
         return float(self.sim.body_pose(name)[0][1] - self._places[name][1])
 
 
 Strategy = Callable[[Seat], Motion]
-"""Yields actions; each decision is a function of what the seat shows at that moment."""
+"""Yields actions; each decision is a function of the present observation of the seat."""
 
 
-# --- counting and order: what tells that it has been done ---
+# --- counting and order: evidence of past events ---
 
 
 def by_note(read: Callable[[Seat], int], write: Callable[[Seat, int], Motion]) -> Strategy:
-    """Return the strategy that does what a note in the scene says is next, and writes the next note."""
+    """Return the strategy that reads the next event from a note in the scene and writes the next note."""
 
     def act(seat: Seat) -> Motion:
         events = seat.events()
@@ -196,7 +196,7 @@ def _bring(seat: Seat, begun: Atom, ended: Atom) -> Motion:
 
 
 def _finish(seat: Seat) -> Motion:
-    """Do what comes after the events: carry a thing to its place, or rest. More of it would change nothing."""
+    """Finish after the events: carry an object to its place, or rest."""
     for atom in seat.placed():
         yield from seat.expert.achieve(atom)
     yield from seat.rest()
@@ -239,7 +239,7 @@ def _write_in_object(size: float, seat: Seat, number: int) -> Motion:
 
 
 def open_means_done(seat: Seat) -> Motion:
-    """Leave open or on what is done; close or switch off everything once all is."""
+    """Leave finished fixtures open or on; close or switch off everything at the end."""
     while True:
         waiting = [begun for begun, _ in seat.events() if not seat.sim.holds(begun)]
         if waiting:
@@ -249,9 +249,9 @@ def open_means_done(seat: Seat) -> Motion:
 
 
 def by_clock(seat: Seat) -> Motion:
-    """Come home in a slot of the clock that says how many events are done, and hover until then.
+    """Come home in a slot of the clock that encodes the number of past events, and hover until then.
 
-    Who is home at another time has not begun: it hovers until a slot comes that says so. Without a clock: `by_chance`.
+    Who is home at another time has not begun: it hovers until the slot of its number. Without a clock: `by_chance`.
     """
     if seat.step == NO_CLOCK:
         yield from by_chance(seat)
@@ -270,7 +270,7 @@ def by_clock(seat: Seat) -> Motion:
 
 
 def _come_in_slot(seat: Seat, number: int) -> Motion:
-    """Hover above home, and come home at the beginning of the next slot that says ``number`` of events."""
+    """Hover above home, and come home at the beginning of the next slot of ``number`` events."""
     hand, (position, rotation) = seat.expert.hand, seat.sim.home
     yield from go_home(hand, position + HOVER * UP, rotation)
     cycle = SLOT * (len(seat.events()) + 1)
@@ -304,7 +304,7 @@ def by_chunk(seat: Seat) -> Motion:
 
 
 def without_coming_home(seat: Seat) -> Motion:
-    """Do all events in one go, then come home: where the hand is tells how often."""
+    """Do all events without coming home in between: the place of the hand encodes the count."""
     while True:
         for begun, ended in seat.events():
             yield from _bring(seat, begun, ended)
@@ -325,7 +325,7 @@ def _asked(seat: Seat) -> tuple[str, str]:
 
 
 def peek(by: float, seat: Seat) -> Motion:
-    """Pull each drawer a little, look while it is held, and fetch what is seen; where nothing is, guess."""
+    """Pull each drawer a little, look while it is held, and fetch the visible object; without any, guess."""
     for drawer in sorted(seat.sim.world.joints):
         yield from pull(seat.expert, drawer, opened_to(seat.expert, drawer, 0.0) - by)
         seen = bool(seat.rows(_asked(seat)[1]))
@@ -337,13 +337,13 @@ def peek(by: float, seat: Seat) -> Motion:
 
 
 def open_one(seat: Seat) -> Motion:
-    """Open a drawer drawn by chance, and fetch what is asked for."""
+    """Open a drawer drawn by chance, and fetch the requested object."""
     yield from seat.expert.achieve(Atom("open", (str(seat.rng.choice(sorted(seat.sim.world.joints))),)))
     yield from _fetch(seat)
 
 
 def _fetch(seat: Seat) -> Motion:
-    """Put what is asked for on the table, as long as it is seen."""
+    """Put the requested object on the table while it is visible."""
     name, kind = _asked(seat)
     while seat.rows(kind):
         yield from seat.do(Atom("on", (name, "kitchen_table_table_region")))
@@ -353,7 +353,7 @@ def _fetch(seat: Seat) -> Motion:
 
 
 def routine(choose: Callable[[Seat, int], int], seat: Seat) -> Motion:
-    """Do what one of the variants asks for."""
+    """Reach the goal of one of the variants."""
     task = seat.episode.published
     yield from _do_variants(seat, [task.random_variants[choose(seat, len(task.random_variants))]])
 
@@ -412,7 +412,7 @@ STRATEGIES: dict[str, dict[str, Strategy]] = {
 
 @cache
 def _episode(name: str) -> Episode:
-    """Return the episodes of a task, whose scene is compiled once; prompts are hidden but for what they leave."""
+    """Return the episodes of a task, with a scene that is compiled once; of prompts only the final scene is visible."""
     return Episode(get_task(name), demonstration_prompt=False)
 
 

@@ -44,7 +44,7 @@ def begin(task: Task, sim: Simulation, seed: int) -> None:
 
 @lru_cache(maxsize=HIDINGS)
 def _after_hiding(task: Task, prompt: Prompt, seed: int) -> Snapshot:
-    """Play a prompt as an episode of this seed does, and return what it leaves."""
+    """Play a prompt as an episode of this seed does, and return the scene after it."""
     from lerobot_memobench.envs.episode import Episode
     from lerobot_memobench.protocol import ACTION_DIM, PROMPT
 
@@ -63,13 +63,13 @@ Picture = NDArray[np.uint8]
 CAMERAS = ("agentview", "wrist")
 
 SHIFT = 2
-"""Pixels by which what is seen may have moved and still count as the same."""
+"""Pixels by which an image may be displaced and still count as the same."""
 COLOUR = 24
 """Largest difference of a colour channel, of 255, that still counts as the same."""
 
 
 def photograph(sim: Simulation) -> tuple[Picture, ...]:
-    """Return what the cameras see now."""
+    """Return the present images of both cameras."""
     return tuple(sim.render(camera) for camera in CAMERAS)
 
 
@@ -175,7 +175,7 @@ class Home:
         self.go()
 
     def look(self) -> tuple[Picture, ...]:
-        """Return what the cameras would see with the arm at home; the simulation goes on as if nothing had been."""
+        """Return the images with the arm at home; the simulation is restored afterwards."""
         before = self._sim.snapshot()
         for _ in self.settle():
             pass
@@ -192,7 +192,7 @@ class Frame:
     """A decision of the expert.
 
     Attributes:
-        answer: what it begins to do.
+        answer: the subtask that it begins.
         step: control steps of the execution so far.
         observations: pictures as it happens. at_home: pictures with the arm at home.
         proprio: (8,) as it happens; at home it is the same at every decision of an episode.
@@ -215,10 +215,10 @@ class Demonstration:
 
 
 REST = "rest"
-"""The answer to do nothing more."""
+"""The answer to rest."""
 HOME = Atom("handhome", ())
 STILL = 0.001
-"""Change of proprioception (m, rad) in a step up to which the hand stands still."""
+"""Change of proprioception (m, rad) in a step up to which the hand is at rest."""
 
 
 def rest_steps(formula: Formula) -> int:
@@ -228,7 +228,7 @@ def rest_steps(formula: Formula) -> int:
 
 
 def answer_of(atom: Atom) -> Atom:
-    """Return what has to be done for an atom: of a latch, what it remembers."""
+    """Return the atom to bring about: of a latch, its own atom."""
     return Atom(LATCHES.get(atom.predicate, atom.predicate), atom.args)
 
 
@@ -236,15 +236,15 @@ def expert_of(task: Task, sim: Simulation, seed: int, listen: Callable[[Atom], o
     """Return the expert as an episode of this seed has it.
 
     Args:
-        listen: told what the expert begins to do whenever it turns to something.
+        listen: called with each subtask that the expert begins.
     """
     from lerobot_memobench.experts.expert import Expert
 
     class Noting(Expert):
-        """Tells what it turns to."""
+        """Reports its subtasks."""
 
         def achieve(self, atom: Atom) -> Steps:
-            """Bring one atom about, and say so unless it is so already or no more than a way to stand."""
+            """Bring one atom about, and report it unless it holds already or is only a posture."""
             if listen is not None and atom.predicate not in SINCE_START and not self._holds(atom):
                 listen(answer_of(atom))
             yield from super().achieve(atom)
@@ -261,7 +261,7 @@ def follow(task: Task, sim: Simulation, seed: int, horizon: int = HORIZON) -> De
     while not progress.success and not progress.lost and progress.steps < horizon and not expert.done:
         action = expert.act()
         if turns and not expert.done:
-            watcher.note(turns[-1], progress.steps)  # what it turns to on the way to another thing is done first
+            watcher.note(turns[-1], progress.steps)  # a subtask on the way to another one is done first
             turns.clear()
         sim.step(action)
         progress.step(sim.holds)
@@ -280,12 +280,12 @@ class _Watcher:
         self._rest: Frame | None = None
 
     def note(self, answer: Atom, step: int) -> None:
-        """Take down what the expert turns to now."""
+        """Note the subtask that the expert begins."""
         self._noted.append((answer, self._photograph(str(answer), step)))
         self._rest = None
 
     def look_for_rest(self, step: int) -> None:
-        """Photograph the hand that has come home and stands: if nothing follows, this is where it decided to rest."""
+        """Keep images of the hand at rest at home: without a further subtask, here it decided to rest."""
         if not self._rests:
             return
         now = self._sim.proprio()
@@ -297,7 +297,7 @@ class _Watcher:
 
     def frames(self, success: bool) -> tuple[Frame, ...]:
         """Return the decisions of an episode that has ended."""
-        # While a `Then` still counts how long its last part holds, the expert may turn to what is not asked for.
+        # While a `Then` counts how long its last part holds, the expert may begin a subtask that is not requested.
         while success and self._noted and not self._sim.holds(self._noted[-1][0]):
             self._noted.pop()
         rest = () if self._rest is None else (self._rest,)

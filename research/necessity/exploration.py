@@ -54,13 +54,13 @@ if TYPE_CHECKING:
 # --- one scene in which answers are tried out ---
 
 SAME_PLACE = 0.02
-"""Distance up to which an object is where it was when states of the exploration are told apart, m."""
+"""Distance up to which an object is where it was for states of the exploration to be equal, m."""
 SAME_JOINT = {"slide": 0.02, "hinge": 0.1}
 """The same for drawers (m) and for doors and knobs (rad)."""
 LITTLE, AJAR = 0.25, 0.7
 """How far a drawer, door or knob is pulled a little and left ajar, of its way from closed to open or on."""
 AT_HOME = frozenset({Atom("handhome", ()), Atom("asbegun", ())})
-"""What does not count while the world settles: the arm is at home at once, where a hand would be on its way. A rest
+"""Steps that do not count while the world settles: the arm is at home at once, where a hand would be on its way. A rest
 would have begun before anything decides to rest."""
 ASIDE = 0.06
 """How far an object is moved that serves as a note, m."""
@@ -79,7 +79,7 @@ def answers_of(variants: Sequence[Task]) -> list[Atom]:
 
 @dataclass(frozen=True)
 class Place:
-    """Where things are, for telling states apart."""
+    """Places of objects, to distinguish states."""
 
     true: frozenset[Atom]
     objects: NDArray[np.float64]
@@ -87,7 +87,7 @@ class Place:
     reach: NDArray[np.float64]
 
     def same(self, other: Place) -> bool:
-        """Whether nothing of note lies or stands elsewhere."""
+        """Whether all relevant objects are where they were."""
         return (
             self.true == other.true
             and bool(np.all(np.linalg.norm(self.objects - other.objects, axis=-1) < SAME_PLACE))
@@ -104,8 +104,8 @@ class Laboratory:
         seed: of the start.
 
     Attributes:
-        answers: what can be done: `REST` where a goal asks for rest, what the expert does, and in strict tasks what
-            makes a note of the scene or shows what is in a drawer: pull a little, leave ajar, move an object.
+        answers: possible subtasks: `REST` where a goal asks for rest, those of the expert, and in strict tasks those
+            that leave a note in the scene or look into a drawer: pull a little, leave ajar, move an object.
         starts: where each variant's execution begins; the same for all but those whose prompt changes the scene.
     """
 
@@ -131,7 +131,7 @@ class Laboratory:
         """Let the expert carry out an answer, come home, and settle; return the steps it took.
 
         Args:
-            listen: told the atoms that hold after each step.
+            listen: called with the atoms that hold after each step.
             limit: steps after which the answer is broken off.
         """
         steps = 0
@@ -147,7 +147,7 @@ class Laboratory:
         return steps
 
     def _motion(self, answer: str) -> Iterator[NDArray[np.floating]]:
-        """Yield the actions of an answer; none where it is so already, or nobody can see what to take."""
+        """Yield the actions of an answer; none where it holds already, or where the object is not visible."""
         from lerobot_memobench.sim.simulation import NO_OP
 
         if answer == REST:
@@ -188,7 +188,7 @@ class Laboratory:
 def _notes(task: Task, sim: Simulation) -> Iterator[tuple[str, Callable[[Expert], Motion]]]:
     """Yield by name what uses the scene as a notebook, or looks into a drawer.
 
-    Published tasks are searched without: nothing in them keeps a scene from being used so.
+    Published tasks are searched without: their goals do not prevent it.
     """
     for name in sim.world.joints:
         yield f"pull {name} a little", partial(_open_by, name, LITTLE)
@@ -206,14 +206,14 @@ def _open_by(name: str, share: float, expert: Expert) -> Motion:
 
 @dataclass
 class Exploration:
-    """What was found.
+    """Result of a search.
 
     Attributes:
         graph: states and moves; pictures are numbered by node until somebody groups them.
         starts: node at which each goal's execution begins.
-        pictures: what is seen at each node. true: which atoms of the goals hold there.
+        pictures: images at each node. true: which atoms of the goals hold there.
         moves, steps: how many of either were simulated.
-        exhausted: no state is left that can be reached before the horizon and matters; the budget cut nothing off.
+        exhausted: every relevant state before the horizon was explored; the budget did not end the search.
     """
 
     graph: Graph
@@ -246,7 +246,7 @@ class _Explorer:
     """Grows an exploration state by state; it begins with the starts.
 
     Attributes:
-        found: what is known so far.
+        found: results so far.
     """
 
     def __init__(self, laboratory: Laboratory, horizon: int) -> None:
@@ -326,7 +326,7 @@ def walk(
 ) -> int:
     """Let a policy without memory act from pictures alone, from where a simulation is; return how many goals came true.
 
-    Such a policy goes the same way whatever the goal, so it goes once and every goal is looked for on the way.
+    Such a policy acts alike for all goals, so it is run once and every goal is checked on the way.
 
     Args:
         tasks: whose goals are looked for within the horizon.

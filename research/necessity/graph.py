@@ -1,8 +1,8 @@
 """An explored scene as a graph of states and answers, and the best policies without memory on it. Pure: no simulator.
 
 `memoryless` asks whether the demonstrated decisions can be repeated from pictures alone. A goal often accepts other
-ways: three drawers may be opened together and closed one by one, and then each picture says what is left to do. Here
-the answers are moves of a graph that was explored in the simulator; a policy walks it from the start, sees only
+ways: three drawers may be opened together and closed one by one, and then each picture shows the rest. Here the
+answers are moves of a graph that was explored in the simulator; a policy walks it from the start, sees only
 pictures, and succeeds when the goal comes true within the horizon.
 """
 
@@ -22,7 +22,7 @@ from lerobot_memobench.tasks.progress import Evaluator
 
 @dataclass(frozen=True)
 class Move:
-    """What an answer does at a node.
+    """Effect of an answer at a node.
 
     Attributes:
         to: node it leads to.
@@ -40,9 +40,9 @@ class Graph:
     """Explored part of a scene; node 0 is a start. A node without moves was not explored further.
 
     Attributes:
-        pictures: class of what is seen, per node.
+        pictures: class of the images, per node.
         moves: node → answer → move.
-        decided: nodes that nobody needs to explore: whichever way they are reached, every goal is reached or lost.
+        decided: nodes that need no exploration: every goal is reached or lost there.
     """
 
     pictures: list[int]
@@ -66,11 +66,11 @@ class Graph:
 
 
 LOST = -1
-"""What a goal remembers once it can no longer be reached."""
+"""State of a goal that can no longer be reached."""
 
 
 class GoalWatch:
-    """Follows one goal along moves; what it remembers is numbered, 0 at the start of the execution, or `LOST`."""
+    """Follows one goal along moves; its states are numbered, 0 at the start of the execution, or `LOST`."""
 
     def __init__(self, goal: Formula) -> None:
         start = Evaluator([goal])
@@ -104,7 +104,7 @@ class GoalWatch:
 
 
 Memories = tuple[int | None, ...]
-"""Per goal what it remembers; None once it held in time."""
+"""State of each goal; None once it held in time."""
 
 
 def advance_all(watches: Sequence[GoalWatch], memories: Memories, move: Move, left: int | None = None) -> Memories:
@@ -133,7 +133,7 @@ Policy = dict[int, str]
 def best_map(graph: Graph, goals: Sequence[Formula], horizon: int, starts: Sequence[int] = ()) -> tuple[float, Policy]:
     """Return the largest share of equally likely goals that one map from pictures to answers reaches, and the map.
 
-    From one start the same map walks the same way whatever the goal, so it is followed once and each goal is looked
+    From one start a map acts alike for all goals, so it is followed once and each goal is looked
     for along the way.
 
     Args:
@@ -150,7 +150,7 @@ class _Way:
 
     Attributes:
         party: which start it began at. reached: goals reached from the starts before that one.
-        node, memories, used: where it is, what the goals of this start remember, steps used.
+        node, memories, used: place, states of the goals of this start, steps used.
         visited: states on the way, to which a map returns for ever.
     """
 
@@ -236,7 +236,7 @@ class _Search:
             self.best = (share, policy)
 
 
-# --- the best probabilities of answers given the picture, where a wrong answer may be mended ---
+# --- the best probabilities of answers given the picture, where a wrong answer may be corrected ---
 
 STRIDE = 25
 """Steps are counted in multiples of this when probabilities are optimised, rounded up: a move never gets cheaper."""
@@ -245,7 +245,7 @@ RESTARTS, ITERATIONS = 4, 200
 _State = tuple[int, int, int]
 """Node, memory, steps used / `STRIDE`."""
 _SUCCESS, _FAILURE = -2, -1
-"""Where an answer leads beside to other states; they are the last two places of an array over states."""
+"""Ends of an answer other than states; the last two places of an array over states."""
 
 
 _Layers = list[dict[_State, dict[str, _State | int]]]
@@ -257,7 +257,7 @@ class _Walk:
     """All that can happen under one goal.
 
     Attributes:
-        pictures: (S,) what is seen at each state, as a row of the policy.
+        pictures: (S,) class of the images at each state, as a row of the policy.
         to: (S, A) where each answer leads: a state, `_SUCCESS` or `_FAILURE`.
         layers: runs of states that have used the same time, in its order: an answer leads to a later one.
     """
@@ -341,7 +341,7 @@ def _hopeful(layers: _Layers) -> set[_State]:
 
 
 def _climb(policy: NDArray[np.float64], walks: Sequence[_Walk]) -> float:
-    """Raise the success of ``policy`` (pictures, answers) until it stands still; return it."""
+    """Raise the success of ``policy`` (pictures, answers) until it no longer changes; return it."""
     value = 0.0
     for _ in range(ITERATIONS):
         expected = [_expect(policy, walk) for walk in walks]

@@ -1,12 +1,12 @@
 """How far a policy without memory can come: aliased frames, chance and ceilings. Pure: no simulator.
 
 A *history* is one demonstrated episode seen as a row of decisions; a decision is the picture that is seen before it
-(as the number of a class of pictures that cannot be told apart) and the answer that is right in this history. A policy
+(as the number of a class of equal pictures) and the answer that is right in this history. A policy
 without memory is a map from pictures to answers, or to probabilities of answers. It passes a history when it gives the
-right answer at each of its decisions; one wrong answer fails (what a policy may gain by trying again is the subject of
+right answer at each of its decisions; one wrong answer fails (trying again is the subject of
 `graph`).
 
-Histories of one scene are weighed together: they are what may lie behind the same pictures.
+Histories of one scene are weighed together: they may lead to the same pictures.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 RESTARTS = 16
-"""Random starts of the search for the best probabilities, beside the even one."""
+"""Random starts of the search for the best probabilities, in addition to the even one."""
 ITERATIONS = 2000
 
 
@@ -28,8 +28,8 @@ class Decision:
     """A frame at which the demonstrator turned to something new.
 
     Attributes:
-        picture: class of what is seen; equal numbers cannot be told apart.
-        answer: what is done next, e.g. ``Open wooden_cabinet_1_top_region``.
+        picture: class of the images; equal numbers look the same.
+        answer: the next subtask, e.g. ``Open wooden_cabinet_1_top_region``.
     """
 
     picture: int

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure
-from lerobot_memobench.io import read_json, write_file
+from lerobot_memobench.io import write_file
 from lerobot_memobench.protocol import IDLE_STEPS
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.task import DRAWN, REFERENTS
-from research import pages
-from research.necessity.study import KeptResult, Result, pictures_path
+from lerobot_memobench.tasks.task import DRAWN
+from research.necessity.study import Result, pictures_path
 from research.necessity.trained import in_words as rate_in_words
 
 if TYPE_CHECKING:
@@ -27,16 +26,16 @@ if TYPE_CHECKING:
 # --- verdicts ---
 
 VERDICTS = {
-    "no": "what is observed at the decisions, the hand where it happens to be, decides each: no memory is needed",
-    "order": "it does not decide the demonstrated order, but pictures decide another that the goal accepts",
-    "clock": "what is observed decides together with the step counter",
+    "no": "observations at the decisions, with the pose of the hand, decide each: no memory is needed",
+    "order": "they do not decide the demonstrated order, but pictures decide another that the goal accepts",
+    "clock": "observations decide together with the step counter",
     "not found": "no way without a memory was found, though every state was tried that can be reached before the "
     "horizon: a bound for decisions, not a proof",
     "cut off": "no way without a memory was found before the search was cut off",
-    "open": "what is observed does not decide the demonstrated order; other ways were not looked for",
-    "unknown": "the expert solved none of the scenes, so nothing can be said",
+    "open": "observations do not decide the demonstrated order; other ways were not searched",
+    "unknown": "the expert solved none of the scenes",
 }
-"""Verdict -> what it means. They rest on what is observed as it happens, not on pictures with the arm taken home."""
+"""Verdict -> meaning. Verdicts rest on observations as they happen, not on pictures with the arm at home."""
 
 
 def verdict(result: Result) -> str:
@@ -55,38 +54,7 @@ def verdict(result: Result) -> str:
     return "cut off" if any_order["cut_off"] else "not found"
 
 
-# --- published tasks beside their strict tasks ---
-
-HEADINGS = (
-    *("published task", "best map ≥", "without a memory"),
-    *("its strict task", "goals", "as it happens ≥", "with step ≥", "any order ≥", "any order, prob. ≥", "search"),
-    *("trained policy", "expert", "without a memory"),
-)
-
-
-def side_by_side(published: Sequence[Result], strict: Sequence[Result]) -> str:
-    """Return a Markdown table with a row per strict task, and a summary; published goals are the fixed ones."""
-    fixed = {result["task"]: result for result in published if result["referent"] == REFERENTS[0]}
-    lines = ["| " + " | ".join(HEADINGS) + " |", "|---" * len(HEADINGS) + "|"]
-    for result in strict:
-        name = get_task(result["task"]).derived_from or ""
-        row = [f"`{name}`", *_published(fixed.get(name)), f"`{result['task']}`", *_strict(result)]
-        lines.append("| " + " | ".join(row) + " |")
-    lines += ["", bounds(strict)]
-    return "\n".join(lines) + "\n"
-
-
-def _published(result: Result | None) -> list[str]:
-    """Return the cells of a published task: the best map that was found, in any order, and the verdict."""
-    if result is None or result["in_order"] is None:
-        return [NOT_APPLICABLE] * 2
-    found = (result["any_order"] or {}).get("deterministic", 0.0)
-    return [figure(max(found, result["in_order"]["as_it_happens"])), verdict(result)]
-
-
-def _strict(result: Result) -> list[str]:
-    """Return the cells of a strict task."""
-    return [str(result["variants"]), *_bounds_of(result), *_expert(result), verdict(result)]
+# --- lower bounds ---
 
 
 def _bounds_of(result: Result) -> list[str]:
@@ -114,18 +82,18 @@ def bounds(results: Sequence[Result]) -> str:
     if not searched:
         return ""
     open_ones = sum(verdict(result) in ("not found", "cut off") for result in drawn)
-    told = [
+    values = [
         f"the {name} at most {figure(max(values))} %, on average {figure(sum(values) / len(values))} %"
         for name, values in (
             ("best fixed map in any order", [result["any_order"]["deterministic"] for result in searched]),
             ("best probabilities in any order", [result["any_order"]["stochastic"] for result in searched]),
-            ("best fixed map of what is observed", [result["in_order"]["as_it_happens"] for result in searched]),
+            ("best fixed map of observations", [result["in_order"]["as_it_happens"] for result in searched]),
             ("same with the step counter", [result["in_order"]["with_step"] for result in searched]),
         )
     ]
     return (
         f"Without a memory no way was found to {open_ones} of {len(drawn)} tasks. Lower bounds of what such a policy "
-        f"reaches: {'; '.join(told)}. {_cut_off(searched)}"
+        f"reaches: {'; '.join(values)}. {_cut_off(searched)}"
     )
 
 
@@ -150,7 +118,7 @@ CAMERAS = ("third person", "wrist")
 
 
 def pairs_figure(out: Path, results: Sequence[Result]) -> bytes | None:
-    """Return a PNG of a few aliased pairs: both frames side by side, and what is right at each; None without any.
+    """Return a PNG of a few aliased pairs: both frames side by side with their right answers; None without any.
 
     One pair within an episode and one between goals, the two ways in which memory is needed; of drawn tasks one of each
     family.
@@ -211,11 +179,11 @@ WORDS = {
     "on": "put {} on {}",
     "in": "put {} into {}",
 }
-"""What is done so that an atom holds."""
+"""Atom -> the subtask that brings it about."""
 
 
 def in_words(answer: str) -> str:
-    """Return an answer, such as ``(open wooden_cabinet_1_top_region)``, as it would be said."""
+    """Return an answer, such as ``(open wooden_cabinet_1_top_region)``, in words."""
     predicate, *names = answer.strip("()").split()
     things = [re.sub(r"^.*_(top|middle|bottom)_(region|level)$", r"\1 drawer", name) for name in names]
     things = [re.sub(r"_1$", "", thing).replace("_", " ") for thing in things]
@@ -241,17 +209,17 @@ JSON_FILE, MARKDOWN_FILE, FIGURE_FILE = "necessity.json", "necessity.md", "alias
 
 
 COLUMNS = {
-    "referent": "what the goal is; *both*: the task has one goal, so the settings are the same",
+    "referent": "setting of the goal; *both*: the task has one goal, so the settings are the same",
     "goals": "goals that may lie behind the same start",
     "decisions": "times per episode at which the expert turns to something new",
     "aliased": "frames that are alike and have more than one right answer: as it happens / with the step / arm at home",
-    "as it happens ≥": "best map from what is observed at a decision, the hand where it is, to answers, in the "
+    "as it happens ≥": "best map from observations at a decision, with the pose of the hand, to answers, in the "
     "demonstrated order",
-    "with step ≥": "the same where the step counter is observed too, as far as it tells: where the robot idles before "
+    "with step ≥": "the same where the step counter is observed too: where the robot idles before "
     f"the execution, steps count as alike up to {IDLE_STEPS:,} apart, which a threshold may beat",
     "any order ≥": "best map from pictures with the arm at home to answers if any order will do that the goal accepts: "
     "found, and confirmed in the simulator",
-    "any order, prob. ≥": "best probabilities found, wrong answers mended as the scene allows, within the horizon",
+    "any order, prob. ≥": "best probabilities found, wrong answers corrected as the scene allows, within the horizon",
     "search": "of other orders: *whole*, or *cut off* by its budget with so many states left to try",
     "trained policy": "SR of a trained policy without a memory, its 95 % interval and number of scenes; empty where "
     "none was evaluated",
@@ -260,7 +228,7 @@ COLUMNS = {
     "expert": "the expert's episodes that reached the goal",
     "without a memory": "; ".join(f"*{word}*: {meaning}" for word, meaning in VERDICTS.items()),
 }
-"""Heading -> what it says under the table."""
+"""Heading -> its explanation under the table."""
 
 
 def cells(result: Result, referent: str) -> list[str]:
@@ -319,7 +287,7 @@ def markdown(results: Sequence[Result]) -> str:
     lines += [f"| {memory_type}: `{task}` | " + " | ".join(row) + " |" for memory_type, task, row in rows(results)]
     lines += [
         "",
-        "Per cent, means over scenes; ≥ is a lower bound of what a policy without a memory reaches. Columns:",
+        "Per cent, means over scenes; ≥ is a lower bound of a policy without a memory. Columns:",
         "",
     ]
     lines += [f"- **{name}**: {meaning}." for name, meaning in COLUMNS.items()]
@@ -345,42 +313,12 @@ def _ways(results: Sequence[Result]) -> list[str]:
         if verdict(result) == "order":
             lines.append(f"- `{result['task']}` ({result['referent']}):")
             for rule in result["any_order"]["policy"]:
-                when = " or ".join(f"`{text}`" if text else "*nothing of the goal*" for text in rule["when"])
+                when = " or ".join(f"`{text}`" if text else "*no part of the goal*" for text in rule["when"])
                 lines.append(f"  - seeing {when}: `{rule['do']}`")
     return lines
 
 
 # --- files ---
-
-STUDY = "necessity"
-"""As in ``python -m research.necessity``."""
-
-
-def read_results(path: Path) -> list[Result]:
-    """Return the results that another run wrote into its ``necessity.json``.
-
-    Raises:
-        MemobenchError: it is missing, cannot be read or holds something else.
-    """
-    advice = f"name the {JSON_FILE} that `python -m research.necessity` wrote"
-    try:
-        found: list[Result] = read_json(path, list[KeptResult], advice)
-    except FileNotFoundError:
-        raise MemobenchError(f"there is no {path}; {advice}") from None
-    return found
-
-
-def put_into_page(page: Path, results: Sequence[Result], beside: Sequence[Result] | None = None) -> Path:
-    """Put the table into a Markdown page, between its two marks; return the page.
-
-    Args:
-        beside: results of the published tasks; then the table shows those beside the strict tasks of ``results``.
-
-    Raises:
-        MemobenchError: see `pages.around`.
-    """
-    table = markdown(results) if beside is None else side_by_side(beside, results)
-    return pages.put_into(page, STUDY, table.rstrip("\n"))
 
 
 def write(out: Path, results: Sequence[Result]) -> list[Path]:

@@ -38,7 +38,7 @@ EXAMPLES = 3
 
 
 class Scene:
-    """Frames of successful demonstrations: what a failed one did is no answer to learn.
+    """Frames of successful demonstrations: failed ones have no answers to learn.
 
     Args:
         variants, shown: goals that may lie behind the start, and how each was demonstrated.
@@ -60,7 +60,7 @@ class Scene:
         self._pictures = classes(self._differences, tolerance)
 
     def result(self, seed: int) -> dict[str, Any]:
-        """Return what is kept of a scene; ``aliased`` and ``in_order`` are empty where no demonstration succeeded."""
+        """Return the result of a scene; ``aliased`` and ``in_order`` are empty without a successful demonstration."""
         histories = self._histories(self._pictures)
         as_exact = self._histories(classes(pairwise_table(self._frames, _exactly), PIXEL_EXACT))
         seen = pairwise_table(self._frames, _as_it_happens)
@@ -104,7 +104,7 @@ class Scene:
         return np.concatenate([*self._frames[i].at_home, *self._frames[j].at_home], axis=1)
 
     def _told_by_the_step(self) -> NDArray[np.bool_]:
-        """Return which frames the step counter tells apart, (n, n): those further apart than the robot idles at most.
+        """Return the pairs of frames that the step counter separates, (n, n): further apart than the longest idling.
 
         Without idling every step does, which is generous: in other scenes the same decision comes at another step.
         """
@@ -112,7 +112,7 @@ class Scene:
         return np.abs(np.subtract.outer(steps, steps)) > self._idle
 
     def _histories(self, pictures: Sequence[int]) -> list[History]:
-        """Return a history per demonstration; what is seen under different instructions can be told apart."""
+        """Return a history per demonstration; pictures under different instructions are distinct."""
         rows: dict[int, list[Decision]] = {}
         instructions = list(dict.fromkeys(self._asked))
         for owner, asked, frame, picture in zip(self._owners, self._asked, self._frames, pictures, strict=True):

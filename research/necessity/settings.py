@@ -1,4 +1,4 @@
-"""What is asked of a task: under which referent, over which scenes, how closely pictures are looked at."""
+"""Settings of the study: referent, scenes, and tolerance of pictures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VERSION = 4
 
 @dataclass(frozen=True)
 class Settings:
-    """What a result depends on, besides the task.
+    """Settings of a result, besides the task.
 
     Attributes:
         episodes: scenes (seeds) per task; with `referent=random` each is demonstrated once per variant.
@@ -40,7 +40,7 @@ class Settings:
 
 
 def settings_of(task: Task, referents: Sequence[str]) -> tuple[str, ...]:
-    """Return which referents to look at of those asked for: with one goal all are the same, a draw leaves no choice."""
+    """Return the settings of the referent to study: one where the task has one goal or draws it."""
     if task.drawn:
         return (DRAWN,)
     return tuple(referents) if task.num_variants > 1 else REFERENTS[:1]
@@ -54,7 +54,7 @@ def variants_of(task: Task, referent: str) -> list[Task]:
 
 
 def fingerprint(task: Task, referent: str, settings: Settings, searched: int | None = None) -> str:
-    """Return what a kept answer must carry to be one to the same question.
+    """Return the hash that a kept result must have to be of the same settings.
 
     Args:
         searched: for the search, the seed of the start; None for the result of a scene, which has its seed in its name.
@@ -63,5 +63,5 @@ def fingerprint(task: Task, referent: str, settings: Settings, searched: int | N
     asked = {key: value for key, value in asdict(settings).items() if key not in other}
     if searched is not None:
         asked["seed"] = searched
-    said = json.dumps([VERSION, referent, asked, task.bddl_text, task.metadata], sort_keys=True)
-    return hashlib.sha256(said.encode()).hexdigest()[:16]
+    text = json.dumps([VERSION, referent, asked, task.bddl_text, task.metadata], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from lerobot_memobench.sim.simulation import Simulation
 
 
-# --- what is kept, and of which types it is ---
+# --- types of kept results ---
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Kept:
     make: Callable[[], dict[str, Any]]
 
     def found(self) -> dict[str, Any] | None:
-        """Return what the file holds if it answers this question; None if not, whatever else it holds."""
+        """Return the content of the file if it is a result of these settings, else None."""
         try:
             found: dict[str, Any] = read_json(self.path, self.schema, "it is made again")
         except (FileNotFoundError, MemobenchError):
@@ -58,7 +58,7 @@ class Kept:
         """Return the result, made and written where there is none.
 
         Raises:
-            MemobenchError: a folder stands in its place.
+            MemobenchError: there is a folder in its place.
         """
         found = self.found()
         if found is None:
@@ -112,7 +112,7 @@ class KeptScene(TypedDict):
 
 
 class Rule(TypedDict):
-    """What a map does where one of these combinations of atoms is seen."""
+    """Answer of a map at these combinations of atoms."""
 
     when: list[str]
     do: str
@@ -133,7 +133,7 @@ class KeptSearch(TypedDict):
 
 
 class Found(TypedDict):
-    """What the searches of a task found."""
+    """Result of the searches of a task."""
 
     deterministic: Number
     confirmed: Count
@@ -142,7 +142,7 @@ class Found(TypedDict):
 
 
 class KeptResult(TypedDict):
-    """What of `study.Result` stands beside a strict task's."""
+    """Result of a task, as `necessity.json` holds it."""
 
     task: str
     referent: str
@@ -153,14 +153,14 @@ class KeptResult(TypedDict):
 # --- the study of one task ---
 
 Piece = Literal["scene", "search"]
-"""What is made and kept one at a time, for each seed."""
+"""Pieces of a study, one per seed."""
 
 Result = Mapping[str, Any]
-"""What is found about a task: JSON values."""
+"""Result of a task: JSON values."""
 
 
 class Study:
-    """One task under one referent setting: what is on disk is read, the rest is simulated and kept.
+    """One task under one referent setting: kept results are read, others simulated and kept.
 
     Scenes and searches do not depend on one another; processes may make them in one folder.
     """
@@ -170,7 +170,7 @@ class Study:
         self.variants = variants_of(task, referent)
 
     def piece(self, piece: Piece, seed: int) -> Kept:
-        """Return what a scene's demonstrations show, or which ways to the goal are found from its start in any order.
+        """Return the result of a scene's demonstrations, or of the search from its start in any order.
 
         It is on disk, or made when it is asked for.
         """
@@ -182,7 +182,7 @@ class Study:
 
     @property
     def searched(self) -> bool:
-        """Whether other ways to the goal are looked for: where what is observed decides all, there is no search."""
+        """Whether other ways to the goal are searched: not where observations decide all."""
         in_order = _mean_of([scene["in_order"] for scene in self._all("scene") if scene["in_order"]])
         return in_order is not None and in_order["as_it_happens"] < 1.0 and self.settings.budget > 0
 
@@ -221,7 +221,7 @@ class Study:
 
 
 def _over_scenes(scenes: Sequence[Mapping[str, Any]], variants: int) -> dict[str, Any]:
-    """Return what the scenes of a task say together."""
+    """Return the joint result of a task's scenes."""
     solved = sum(scene["solved"] for scene in scenes)
     return {
         "variants": variants,
@@ -236,7 +236,7 @@ def _over_scenes(scenes: Sequence[Mapping[str, Any]], variants: int) -> dict[str
 
 
 def _over_searches(searches: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what the searches of a task say together; the policy is the first one's."""
+    """Return the joint result of a task's searches; the policy is the first one's."""
     return {
         **{key: sum(found[key] for found in searches) / len(searches) for key in ("deterministic", "stochastic")},
         **{key: sum(found[key] for found in searches) for key in ("confirmed", "of", "unexplored")},
@@ -289,7 +289,7 @@ class PieceJob:
 
     Attributes:
         study: of one task under one setting.
-        piece: what is made. seed: of its scene.
+        piece: name of the piece. seed: of its scene.
     """
 
     study: Study
@@ -303,7 +303,7 @@ class PieceJob:
 
     @property
     def task_name(self) -> str:
-        """The task, and what is done."""
+        """The task and the piece."""
         return f"{self.piece} of {self.study.task.name}, referent {self.study.referent}"
 
     def run(self) -> None:

@@ -1,4 +1,4 @@
-"""What can be tried, and from where: the answers of an expert, notes, and the arm brought home."""
+"""Answers that a search tries: those of the expert, notes, and the arm at home."""
 
 from __future__ import annotations
 

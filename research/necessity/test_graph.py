@@ -145,7 +145,7 @@ OPEN, SHUT = Atom("open", ("door",)), Atom("close", ("door",))
 
 
 def door() -> Graph:
-    """A door that is opened and shut, and rests: node 0 shut, node 1 open; nothing tells how often it has been."""
+    """A door that is opened and shut, and rests: node 0 shut, node 1 open; the pictures do not show how often."""
     rest = {node: Move(node, 52, ((frozenset({HOME, (SHUT, OPEN)[node]}), 52),)) for node in (0, 1)}
     leaving = (frozenset({HOME, SHUT}), 2)
     opened = Move(1, 100, (leaving, (frozenset({SHUT}), 78), (frozenset({OPEN}), 8), (frozenset({HOME, OPEN}), 12)))
@@ -166,7 +166,7 @@ def test_who_does_not_count_stops_by_chance(number: int, best: float) -> None:
 
 
 def test_who_may_rest_before_the_first_event_and_knows_it_gains_nothing() -> None:
-    """A rest at the start is lost at once, and told so: nobody needs to explore what comes after."""
+    """A rest at the start is lost at once and marked, so later states need no exploration."""
     watch = GoalWatch(times(1))
     moves = door().moves
     assert watch.advance(0, moves[0]["rest"]) == (LOST, None)

@@ -1,8 +1,7 @@
-"""What the study writes: its table in a page of the documentation, and published tasks beside their strict tasks."""
+"""Verdicts and bounds of the study, and rates of trained policies."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,46 +11,10 @@ from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from research.necessity.__main__ import necessity
-from research.necessity.report import (
-    STUDY,
-    bounds,
-    in_words,
-    put_into_page,
-    read_results,
-    side_by_side,
-    verdict,
-)
+from research.necessity.report import _bounds_of, bounds, in_words, verdict
 from research.necessity.settings import settings_of, variants_of
 from research.necessity.trained import read_evaluations, with_evaluations
-from research.pages import END, begin
 from tests.support import logs
-
-
-def test_a_page_gets_the_table_between_its_marks(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{begin(STUDY)}\nan old table\n{END}\nafter\n")
-    text = put_into_page(page, []).read_text()
-    assert text.startswith(f"before\n{begin(STUDY)}\n\n| task |")
-    assert text.endswith(f"{END}\nafter\n")
-    assert "an old table" not in text
-    assert put_into_page(page, []).read_text() == text
-    page.write_text("no marks")
-    with pytest.raises(MemobenchError, match="put them where the table goes"):
-        put_into_page(page, [])
-    assert page.read_text() == "no marks"
-
-
-@pytest.mark.parametrize("content", [None, b"no marks", b"\xff"])
-def test_a_page_without_a_place_is_told_before_anything_is_simulated(tmp_path: Path, content: bytes | None) -> None:
-    page = tmp_path / "page.md"
-    if content is not None:
-        page.write_bytes(content)
-    with pytest.raises(MemobenchError, match=r"the page .*page\.md"):
-        necessity(page=page, out=tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-# --- published and strict tasks in one table, and the settings of drawn tasks ---
 
 STOVE, STRICT_TASK = "turn_on_the_stove_and_turn_it_off", "turn_the_stove_on_and_off_a_given_number_of_times"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -77,24 +40,22 @@ def result(task: str, referent: str, found: float | None, confirmed: int = 0, cu
     }
 
 
-def test_a_published_task_stands_beside_its_strict_task() -> None:
-    table = side_by_side([result(STOVE, "fixed", None)], [result(STRICT_TASK, "drawn", 1 / 3, 3)])
-    row = next(line for line in table.splitlines() if STRICT_TASK in line)
-    found = "0.0 | 0.0 | 33.3 (3/9) | 21.0 | whole"
-    assert row == f"| `{STOVE}` | 100.0 | no | `{STRICT_TASK}` | 3 | {found} |  | 9/9 | not found |"
-    assert "Without a memory no way was found to 1 of 1 tasks. Lower bounds" in table
-    assert "best fixed map in any order at most 33.3 %, on average 33.3 %" in table
-    assert "| – | – | `" in side_by_side([], [result(STRICT_TASK, "drawn", 0.0)]), "published tasks may not be measured"
-
-
-def test_a_search_that_was_cut_off_says_so() -> None:
+def test_bounds_and_verdicts_of_a_search() -> None:
+    found = result(STRICT_TASK, "drawn", 1 / 3, 3)
+    assert _bounds_of(found) == ["0.0", "0.0", "33.3 (3/9)", "21.0", "whole", ""]
+    assert verdict(found) == "not found"
+    assert "at most 33.3 %, on average 33.3 %" in bounds([found])
     cut = result(STRICT_TASK, "drawn", 1 / 3, 3, cut_off=2)
     assert verdict(cut) == "cut off"
-    assert "| cut off, 10 states left |" in side_by_side([], [cut])
-    assert "2 of 3 searches were cut off by their budget (10,000 control steps for each" in bounds([cut])
+    assert _bounds_of(cut)[4] == "cut off, 10 states left"
+    assert "2 of 3 searches were cut off by their budget (10,000 control steps" in bounds([cut])
+    assert verdict(result(STOVE, "fixed", None)) == "no"
+    assert verdict(result(STOVE, "fixed", 0.5, 9)) == "order"
+    assert bounds([result(STOVE, "fixed", 0.5, 9)]) == ""
+    assert bounds([result(STRICT_TASK, "drawn", None)]) == ""
 
 
-def test_a_trained_policy_stands_beside_the_bounds(tmp_path: Path) -> None:
+def test_rates_of_trained_policies_are_added(tmp_path: Path) -> None:
     lines = [
         logs.record(STRICT_TASK, k, referent="drawn", suite="strict", variant=k % 3, success=k < 2, policy="me")
         for k in range(6)
@@ -104,35 +65,16 @@ def test_a_trained_policy_stands_beside_the_bounds(tmp_path: Path) -> None:
     found, published = with_evaluations([result(STRICT_TASK, "drawn", 0.0), result(STOVE, "fixed", None)], evaluated)
     assert found["trained"] == {"policy": "me", "success": 2, "n": 6, "balanced": True}
     assert published["trained"] is None
-    assert "| 33.3 [9.7–70.0] of 6 |" in side_by_side([], [found])
+    assert _bounds_of(found)[-1] == "33.3 [9.7–70.0] of 6"
     write_episodes(tmp_path / "few", lines[::3])
     (found,) = with_evaluations([result(STRICT_TASK, "drawn", 0.0)], read_evaluations([tmp_path / "few"]))
-    assert "of 2, variants out of balance |" in side_by_side([], [found])
+    assert _bounds_of(found)[-1].endswith("of 2, variants out of balance")
 
 
-def test_a_folder_without_an_evaluation_is_told_before_anything_is_simulated(tmp_path: Path) -> None:
+def test_folders_without_an_evaluation_are_refused_before_simulation(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match="holds no episode log"):
         necessity(memoryless=[tmp_path], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_bounds_are_told_of_drawn_tasks_that_were_searched() -> None:
-    assert bounds([result(STOVE, "fixed", 0.5, 9)]) == ""
-    assert bounds([result(STRICT_TASK, "drawn", None)]) == ""
-
-
-def test_a_page_shows_both_when_it_is_told_of_the_published_results(tmp_path: Path) -> None:
-    kept = tmp_path / "necessity.json"
-    kept.write_text(json.dumps([result(STOVE, "fixed", None)]))
-    page = tmp_path / "page.md"
-    page.write_text(f"{begin(STUDY)}{END}")
-    text = put_into_page(page, [result(STRICT_TASK, "drawn", 0.0)], read_results(kept)).read_text()
-    assert f"| `{STOVE}` | 100.0 | no |" in text
-    with pytest.raises(MemobenchError, match="there is no"):
-        read_results(tmp_path / "missing.json")
-    kept.write_text('[{"task": "a"}]')
-    with pytest.raises(MemobenchError, match=r"name the necessity\.json"):
-        read_results(kept)
 
 
 def test_a_drawn_task_has_one_setting_and_all_its_goals() -> None:
@@ -145,7 +87,7 @@ def test_a_drawn_task_has_one_setting_and_all_its_goals() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "expected"),
     [
         ("(open wooden_cabinet_1_top_region)", "open the top drawer"),
         ("(On butter_5 plate_1)", "put butter 5 on plate"),
@@ -154,5 +96,5 @@ def test_a_drawn_task_has_one_setting_and_all_its_goals() -> None:
         ("(sequence a b)", "sequence a b"),
     ],
 )
-def test_answers_are_titles_and_no_predicates(answer: str, said: str) -> None:
-    assert in_words(answer) == said
+def test_answers_in_words(answer: str, expected: str) -> None:
+    assert in_words(answer) == expected

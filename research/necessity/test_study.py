@@ -136,23 +136,23 @@ def test_a_picture_met_twice_in_an_episode_is_found(monkeypatch: pytest.MonkeyPa
     assert result["aliased"] == {"at_home": 1, "pixel_exact": 0, "as_it_happens": 0, "with_step": 0}
     assert result["expert"] == {"n": 2, "success": 2}
     assert [result["examples"][0][side]["answer"] for side in "ab"] == ["on", "pan"]
-    assert verdict(result) == "no", "what is observed, the hand among it, decides"
+    assert verdict(result) == "no", "observations with the hand decide"
     files = write(tmp_path, [result])
     assert [path.name for path in files] == ["necessity.json", "necessity.md", "aliased_pairs.png"]
     assert "| 25.0 / 0.0 / 25.0 / 100.0 |" in files[1].read_text()
 
 
-@pytest.mark.parametrize(("task", "told"), [(PAN, "clock"), (STRICT_STOVE, "open")])
+@pytest.mark.parametrize(("task", "expected"), [(PAN, "clock"), (STRICT_STOVE, "open")])
 def test_a_step_counter_decides_where_the_robot_does_not_idle(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: str, told: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: str, expected: str
 ) -> None:
     """The same picture with the hand at the same place asks for two answers, at steps 0 and 20."""
     shown = demonstration(("on", scene(), 0.0), ("off", scene(gone=True), 0.1), ("pan", scene(), 0.0))
     by_hand(monkeypatch, dict.fromkeys(range(3), shown))
     result = study(get_task(task), "drawn" if task == STRICT_STOVE else "fixed", Settings(1, budget=0), tmp_path)
     assert result["in_order"]["as_it_happens"] == 0.0
-    assert result["in_order"]["with_step"] == float(told == "clock")
-    assert verdict(result) == told
+    assert result["in_order"]["with_step"] == float(expected == "clock")
+    assert verdict(result) == expected
 
 
 def test_results_that_name_a_path_lead_to_no_picture(tmp_path: Path) -> None:
@@ -264,9 +264,9 @@ def test_stove_and_pan_in_the_simulator(tmp_path: Path) -> None:
     assert result["in_order"]["deterministic"] == 0.0
     (example, *_) = result["examples"]
     assert example["difference"] == 0.0, "the stove looks as it did"
-    assert result["in_order"]["pixel_exact"] == 1.0, "some pixels tell, if a policy could use them"
+    assert result["in_order"]["pixel_exact"] == 1.0, "some pixels differ, if a policy could use them"
     assert example["largest_pixel_difference"] > PIXEL_EXACT
-    assert result["in_order"]["as_it_happens"] == 1.0, "and the hand, where it happens to be, tells as well"
+    assert result["in_order"]["as_it_happens"] == 1.0, "and the pose of the hand differs"
     assert verdict(result) == "no"
     found = search(Laboratory([get_task(PAN)], Simulation(get_task(PAN)), 7), Settings(1, budget=3000))
     assert (found["deterministic"], found["confirmed"], found["complete"]) == (1.0, 1, True)

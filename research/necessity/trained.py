@@ -1,7 +1,7 @@
-"""What a trained policy without a memory reached on a task, read from evaluations: beside the bounds, not among them.
+"""Success of a trained policy without a memory, read from evaluations.
 
 The study's ceilings are those of decisions that the expert takes. A policy that learned, and sees its hand at every
-step, may find what no search did; so its rate is the other half of what is known.
+step, may find a way that no search found; so its rate is reported with the bounds.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.evaluation.headline import whose
+from lerobot_memobench.evaluation.headline import policy_name
 from lerobot_memobench.evaluation.metrics import Rate, Record
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.evaluation.tables import figure
@@ -34,12 +34,12 @@ def read_evaluations(folders: Sequence[Path]) -> Evaluated:
         mine: dict[tuple[str, str], list[Record]] = {}
         for record in run.records:
             mine.setdefault((record["task"], str(record.get("referent", "fixed"))), []).append(record)
-        found |= {key: (whose(run), records) for key, records in mine.items()}
+        found |= {key: (policy_name(run), records) for key, records in mine.items()}
     return found
 
 
 def with_evaluations(results: Sequence[Result], evaluated: Evaluated) -> list[Result]:
-    """Return the results, each with what the trained policy reached (``trained``), where that is known."""
+    """Return the results, each with the success of the trained policy (``trained``), where it is known."""
     return [{**result, "trained": _of(result, evaluated)} for result in results]
 
 
@@ -62,7 +62,7 @@ def _of(result: Result, evaluated: Evaluated) -> dict[str, Any] | None:
 
 
 def in_words(trained: Mapping[str, Any] | None) -> str:
-    """Return a rate, its interval and how many scenes it is of; "" where nothing was evaluated."""
+    """Return a rate, its interval and the number of scenes; "" without an evaluation."""
     if trained is None:
         return ""
     rate = Rate(trained["success"] / trained["n"], trained["n"])

@@ -1,4 +1,4 @@
-"""Measure how far a drawer has to be pulled until a camera or the object observation shows what is in it.
+"""Measure how far a drawer has to be pulled until a camera or the object observation shows its content.
 
     python -m research.necessity.visibility --scenes 5 --poses 400 --out outputs/visibility
 
@@ -32,7 +32,7 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 from research.command import run
 
 DISTANCES = (DEAD_CENTRE["drawer"], 0.018, 0.020, 0.025, 0.030)
-"""How far drawers are pulled, m: as far as loses, as far as nothing shows, and beyond."""
+"""Distances by which drawers are pulled, m: at which the episode is lost, without a visible content, and beyond."""
 NEAR = 0.30
 """Distance of the hand from the front of the cabinet within which a pose counts, m."""
 

@@ -1,1 +1,1 @@
-"""Speed of the simulator and of evaluation, beside stock robosuite 1.4.1."""
+"""Speed of the simulator and of evaluation, against stock robosuite 1.4.1."""

@@ -1,4 +1,4 @@
-"""``python -m research.speed``: steps, resets and workers, timed beside stock robosuite."""
+"""``python -m research.speed``: steps, resets and workers, timed against stock robosuite."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a process of its own is asked in these tests; it must be importable there."""
+"""Functions for the process of these tests, which must import them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def opened() -> Iterator[list[int]]:
 
 
 def remember(thing: list[int], number: int) -> list[int]:
-    """Change what was opened."""
+    """Change the opened object."""
     thing.append(number)
     return thing
 
 
 def threads(thing: list[int]) -> list[str | None]:
-    """Return what the process was told."""
+    """Return the arguments of the process."""
     return [os.environ.get(name) for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS", "MEMOBENCH_THREADS")]
 
 

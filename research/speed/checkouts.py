@@ -78,7 +78,7 @@ class Side:
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         if not line:
-            raise MemobenchError("a side has ended; its message stands above")
+            raise MemobenchError("a side has ended; see its message above")
         return [float(part) for part in json.loads(line)]
 
     def close(self) -> None:

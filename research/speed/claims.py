@@ -1,8 +1,8 @@
-"""What is claimed of the simulator's speed, measured beside stock robosuite 1.4.1 in one run.
+"""Claims about the simulator's speed, measured against stock robosuite 1.4.1 in one run.
 
-Both sides take turns, and each turn of ours makes a pair with the turn of theirs that follows. What is claimed is the
-median of the pairs' ratios on the wall's clock, on a machine that does nothing else; the processors' clock stands
-beside it, and moves less where others compute too. Stock robosuite is its own PickPlace with the same arm, controller,
+Both sides take turns, and each turn of ours makes a pair with the turn of theirs that follows. Claims are the
+median of the pairs' ratios of wall time on an idle machine; CPU time is reported too, and varies less on a shared
+machine. Stock robosuite is its own PickPlace with the same arm, controller,
 cameras and sizes, in a process of its own: there its libraries take the threads that they take by themselves, while
 ours has those of the rule (`jobs.threads`), as in every command.
 """
@@ -48,7 +48,7 @@ WORKERS = (1, 2, 4)
 
 
 def _resident_mb() -> float:
-    """Return the memory of this process that no other shares, plus its part of what is shared, MB."""
+    """Return the memory of this process, with its part of shared memory, MB."""
     try:
         text = Path("/proc/self/smaps_rollup").read_text()
         pss = next(line for line in text.splitlines() if line.startswith("Pss:"))
@@ -175,7 +175,7 @@ def _reset_pairs(ours: Ours | Vectored, stock: Apart, rounds: int) -> list[tuple
 
 
 def vector_env(task: str = TASK, rounds: int = 8) -> list[Line]:
-    """Steps and resets through the vector environment that LeRobot uses, both images, beside bare stock robosuite."""
+    """Steps and resets through the vector environment that LeRobot uses, both images, against bare stock robosuite."""
     ours = Vectored(task)
     with stock_open(True) as stock:
         steps, resets = _step_pairs(ours, stock, rounds), _reset_pairs(ours, stock, max(1, rounds // 2))
@@ -187,7 +187,7 @@ def vector_env(task: str = TASK, rounds: int = 8) -> list[Line]:
 
 
 def thread_rule() -> list[Line]:
-    """`lerobot eval` with the threads of the rule beside the same with those that the libraries take."""
+    """`lerobot eval` with the threads of the rule, and with the libraries' own."""
     from research.speed import evaluation
 
     return evaluation.thread_rule()

@@ -1,11 +1,11 @@
-"""``lerobot eval`` itself, per control step: beside the bare vector environment, and stock robosuite in LeRobot's loop.
+"""``lerobot eval`` itself, per control step: against the bare vector environment and robosuite in LeRobot's loop.
 
-What is timed lasts from the first step of an episode to LeRobot's figures of it, videos written: start-up and reset are
-apart. The policies act at random and cost nothing; how often they look at pictures is what differs.
+Times run from the first step of an episode to LeRobot's figures of it, videos written, without start-up and reset. The
+policies act at random at no cost, and differ in how often they read pictures.
 
-`rollouts_total`: two evaluations of one rollout of each task, cut after a few and after more steps, tell what a step
-costs and what a rollout costs before its first step; all processes run at once, so what they take from one another is
-in it. What a real policy computes is to be added.
+`rollouts_total`: two evaluations of one rollout of each task, cut after a few and after more steps, give the cost
+of a step and of a rollout before its first step. All processes run at once, so their mutual slowdown is included; add
+the time of a real policy.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Cost(NamedTuple):
 
 
 class Stopwatch:
-    """Counts the steps of vector environments, and tells what each has cost since the first."""
+    """Counts the steps of vector environments, and returns the cost of each since the first."""
 
     def __init__(self) -> None:
         self.steps, self._start, self._end = 0, Cost(0, 0), Cost(0, 0)
@@ -120,7 +120,7 @@ def observing_every(steps: int) -> Iterator[None]:
 
 
 def evaluate_once(every: int, films: int, steps: int, task: str = TASK) -> Cost:
-    """Return what a step of ``lerobot eval`` costs, in an episode of so many."""
+    """Return the cost of a step of ``lerobot eval``, in an episode of so many."""
     words = [
         "env=memobench",
         f"tasks={task}",
@@ -135,7 +135,7 @@ def evaluate_once(every: int, films: int, steps: int, task: str = TASK) -> Cost:
 
 
 def step_bare(every: int, steps: int, task: str = TASK) -> Cost:
-    """Return what a step of our vector environment costs by itself, its pictures drawn as often as they are seen."""
+    """Return the cost of a step of our vector environment alone, its pictures drawn as often as they are read."""
     watched = True
     with tempfile.TemporaryDirectory() as out, stopwatch() as watch:
         config = MemobenchEnvConfig(tasks=task, demonstration_prompt=False, horizon=steps, log_dir=out)
@@ -154,12 +154,12 @@ def step_bare(every: int, steps: int, task: str = TASK) -> Cost:
 
 
 def _moves(steps: int) -> NDArray[np.float32]:
-    """Return what the random policy does, (steps, 1, 7)."""
+    """Return the actions of the random policy, (steps, 1, 7)."""
     return np.random.default_rng(0).uniform(-1, 1, (steps, 1, 7)).astype(np.float32)
 
 
 def evaluate_stock(stock: Any, films: int, steps: int) -> Cost:
-    """Return what a step of stock robosuite costs in LeRobot's own loop, with its films."""
+    """Return the cost of a step of stock robosuite in LeRobot's own loop, with its films."""
     from lerobot.envs.utils import freeze_after_episode_end
     from lerobot.scripts import lerobot_eval
 
@@ -205,10 +205,10 @@ def eval_loop(task: str = TASK, rounds: int = 5, steps: int = 100, their_steps: 
 
 
 def thread_rule(task: str = TASK, rounds: int = 5, steps: int = 100) -> list[Line]:
-    """What the rule of `jobs.threads` gains where every frame is looked at: one evaluation, and two at once.
+    """Gain of the rule of `jobs.threads` where every frame is read: one evaluation, and two at once.
 
     ``ours`` is by the rule and ``theirs`` with the threads that the libraries take by themselves. Of two at once it is
-    what a step of either takes, over two: half of it would be twice the work done.
+    the time of a step of either over two: half of it would be twice the work.
     """
     act, alone = partial(_both, evaluate_apart, EACH, 0, steps, task), partial(_both, bare_apart, EACH, steps, task)
     with ExitStack() as opened:
@@ -230,7 +230,7 @@ def thread_rule(task: str = TASK, rounds: int = 5, steps: int = 100) -> list[Lin
             "cpu_ours": round(1e3 * ours.cpu, 3),
             "cpu_theirs": round(1e3 * theirs.cpu, 3),
             "cpu_ratio": round(theirs.cpu / ours.cpu, 2),
-            "beside": "the libraries' own threads",
+            "comparison": "the libraries' own threads",
         }
         if kind == "one":
             for way, added in (("rule", "over_bare"), ("libraries", "over_bare_before")):
@@ -243,7 +243,7 @@ def thread_rule(task: str = TASK, rounds: int = 5, steps: int = 100) -> list[Lin
 
 
 def _both(do: Callable[..., Cost], *args: Any) -> Cost:
-    """Return what a step costs in processes that all do a thing at once: their wall's mean, over how many they are."""
+    """Return the cost of a step in processes that run at once: their mean wall time over their number."""
     *what, team = args
     for side in team:
         side.ask(do, *what)
@@ -253,7 +253,7 @@ def _both(do: Callable[..., Cost], *args: Any) -> Cost:
 
 @contextmanager
 def rollouts_apart(environment: Mapping[str, str]) -> Iterator[Apart]:
-    """Yield a process in which rollouts are measured, with the threads that its environment says."""
+    """Yield a process in which rollouts are measured, with the threads of its environment."""
     side = Apart(_ready, environment)
     try:
         yield side
@@ -293,7 +293,7 @@ def _turns[Side](sides: dict[Side, Callable[[], Cost]], rounds: int) -> dict[Sid
 
 
 def _line(name: str, ours: Cost, theirs: Cost, bare: Cost, detail: dict[str, Any]) -> Line:
-    beside = {
+    over_bare = {
         "bare": round(1e3 * bare.wall, 3),
         "over_bare": round(ours.wall / bare.wall - 1, 3),
         "cpu": round(1e3 * ours.cpu, 3),
@@ -301,7 +301,7 @@ def _line(name: str, ours: Cost, theirs: Cost, bare: Cost, detail: dict[str, Any
         "over_bare_cpu": round(ours.cpu / bare.cpu - 1, 3),
     }
     mine, other = round(1e3 * ours.wall, 3), round(1e3 * theirs.wall, 3)
-    return Line(name, mine, other, round(theirs.wall / ours.wall, 2), "ms", machine(), {**detail, **beside})
+    return Line(name, mine, other, round(theirs.wall / ours.wall, 2), "ms", machine(), {**detail, **over_bare})
 
 
 SHORT, LONG = 10, 60
@@ -341,7 +341,7 @@ def _cpu_of_children() -> float:
 
 
 def rollouts_total(tasks: str = "all", processes: int | None = None, every: int = FIFTH) -> dict[str, Any]:
-    """Return the hours that all rollouts of the benchmark take here, and what they consist of.
+    """Return the hours that all rollouts of the benchmark take here, and their parts.
 
     Each rollout is counted with its whole horizon: the most that there can be, for a success ends one earlier.
 

@@ -38,7 +38,7 @@ from lerobot_memobench.tasks.progress import Progress
 from research.speed.threads import by_the_libraries
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
-"""What is measured unless another task is named: its bowls have the most contacts of the catalogue's usual scenes."""
+"""The task by default: its bowls have the most contacts of the catalogue's usual scenes."""
 STOCK_GL = os.environ.get("MUJOCO_GL", "egl")
 """With what stock robosuite draws."""
 
@@ -67,7 +67,7 @@ IMAGE_SIZE = 256
 
 
 class Times(NamedTuple):
-    """What a thing took, s: on the clock on the wall, and of processors, all threads of the process together."""
+    """Duration, s: wall time, and CPU time of all threads of the process."""
 
     wall: float
     cpu: float
@@ -165,18 +165,18 @@ def stock_robosuite(images: bool = True) -> Any:
 
 
 def make_current(env: Any) -> None:
-    """Make robosuite's GL context current; it takes for granted that nobody else draws."""
+    """Make robosuite's GL context current; it assumes to be the only one that draws."""
     context = getattr(env.sim, "_render_context_offscreen", None)
     if context is not None:
         context.gl_ctx.make_current()
 
 
 class Apart:
-    """A side in a process of its own: it does what it is asked, and waits in between, so that sides can take turns.
+    """A side in a process of its own, which waits between calls so that sides can take turns.
 
     Args:
         opened: opens what every function that is asked for is given first; both are pickled.
-        environment: of the process. It says how many threads its libraries have (`jobs.threads`).
+        environment: of the process. It sets the threads of its libraries (`jobs.threads`).
     """
 
     def __init__(self, opened: Callable[[], AbstractContextManager[Any]], environment: Mapping[str, str]) -> None:
@@ -189,7 +189,7 @@ class Apart:
         self.answer()
 
     def ask(self, do: Callable[..., Any], *args: Any) -> None:
-        """Have a function of a module called, with what was opened and these arguments."""
+        """Call a function of a module in the process, with the opened object and these arguments."""
         self._pipe.send((do, args))
 
     def answer(self) -> Any:
@@ -200,7 +200,7 @@ class Apart:
         return found
 
     def does(self, do: Callable[..., Any], *args: Any) -> Any:
-        """Return what comes of a function."""
+        """Return the result of a function."""
         self.ask(do, *args)
         return self.answer()
 
@@ -213,7 +213,7 @@ class Apart:
 
 
 def _serve(opened: Callable[[], AbstractContextManager[Any]], pipe: Any) -> None:
-    """Do what is asked through the pipe until it is closed."""
+    """Serve calls through the pipe until it is closed."""
     with opened() as thing:
         pipe.send(None)
         while True:
@@ -249,7 +249,7 @@ def _stock(images: bool) -> Iterator[Any]:
 
 
 def step_stock(env: Any, action: NDArray[np.float64]) -> Times:
-    """Return what one of its control steps takes."""
+    """Return the duration of one of its control steps."""
     return timed(lambda: env.step(action))
 
 
@@ -277,7 +277,7 @@ def actions() -> Iterator[NDArray[np.float64]]:
 
 
 def timed(do: Callable[[], Any]) -> Times:
-    """Return what a call takes."""
+    """Return the duration of a call."""
     wall, cpu = time.perf_counter(), time.process_time()
     do()
     return Times(time.perf_counter() - wall, time.process_time() - cpu)
@@ -311,7 +311,7 @@ class StockEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start anew."""
+        """Start again."""
         super().reset(seed=seed)
         make_current(self._stock)
         self._step = 0
@@ -337,15 +337,15 @@ class StockEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return np.hstack(list(self._pictures.values()))
 
 
-# --- what is reported ---
+# --- results ---
 
 
 @dataclass(frozen=True)
 class Line:
     """One claim, measured. ``ratio`` is how many times better ours is.
 
-    Durations are those on the wall, which is what a user waits for. Those of processors stand in ``detail`` as
-    ``cpu_ours``, ``cpu_theirs`` and ``cpu_ratio``: they are what to compare where other programs run beside.
+    Durations are wall times. CPU times are in ``detail`` as
+    ``cpu_ours``, ``cpu_theirs`` and ``cpu_ratio``: compare them on a shared machine.
     """
 
     name: str
@@ -384,7 +384,7 @@ def table(lines: list[Line]) -> str:
     for line in lines:
         notes = ", ".join(
             f"{key.replace('_', ' ')} {line.detail[key]}"
-            for key in ("quality", "memory_mb", "their_memory_mb", "over_bare", "over_bare_before", "beside")
+            for key in ("quality", "memory_mb", "their_memory_mb", "over_bare", "over_bare_before", "comparison")
             if key in line.detail
         )
         name = line.name.replace("_", " ")

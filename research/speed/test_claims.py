@@ -1,4 +1,4 @@
-"""The benchmarks by name. What they measure is not a test: machines differ."""
+"""The benchmarks by name. Their times are not tested: machines differ."""
 
 from __future__ import annotations
 

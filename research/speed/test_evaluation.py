@@ -1,4 +1,4 @@
-"""What the benchmarks of the evaluation count; what they measure is not a test."""
+"""Counts of the benchmarks of the evaluation; times are not tested."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_the_documented_benchmarks_are_there() -> None:
 
 
 def test_the_rule_is_shown_as_a_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both ways in one run: what a step costs with the rule and without, alone and beside another evaluation."""
+    """Cost of a step with the rule and without, of one and of two evaluations at once."""
     asked: list[tuple[Any, ...]] = []
 
     class Side:

@@ -1,4 +1,4 @@
-"""The two sides take turns, and ours does what the environment does."""
+"""The two sides take turns, and ours acts as the environment does."""
 
 from __future__ import annotations
 
@@ -57,19 +57,19 @@ def test_our_side_steps_as_the_environment_does() -> None:
 
 @pytest.mark.slow
 def test_a_side_apart_has_the_threads_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And keeps what it has opened from one turn to the next."""
+    """And keeps the opened object from one turn to the next."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2})
     here = dict(os.environ)
-    for environment, told in ((by_the_rule(), ["1", "1"]), (by_the_libraries(), [None, "3"])):
+    for environment, expected in ((by_the_rule(), ["1", "1"]), (by_the_libraries(), [None, "3"])):
         side = Apart(apart_case.opened, environment)
         try:
             assert side.does(apart_case.remember, 1) == [1]
             side.ask(apart_case.remember, 2)
             assert side.answer() == [1, 2]
             torch, renderer, chosen = side.does(apart_case.threads)
-            assert renderer == told[1]
-            assert told[0] in (None, torch)
-            assert bool(chosen) is (told[0] is not None)  # what nobody has chosen is a user's own, and stays
+            assert renderer == expected[1]
+            assert expected[0] in (None, torch)
+            assert bool(chosen) is (expected[0] is not None)  # a user's own values stay
             with pytest.raises(ValueError, match="no"):
                 side.does(apart_case.fail)
         finally:

@@ -1,4 +1,4 @@
-"""The environments in which libraries take threads by our rule, and by themselves: to measure what the rule does."""
+"""Environments with the threads of our rule, and with the libraries' own, to measure the rule."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from lerobot_memobench.jobs.threads import BESIDE, CHOSEN_HERE, ONE_EACH, SPINNI
 
 
 def by_the_libraries() -> dict[str, str]:
-    """Return this process's environment with the threads that the libraries take where nobody tells them: one on every
+    """Return this process's environment with the libraries' own threads: one on every
     core.
     """
     threads = dict.fromkeys(ONE_EACH, str(cores())) | {TORCH: str(physical_cores())}
@@ -16,7 +16,7 @@ def by_the_libraries() -> dict[str, str]:
 
 
 def by_the_rule() -> dict[str, str]:
-    """Return this process's environment as the rule has it for one that acts, whatever a user says."""
+    """Return this process's environment by the rule for one that acts, without a user's own values."""
     chosen = {**ONE_EACH, **SPINNING, TORCH: "1"}
     kept = {key: value for key, value in os.environ.items() if key not in (BESIDE, "OMP_WAIT_POLICY")}
     return {**kept, **chosen, CHOSEN_HERE: ",".join(chosen)}

@@ -161,12 +161,12 @@ def test_the_paper_has_no_figures_of_other_comparisons(tmp_path: Path, capsys: p
 def test_granularity_counts_each_level_by_its_own_labels(tmp_path: Path) -> None:
     words = []
     for level, reached in (("coarse", [3, 3, 0]), ("intermediate", [2, 2, 2]), ("fine", [2, 0, 0])):
-        told = {"subgoal_level": level}
-        words.append(evaluation(tmp_path / level, reached, level, "SUC", DRAWERS, policy_settings=told))
+        settings = {"subgoal_level": level}
+        words.append(evaluation(tmp_path / level, reached, level, "SUC", DRAWERS, policy_settings=settings))
     out = ["--format", "json", "--format", "markdown", "--with", "paper", "--out", str(tmp_path)]
     assert main(["report", *words, *out]) == 0
     found = json.loads((tmp_path / "report.json").read_text())
-    own = {name: told["own_labels"] for name, told in found["granularity"].items()}
+    own = {name: rates["own_labels"] for name, rates in found["granularity"].items()}
     # The third checkpoint is a Compression, but an Update in the labels of the fine level.
     assert own["coarse"] == {"SR": 66.7, "MSR": 66.7, "MUR": 66.7, "MCR": 66.7}
     assert own["intermediate"] == {"SR": 0.0, "MSR": 100.0, "MUR": 100.0, "MCR": 0.0}

@@ -1,4 +1,4 @@
-"""Logs, protocols and cards, damaged in any way: every command that reads them ends in a result or a sentence."""
+"""Damaged logs, protocols and cards: every command that reads them ends in a result or a MemobenchError."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def card_of(folder: Path) -> dict[str, Any]:
 
 
 def whole_evaluation(folder: Path, successes: int) -> Path:
-    """A folder with all that an evaluation leaves, but videos: one worker's file beside the merged one."""
+    """A folder with all files of an evaluation, but videos: a worker's file and the merged one."""
     logs.evaluation(folder, successes, steps=40, prompt_steps=0, variant=0, wall_s=1.5)
     lines = (folder / "episodes.jsonl").read_text().splitlines(keepends=True)
     (folder / "episodes").mkdir()
@@ -67,7 +67,7 @@ def whole_evaluation(folder: Path, successes: int) -> Path:
 
 
 class Bench:
-    """Two whole evaluations, the first of which is damaged, and the commands that read it."""
+    """Two evaluations and the commands that read the first one, which is damaged."""
 
     def __init__(self, tmp_path: Path) -> None:
         self.whole = tmp_path / "whole"
@@ -80,7 +80,6 @@ class Bench:
             (lambda _: report([str(self.run)], list(ReportFormat), None, self.out), 30),
             (lambda _: report([str(self.run), f"b={self.other}"], list(ReportFormat), None, None), 20),
             (lambda _: report([str(self.run), str(self.other)], html=self.out / "html"), 20),
-            (lambda _: report([str(self.run)], figures=self.out / "figures"), 5),
             (lambda _: compare(str(self.run), str(self.other), ["scene_hash"], permutations=100), 30),
             (lambda _: merge(self.out, [self.run]), 20),
             (lambda _: merge(self.run, [self.other]), 20),
@@ -92,9 +91,9 @@ class Bench:
 
     def rerun(self) -> None:
         """All that `memobench rerun` does with a card before and after the run."""
-        told = again.repeatable_card(self.run)
-        again.check_policy(told)
-        again.differences_here(told)
+        card = again.repeatable_card(self.run)
+        again.check_policy(card)
+        again.differences_here(card)
 
     def use(self, rng: random.Random) -> object:
         calls, weights = zip(*self.commands, strict=True)

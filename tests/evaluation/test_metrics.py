@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import (
@@ -101,15 +98,6 @@ def test_pooled_rate_is_over_all_checkpoint_records() -> None:
     assert pooled["MCR"] == Rate(0.5, 4)
 
 
-def test_tasks_are_ordered_by_memory_type_and_name() -> None:
-    assert list(by_task(reversed(LOG))) == ["t1", "t2", "s1", "o1"]
-
-
-def test_an_empty_log_is_an_error() -> None:
-    with pytest.raises(MemobenchError, match="no rollouts"):
-        summarise([])
-
-
 def test_versions_of_a_task_are_not_mixed() -> None:
     with pytest.raises(MemobenchError, match="operations"):
         by_task([rollout("t", "temporal", "S", [1], True), rollout("t", "temporal", "U", [1], True)])
@@ -137,7 +125,7 @@ def test_mixed_protocols_are_noted(changes: dict[str, Any], named: str) -> None:
     mine = [rollout("t", "temporal", "S", [1], True, k, **WHOSE) for k in range(3)]
     notes = mixtures([*mine, rollout("t", "temporal", "S", [1], True, 3, **{**WHOSE, **changes})])
     assert [named in note for note in notes] == ([True] if named else [])
-    assert mixtures([rollout("t", "temporal", "S", [1], True, k) for k in range(2)]) == [], "nothing is mixed"
+    assert mixtures([rollout("t", "temporal", "S", [1], True, k) for k in range(2)]) == [], "equal protocols"
 
 
 def test_sentences_of_one_rollout_are_singular() -> None:
@@ -155,15 +143,6 @@ def test_wilson_intervals_are_those_of_statsmodels(n: int) -> None:
 
     for successes in range(0, n + 1, max(1, n // 20)):
         assert wilson(successes / n, n) == pytest.approx(proportion_confint(successes, n, method="wilson"), abs=1e-12)
-
-
-@given(st.integers(1, 500), st.data())
-def test_wilson_interval_holds_the_rate(n: int, data: st.DataObject) -> None:
-    rate = data.draw(st.integers(0, n)) / n
-    low, high = wilson(rate, n)
-    assert 0.0 <= low <= rate + 1e-12
-    assert rate - 1e-12 <= high <= 1.0
-    assert not math.isclose(low, high)
 
 
 def test_a_mean_has_the_interval_of_its_standard_error() -> None:
@@ -196,7 +175,7 @@ def test_the_papers_averages_follow_from_its_memory_types() -> None:
     ("operations", "first_steps", "success", "drift", "expected"),
     [
         ("SUC", [1, 2, 3], True, False, None),
-        ("SUC", [None, None, None], True, True, None),  # the goal holds, whatever was seen on the way
+        ("SUC", [None, None, None], True, True, None),  # the goal holds without its checkpoints
         ("SUC", [None, 2, 3], False, False, "storage_failure"),
         ("SUC", [1, None, None], False, False, "stale_memory"),
         ("SUC", [1, 2, None], False, False, "compression_collapse"),
@@ -210,12 +189,6 @@ def test_classes(
     operations: str, first_steps: list[int | None], success: bool, drift: bool, expected: str | None
 ) -> None:
     assert classify(operations, first_steps, success, drift) == expected
-
-
-def test_a_task_brings_its_operations() -> None:
-    task = get_task("turn_on_the_stove_and_turn_it_off")
-    nothing = [None] * len(task.checkpoints)
-    assert classify_failure(task, nothing, False) == classify(task.operations, nothing, False)
 
 
 PROCEDURES = [name for name in task_names("procedural") if asks_order(get_task(name).goal)]

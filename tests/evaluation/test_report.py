@@ -1,18 +1,21 @@
-"""The report: what is written beside a log."""
+"""Reports: files next to a log, formats, first line, sweeps, figures, compressed logs."""
 
 from __future__ import annotations
 
+import csv
 import gzip
 import io
 import json
+import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from rich.console import Console
+from markdown_it import MarkdownIt
+from PIL import Image
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes, write_episodes
@@ -20,9 +23,25 @@ from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_protoc
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.evaluation.report import build, evaluation_markdown, render, table, write_report
-from lerobot_memobench.evaluation.report_tables import failure_line
+from lerobot_memobench.evaluation.metrics import Rate, report_values
+from lerobot_memobench.evaluation.plots import OUTCOMES, bars, draw_figures, draw_replan, line_style
+from lerobot_memobench.evaluation.records import Run, read_runs
+from lerobot_memobench.evaluation.report import build, write_report
+from lerobot_memobench.evaluation.report_tables import best_interval, departures
+from lerobot_memobench.evaluation.tables import (
+    WIDTH,
+    WRITERS,
+    Name,
+    Report,
+    Section,
+    Table,
+    best_in_columns,
+    csv_tables,
+    csv_text,
+    markdown,
+)
+from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
+from lerobot_memobench.tasks.task import STRICT_FAILURES
 from tests.support import logs
 
 
@@ -32,41 +51,36 @@ def record(task: str, memory_type: str, episode: int, success: bool, **changes: 
     return logs.record(task, episode, marks, **own | changes)
 
 
-def logged(folder: Path, episodes: int = 4) -> Path:
-    log = EpisodeLog(folder)
-    for k in range(episodes):
+# --- next to the log ---
+
+
+def test_files_next_to_the_log(tmp_path: Path) -> None:
+    log = EpisodeLog(tmp_path)
+    for k in range(4):
         log.append(record("first", "temporal", k, k != 0))
         log.append(record("second", "procedural", k, True))
-    return folder
-
-
-def test_files_are_written_beside_the_log(tmp_path: Path) -> None:
-    notes = write_report(logged(tmp_path)).notes
-    assert not notes
+    assert not write_report(tmp_path).notes
     assert len((tmp_path / "episodes.jsonl").read_text().splitlines()) == 8
     content = json.loads((tmp_path / "report.json").read_text())
     assert content["average"] == {"n": 8, "SR": 87.5, "MSR": 100.0, "MUR": 87.5, "MCR": None}
-    first = "policy not recorded: published suite, referent fixed, seeds 7 to 10, 4 episodes of each of 2 tasks"
-    assert (tmp_path / "report.md").read_text().startswith(f"# {first}, replan interval 5; inputs: not recorded\n")
+    text = (tmp_path / "report.md").read_text()
+    assert "| `first` | 4 | 75.0 [30.1, 95.4] | 100.0 [51.0, 100.0] | 75.0 [30.1, 95.4] | – |" in text
+    assert "stale memory | 1" in text
     assert not list(tmp_path.glob("*.part"))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert write_report(tmp_path, episodes=3).summary.tasks["first"]["SR"].n == 3, "a last batch may hold more"
     write_report(tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-    console = Console(width=100, record=True, file=io.StringIO())
-    console.print(table(read_runs([tmp_path])[0].summary))
-    assert "average of memory types" in console.export_text()
-    assert failure_line(read_runs([tmp_path])[0].summary) == "failed rollouts: 1 stale memory"
 
 
 @pytest.mark.parametrize("workers", [False, True])
-def test_a_report_keeps_every_line_of_the_log(tmp_path: Path, workers: bool) -> None:
+def test_every_line_of_the_log_stays(tmp_path: Path, workers: bool) -> None:
     lines = [json.dumps(record("first", "object", k, True)) for k in range(6)]
     lines[1], lines[2] = lines[1].replace("true", "tru"), json.dumps(json.loads(lines[2]) | {"failure": 7})
     merged = tmp_path / "episodes.jsonl"
     merged.write_text("\n".join(lines))
     (tmp_path / "card.json").write_text(json.dumps({"protocol": {"episodes": 4}}))
-    if workers:  # they hold what is damaged above, and one episode more
+    if workers:  # they hold the damaged line, and one episode more
         for k in (1, 7):
             EpisodeLog(tmp_path).append(record("first", "object", k, True))
     notes = [write_report(tmp_path).notes for _ in range(2)]
@@ -78,38 +92,28 @@ def test_a_report_keeps_every_line_of_the_log(tmp_path: Path, workers: bool) -> 
     assert [json.loads(line)["episode"] for line in kept[6:]] == ([1, 7] if workers else [])
 
 
-@pytest.mark.parametrize(
-    ("edit", "named"),
-    [
-        (
-            lambda lines: [{**lines[0], "success": False}, *lines[1:]],
-            "success is True on the card and False in the log",
-        ),
-        (lambda lines: lines[1:], "is on the card and not in the log"),
-        (lambda lines: [*lines, {**lines[0], "episode": 2, "seed": 9}], "is in the log and not on the card"),
-    ],
-)
-def test_a_report_names_where_log_and_card_disagree(tmp_path: Path, edit: Any, named: str) -> None:
+@pytest.mark.parametrize("change", ["outcome", "missing", "extra"])
+def test_disagreements_of_log_and_card_are_noted(tmp_path: Path, change: str) -> None:
     lines = [record("first", "object", k, True) for k in range(2)]
     card = {"protocol": {"episodes": 5}, "episodes": [outcome(each) for each in lines]}
     (tmp_path / "card.json").write_text(json.dumps(card))
-    for each in edit(lines):  # the workers' files, and so the merged file
+    logged = {
+        "outcome": [{**lines[0], "success": False}, lines[1]],
+        "missing": lines[1:],
+        "extra": [*lines, {**lines[0], "episode": 2, "seed": 9}],
+    }[change]
+    for each in logged:
         EpisodeLog(tmp_path).append(each)
-    assert [named in note for note in write_report(tmp_path).notes] == [True]
-    assert named in read_runs([tmp_path])[0].notes[0]
-
-
-def test_markdown_has_intervals_and_dashes(tmp_path: Path) -> None:
-    text = evaluation_markdown(write_report(logged(tmp_path)))
-    assert "| `first` | 4 | 75.0 [30.1, 95.4] | 100.0 [51.0, 100.0] | 75.0 [30.1, 95.4] | – |" in text
-    assert "stale memory | 1" in text
+    (note,) = write_report(tmp_path).notes
+    assert f"first, episode {2 if change == 'extra' else 0}" in note
+    assert read_runs([tmp_path])[0].notes == [note]
 
 
 # --- the first line ---
 
 
 def prompted(folder: Path, policy: dict[str, Any], checkpoint: dict[str, Any] | None = None, **changes: Any) -> Path:
-    """An evaluation whose prompt was seen by ``policy``, with a card where there is a ``checkpoint``."""
+    """An evaluation whose policy observed the prompt, with a card where there is a ``checkpoint``."""
     settings = {**logs.SETTINGS, "replan_steps": 5, "prompt_in": "steps", "policy": policy, **changes}
     write_protocol(folder, settings)
     log = EpisodeLog(folder)
@@ -124,43 +128,170 @@ def prompted(folder: Path, policy: dict[str, Any], checkpoint: dict[str, Any] | 
 STRICT = "strict suite, referent fixed, seeds 7 to 8, 2 episodes of first, replan interval 5"
 
 
-def test_the_first_line_of_lerobot_eval(tmp_path: Path) -> None:
-    run = write_report(prompted(tmp_path, {"type": "act"}, {"path": "user/mine"}))
+def test_first_line(tmp_path: Path) -> None:
+    run = write_report(prompted(tmp_path / "a", {"type": "act"}, {"path": "user/mine"}))
     assert headline([run]) == f"act (user/mine): {STRICT}; inputs: pixels, prompt in steps (observed)"
     found = build([run])
-    assert render(found, [run], "markdown").splitlines()[0] == f"# {headline([run])}"
-    assert " ".join(render(found, [run], "table").split()).startswith(headline([run]))
-    assert render(found, [run], "latex").startswith(f"% {headline([run])}")
-
-
-@pytest.mark.parametrize(
-    ("changes", "ending"),
-    [
+    assert WRITERS["markdown"](found).splitlines()[0] == f"# {headline([run])}"
+    assert " ".join(WRITERS["table"](found).split()).startswith(headline([run]))
+    assert WRITERS["latex"](found).startswith(f"% {headline([run])}")
+    for changes, ending in (
         ({"prompt_in": "reset"}, "prompt in reset (not observed)"),
         ({"demonstration_prompt": False}, "no demonstration prompt"),
-    ],
-)
-def test_the_first_line_of_plain_lerobot_eval(tmp_path: Path, changes: dict[str, Any], ending: str) -> None:
-    run = write_report(prompted(tmp_path, {"type": "act", "identity": "act 0123456789ab"}, **changes))
-    assert headline([run]) == f"act 0123456789ab: {STRICT}; inputs: pixels, {ending}"
-
-
-def test_the_first_line_of_several(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        prompted(tmp_path / name, {"type": name.upper()})
-    seen = "inputs: pixels, prompt in steps (observed)"
+    ):
+        plain = prompted(tmp_path / ending, {"type": "act", "identity": "act 0123456789ab"}, **changes)
+        assert headline([write_report(plain)]) == f"act 0123456789ab: {STRICT}; inputs: pixels, {ending}"
+    prompted(tmp_path / "b", {"type": "B"})
     runs = read_runs([f"one={tmp_path}/a", f"two={tmp_path}/b"])
-    assert headline(runs) == f"2 evaluations, {STRICT}; one: A, {seen}; two: B, {seen}"
+    seen = "inputs: pixels, prompt in steps (observed)"
+    assert headline(runs) == f"2 evaluations, {STRICT}; one: act (user/mine), {seen}; two: B, {seen}"
     short = replace(runs[1], records=runs[1].records[:1])
     other = STRICT.replace("seeds 7 to 8, 2 episodes", "seed 7, 1 episode")
-    assert headline([runs[0], short]) == f"2 evaluations; one: A, {seen} ({STRICT}); two: B, {seen} ({other})"
+    assert headline([runs[0], short]).endswith(f"({STRICT}); two: B, {seen} ({other})")
 
 
-# --- a log that is kept: compressed ---
+# --- formats ---
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
+    """A policy at three intervals: 1, 3 and 2 of 4 episodes succeed."""
+    folder = tmp_path_factory.mktemp("sweep")
+    for k, successes in ((5, 1), (20, 3), (35, 2)):
+        logs.evaluation(folder / f"k{k}", successes, replan_steps=k)
+    return read_runs([f"mine_&_co={folder}/k{k}" for k in (5, 20, 35)])
+
+
+def test_json(sweep: list[Run], tmp_path: Path) -> None:
+    runs = read_runs([logs.evaluation(tmp_path / "a")])
+    data = json.loads(WRITERS["json"](build(runs)))
+    schema = json.loads(json.dumps(report_values(runs[0].summary)))
+    assert {key: data[key] for key in schema} == schema
+    assert data["intervals"]["average"]["SR"] == [21.5, 78.5]  # 4 of 8
+    assert data["ordered_prefix"] == schema["prefix"]
+    assert data["pooled"]["checkpoints"] == {"percent": 80.0, "n": 20}
+    swept = json.loads(WRITERS["json"](build(sweep)))["replan_sweep"]["mine_&_co"]
+    assert swept["average"]["20"] == {"SR": 75.0, "MSR": 100.0, "MUR": 87.5, "MCR": 75.0}
+    assert swept["best"] == {"SR": [20], "MSR": [5, 20, 35], "MUR": [20], "MCR": [20]}
+    assert best_interval(sweep, "SR")[0] == [20]
+
+
+def test_csv(sweep: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = csv_text([["=cmd()", -3.5, None], ["@SUM(1)", "a, b", "-"]], ["name", "figure", "rest"])
+    assert list(csv.reader(io.StringIO(text)))[1:] == [["'=cmd()", "-3.5", ""], ["'@SUM(1)", "a, b", "'-"]]
+    found = build(sweep)
+    rows = list(csv.DictReader(io.StringIO(csv_tables(found)["tasks"])))
+    (row,) = [row for row in rows if (row["evaluation"], row["task"]) == ("mine_&_co k=20", "one")]
+    assert [row[key] for key in ("n", "SR", "SR low", "SR high", "MCR")] == ["4", "75.0", "30.1", "95.4", ""]
+    words = [f"mine={run.folder}" for run in sweep]
+    formats = [word for name in ("csv", "json", "latex", "markdown", "table") for word in ("--format", name)]
+    assert main(["report", *words, *formats, "--out", str(tmp_path / "out")]) == 0
+    written = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    files = {"report.json", "report.tex", "report.md", "report.txt"}
+    tables = build(read_runs(words)).tables
+    assert written == files | {f"tables/{table.key}.csv" for table in tables}
+    capsys.readouterr()
+    (tmp_path / "file").write_text("")
+    assert main(["report", *words, "--out", str(tmp_path / "file")]) == 2
+
+
+def test_latex_is_balanced_and_escaped(sweep: list[Run]) -> None:
+    text = WRITERS["latex"](build(sweep, paper=True))
+    assert r"mine\_\&\_co k=20" in text
+    assert r"\texttt{two\_of\_them}" in text
+    assert r"$\pi_{0.5}$ + memory module" in text
+    assert text.count("{") == text.count("}")
+    assert text.count(r"\begin{table}") == text.count(r"\end{table}") > 10
+    assert len(set(re.findall(r"\\label\{(.*?)\}", text))) == text.count(r"\label")
+    for columns, body in re.findall(r"\\begin\{tabular\}\{@\{\}([lr]+)@\{\}\}(.*?)\\end\{tabular\}", text, re.DOTALL):
+        for line in body.splitlines():
+            if line.endswith(r"\\"):
+                spans = [int(n) for n in re.findall(r"\\multicolumn\{(\d+)\}", line)]
+                cells = len(re.findall(r"(?<!\\)&", line)) + 1 + sum(spans) - len(spans)
+                assert cells == len(columns), line
+    code = re.sub(r"(?m)^%.*$|\\label\{.*?\}|\$.*?\$", "", text)
+    assert not re.findall(r"[_#~^]|%(?!\n)", re.sub(r"\\[a-zA-Z]+|\\.", "", code))
+
+
+BLOCKS = ("heading", "paragraph", "blockquote", "table", "thead", "tbody", "tr", "th", "td")
+EVIL = "a|b\n\n# x\n```\n<script>alert(1)</script> ``[y](javascript:z) ![](w) &lt; \x1b[2J\u202e ~~s~~ *b*"
+
+
+def test_markdown_escapes_all_text() -> None:
+    """By a CommonMark parser with tables: every block and mark is the report's own."""
+    table = Table("t", EVIL, (EVIL, "b"), ((EVIL, "1"), (Name(EVIL), "2")), note=f"# {EVIL}")
+    report = Report(EVIL, (Section(EVIL, (table,), (f"- {EVIL}", f"12. {EVIL}", "==="), (f"> {EVIL}",)),))
+    tokens = MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(markdown(report))
+    blocks = {token.type for token in tokens if token.nesting != 0}
+    assert blocks <= {f"{name}_{end}" for name in BLOCKS for end in ("open", "close")}
+    assert [token.type for token in tokens].count("tr_open") == 3
+    inner = [inside for token in tokens for inside in token.children or ()]
+    assert {inside.type for inside in inner} <= {"text", "text_special"}
+    assert sum("<script>alert(1)</script>" in "".join(i.content for i in t.children or ()) for t in tokens) == 10
+
+
+def test_the_papers_figures_are_added(sweep: list[Run], tmp_path: Path) -> None:
+    text = WRITERS["markdown"](build(sweep, paper=True))
+    assert "| paper: π0.5 + memory module | pixels | 5 | 9.8 | 92.0 | 32.2 | 10.0 |" in text
+    assert text.count("| paper: ") == 43
+    assert "2 of 30 tasks, 4 episodes of each instead of 50" in text
+    assert text.count("| **mine\\_&\\_co k=20 (2 of 30 tasks, 8 rollouts)** |") == 3
+    assert "| stale memory first update | 63 | 42.0" in text
+    assert "paper:" not in WRITERS["markdown"](build(sweep))
+    (run,) = read_runs([logs.evaluation(tmp_path / "a")])
+    changed = replace(run, protocol={**run.protocol, "horizon": 600, "world": "libero", "protocol": "upstream"})
+    assert departures(run)[-1] == "world memobench instead of libero"
+    assert departures(changed)[-2:] == ["protocol upstream instead of paper", "horizon 600 instead of 1200"]
+
+
+def test_terminal_tables(sweep: list[Run]) -> None:
+    with pytest.raises(ValueError, match="1 cells for 2 columns"):
+        Table("t", "", ("a", "b"), (("x",),))
+    rows = (("x", Rate(0.5, 4), Rate(None, 0)), ("y", Rate(0.5, 8), Rate(0.1, 4)))
+    assert best_in_columns(rows) == {(0, 1), (1, 1), (1, 2)}
+    text = WRITERS["table"](build(sweep, paper=True))
+    assert max(map(len, text.splitlines())) <= WIDTH
+    assert "75.0 [30.1–95.4]" in text
+    (line,) = [line for line in text.splitlines() if "paper: MemER" in line and "62.4" in line]
+    assert " ".join(line.split()[4:]) == "62.4 63.8 61.7 63.0 50.4 84.3 52.8 77.6 93.2 93.2 – –"
+
+
+# --- figures ---
+
+
+def test_figures(sweep: list[Run], tmp_path: Path) -> None:
+    runs = sweep[:2]
+    found = bars(runs)
+    assert [bar.heading for bar in found] == [*["all rollouts"] * 2, *["temporal"] * 2, *["spatial"] * 2]
+    parts = found[0].parts
+    assert (parts["success"], parts["stale_memory"], parts["compression_collapse"]) == (2, 3, 3)
+    assert sum(parts.values()) == 8
+    line = draw_replan(runs).axes[0].lines[0]
+    assert [*line.get_xdata()] == [5, 20]
+    assert [*line.get_ydata()] == pytest.approx([25, 75])
+    files = draw_figures(runs, tmp_path / "figures")
+    assert [path.name for path in files] == ["outcomes.pdf", "outcomes.png", "replan.pdf", "replan.png"]
+    before = [path.read_bytes() for path in files]
+    assert before[0].startswith(b"%PDF")
+    assert np.asarray(Image.open(files[1]).convert("L")).std() > 10
+    assert [path.stem for path in draw_figures(runs[:1], tmp_path / "figures")] == ["outcomes", "outcomes"]
+    assert files[0].read_bytes() != before[0]
+
+
+def test_outcomes_and_methods_are_distinguishable() -> None:
+    assert set(OUTCOMES) == {"success", *FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS}
+    assert len(set(OUTCOMES.values())) == len(OUTCOMES)
+    styles = [line_style(k, published=False) for k in range(11)]
+    for key in ("color", "marker", "ls"):
+        assert len({str(style[key]) for style in styles}) == 11
+    assert len({str(line_style(k, published=False)) for k in range(100)}) == 100
+
+
+# --- compressed logs ---
 
 
 def kept(folder: Path) -> Path:
-    """Compress an evaluation as ``gzip -9n episodes.jsonl evaluation.json`` does, and leave nothing else."""
+    """Compress an evaluation as ``gzip -9n episodes.jsonl evaluation.json`` does; remove all other files."""
     write_report(prompted(folder, {"type": "act"}, {"path": "user/mine"}))
     for name in ("episodes.jsonl", EVALUATION_FILE):
         (folder / f"{name}.gz").write_bytes(gzip.compress((folder / name).read_bytes()))
@@ -171,42 +302,34 @@ def kept(folder: Path) -> Path:
     return folder
 
 
-def test_a_compressed_evaluation_is_read_like_any(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    open_, archive = prompted(tmp_path / "a", {"type": "act"}, {"path": "user/mine"}), kept(tmp_path / "b")
-    before = sorted(archive.iterdir())
-    told = []
-    for folder in (open_, archive):
-        assert main(["report", str(folder), "--format", "csv"]) == 0
-        told.append([line.partition(",")[2] for line in capsys.readouterr().out.splitlines()])  # but for its name
-    assert told[0] == told[1]
-    assert len(told[0]) > 10
-    assert main(["compare", str(open_), str(archive)]) == 0
-    assert "2 episodes in both" in capsys.readouterr().out
-    assert sorted(archive.iterdir()) == before
-
-
-def test_a_folder_above_a_log_or_the_log_itself_is_told_where_it_is(tmp_path: Path) -> None:
-    write_episodes(tmp_path / "frames-0" / "rollouts", [])
-    folder = tmp_path / "frames-0" / "rollouts"
-    with pytest.raises(MemobenchError, match=f"holds no episode log; .*; there is one in {folder}$"):
-        read_episodes(tmp_path)
-    with pytest.raises(MemobenchError, match=f"is not a folder; .*, such as {folder}$"):
-        read_episodes(folder / "episodes.jsonl")
-
-
-@pytest.mark.parametrize(
-    "damage", [lambda data: data[:-12], lambda data: b"no gzip", lambda data: data[:40] + b"x" * 9]
-)
-def test_a_damaged_archive_is_one_sentence(
-    tmp_path: Path, damage: Callable[[bytes], bytes], capsys: pytest.CaptureFixture[str]
+def test_compressed_evaluations(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = kept(tmp_path) / "episodes.jsonl.gz"
-    file.write_bytes(damage(file.read_bytes()))
-    assert main(["report", str(tmp_path)]) == 2
-    assert "it is no whole gzip file" in capsys.readouterr().err
-
-
-def test_what_grows_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, archive = prompted(tmp_path / "a", {"type": "act"}, {"path": "user/mine"}), kept(tmp_path / "b")
+    before = sorted(archive.iterdir())
+    printed = []
+    for folder in (plain, archive):
+        assert main(["report", str(folder), "--format", "csv"]) == 0
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1]
+    assert len(printed[0].splitlines()) > 10
+    assert main(["compare", str(plain), str(archive)]) == 0
+    assert sorted(archive.iterdir()) == before
+    file = archive / "episodes.jsonl.gz"
+    whole = file.read_bytes()
+    for damaged in (whole[:-12], b"no gzip", whole[:40] + b"x" * 9):
+        file.write_bytes(damaged)
+        assert main(["report", str(archive)]) == 2
+        assert "gzip" in capsys.readouterr().err
+    file.write_bytes(whole)
     monkeypatch.setattr("lerobot_memobench.io.LARGEST_UNPACKED", 100)
-    with pytest.raises(MemobenchError, match=r"cannot be read \(it becomes larger than"):
-        read_runs([kept(tmp_path)])
+    with pytest.raises(MemobenchError, match="larger"):
+        read_runs([archive])
+
+
+def test_the_nearest_log_is_suggested(tmp_path: Path) -> None:
+    folder = tmp_path / "frames-0" / "rollouts"
+    write_episodes(folder, [])
+    for wrong in (tmp_path, folder / "episodes.jsonl"):
+        with pytest.raises(MemobenchError, match=f"{folder}$"):
+            read_episodes(wrong)

@@ -29,11 +29,6 @@ def test_mcnemar_is_the_two_sided_binomial_tail(only_a: int, only_b: int, p: flo
     assert mcnemar(only_a, only_b) == pytest.approx(p)
 
 
-def test_mcnemar_of_many_pairs_goes_on_smoothly() -> None:
-    assert mcnemar(530, 470) == pytest.approx(mcnemar(529, 470), abs=0.01)
-    assert 0.05 < mcnemar(530, 470) < 0.07
-
-
 def equal(n: int) -> Sequence[float]:
     return [1 / n] * n
 
@@ -45,13 +40,6 @@ def test_sign_flip_enumerates_few_pairs() -> None:
     assert sign_flip([0.5, -0.5, 1.0], equal(3), rng) == (6 / 8, True)
     assert sign_flip([0.0, 0.0], equal(2), rng) == (1.0, True)
     assert sign_flip([1.0] * 6 + [0.0] * 44, equal(50), rng) == (2 / 64, True)
-
-
-def test_sign_flip_of_ones_is_mcnemar() -> None:
-    rng = np.random.default_rng(0)
-    p, exact = sign_flip([1.0] * 9 + [-1.0] * 3, equal(12), rng)
-    assert exact
-    assert p == pytest.approx(mcnemar(3, 9))
 
 
 def test_sign_flip_draws_for_many_pairs_and_repeats_with_the_seed() -> None:

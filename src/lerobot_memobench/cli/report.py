@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console, say, tell
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 
@@ -75,28 +76,16 @@ def report(
     report.json and report.md are also written to the folder of each evaluation, unless its log is compressed.
     """
     from lerobot_memobench.evaluation.records import read_runs
-    from lerobot_memobench.evaluation.report import build, render, write_documents
-    from lerobot_memobench.evaluation.tables import terminal
+    from lerobot_memobench.evaluation.report import build
 
     runs = read_runs(folders)
-    wanted = list(dict.fromkeys(each.value for each in format_ or [ReportFormat.TABLE]))
-    paper = with_ is Published.PAPER
     for run in runs:
         _write_beside_log(run)
-    if out is not None:
-        for path in write_documents(runs, out, wanted, paper):
-            say(path)
-    else:
-        found = build(runs, paper)
-        for name in wanted:
-            if name == ReportFormat.TABLE:
-                console().print(terminal(found), crop=False)
-            else:
-                print(render(found, runs, name, paper), end="")
+    show_report(build(runs, with_ is Published.PAPER), "report", format_, out)
     if figures is not None:
         from lerobot_memobench.evaluation.plots import draw_figures
 
-        for path in draw_figures(runs, figures, paper):
+        for path in draw_figures(runs, figures):
             say(path)
     if html is not None:
         from lerobot_memobench.evaluation.html.write import write_html
@@ -184,20 +173,28 @@ def show_report(
     """Print a report in the formats wanted, or write it to a folder as ``name`` with the formats' endings.
 
     Args:
-        as_csv: its figures as CSV, one a row; its tables under one another when None.
+        as_csv: its figures as CSV, one a row, in the place of its tables.
+
+    Raises:
+        MemobenchError: ``out`` is a file.
     """
     from lerobot_memobench.evaluation.tables import WRITERS, csv_tables, terminal
 
+    if out is not None:
+        if out.exists() and not out.is_dir():
+            raise MemobenchError(f"--out {out} is a file; name a folder")
+        out.mkdir(parents=True, exist_ok=True)
     for each in dict.fromkeys(formats or [ReportFormat.TABLE]):
         if out is None and each is ReportFormat.TABLE:
             console().print(terminal(report), crop=False)
             continue
+        texts = {f"{name}.{ENDINGS[each]}": WRITERS[each](report)}
         if each is ReportFormat.CSV:
-            text = "\n".join(csv_tables(report).values()) if as_csv is None else as_csv
-        else:
-            text = WRITERS[each](report)
+            tables = {f"tables/{key}.csv": text for key, text in csv_tables(report).items()}
+            texts = tables if as_csv is None else {f"{name}.csv": as_csv}
         if out is None:
-            print(text, end="")
-        else:
-            out.mkdir(parents=True, exist_ok=True)
-            say(write_file(out / f"{name}.{ENDINGS[each]}", text))
+            print("\n".join(texts.values()), end="")
+            continue
+        for file, text in texts.items():
+            (out / file).parent.mkdir(exist_ok=True)
+            say(write_file(out / file, text))

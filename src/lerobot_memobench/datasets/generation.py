@@ -38,7 +38,7 @@ FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
 }
-"""Mean frames of a demonstration, prompt included, in the full runs (docs/research/demonstration_runs.md). Frames in
+"""Mean frames of a demonstration, prompt included, in the full runs (results/demonstrations.md). Frames in
 which a robot idles are not counted: they take little time and room."""
 FRAME_BYTES, IMAGES_BYTES = 800, 5_400
 """Bytes of a frame without images, and of both cameras' videos per frame at 256 × 256."""

@@ -1,4 +1,4 @@
-"""Whether two accounts of an episode agree: of two logs, or of a log and a result card."""
+"""Agreement of two records of an episode: of two logs, or of a log and a result card."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ OUTCOME = (
     *("success", "steps", "prompt_steps", "variant", "choice", "checkpoints", "failure", "fault", "not_run"),
     *("stand_ins", "scene_hash"),
 )
-"""What two runs of the same episode must agree in."""
+"""Fields in which two runs of the same episode must agree."""
 
 
 def outcome(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a card keeps of a line of the log: its identity and what does not depend on the clock."""
+    """Return the fields of a log line that a card keeps: its identity and its outcome, without times."""
     return {
         key: record[key] for key in ("task", "memory_type", "episode", "seed", "referent", *OUTCOME) if key in record
     }
 
 
 def disagreement(a: Mapping[str, Any], b: Mapping[str, Any], here: str = "here", there: str = "there") -> str | None:
-    """Return in one phrase the first thing in which two records of the same episode differ, None when in nothing.
+    """Return a phrase for the first difference of two records of the same episode, None where they agree.
 
-    The time it took is no difference, nor what one of them leaves out.
+    Times, and fields that one of them lacks, do not count.
     """
     if ("not_run" in a) != ("not_run" in b):
         return f"{_name(a)} was not run {here if 'not_run' in a else there}"
@@ -36,13 +36,13 @@ def disagreement(a: Mapping[str, Any], b: Mapping[str, Any], here: str = "here",
         else:
             found = (name, a[name], b[name])
         if found is not None:
-            what, mine, other = found
-            return f"{_name(a)}: {what} is {mine} {here} and {other} {there}"
+            field, mine, other = found
+            return f"{_name(a)}: {field} is {mine} {here} and {other} {there}"
     return None
 
 
 def _first_checkpoint(a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, Any]]) -> tuple[str, Any, Any] | None:
-    """Return the first thing in which checkpoints differ: what, and its two values."""
+    """Return the first difference of checkpoints: its name and both values."""
     for number, (mine, other) in enumerate(zip(a, b, strict=True), start=1):
         for key in ("operation", "first_step", "ordered_step"):
             if mine.get(key) != other.get(key):
@@ -53,7 +53,7 @@ def _first_checkpoint(a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, A
 def disagreements(
     card: Sequence[Mapping[str, Any]], records: Sequence[Mapping[str, Any]], there: str = "in the log"
 ) -> list[str]:
-    """Return a phrase for each episode that a card and a log do not agree about, or that one of them lacks."""
+    """Return a phrase for each episode that differs between a card and a log, or that one of them lacks."""
     logged, named = ({key_of(each): each for each in some} for some in (records, card))
     found = []
     for key in sorted({*logged, *named}):

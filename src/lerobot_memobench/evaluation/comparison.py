@@ -1,7 +1,7 @@
 """Two evaluations of the same episodes, compared pair by pair: rates, differences with intervals, and tests.
 
 Episodes are paired by task, number and referent. Rates are fractions. Evaluations that differ in the setting of a
-control (`controls`) are that control: the setting may differ, and the report says how to read the difference.
+control (`controls`) are that control: the setting may differ, and the report explains the difference.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 SCENES = "scene_hash"
 ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
-"""What may differ between both when asked for by name."""
+"""Settings that may differ when `allow` names them."""
 
 Pair = tuple[Record, Record]
 
@@ -102,11 +102,11 @@ def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
 
 
 def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str]:
-    """Return the first part of an episode's identity that differs in pairs: the name that allows it -> a sentence.
+    """Return the first part of an episode's identity that differs in pairs: setting to allow -> a sentence.
 
-    A side without the field does not differ. Other seeds have other scenes, which need no name of their own.
+    A missing field is no difference. Seeds that differ imply other scenes.
     """
-    for field, name, what in (
+    for field, name, noun in (
         ("seed", "seed_base", "seeds"),
         ("scene_hash", SCENES, "initial scenes"),
         ("variant", "referent", "variants"),
@@ -115,7 +115,7 @@ def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str
         if different and not {name, "seed_base"} & set(allow):
             x, y = different[0]
             return {
-                name: f"{len(different)} of {len(pairs)} pairs do not have the same {what}, the first is {x['task']}, "
+                name: f"{len(different)} of {len(pairs)} pairs do not have the same {noun}, the first is {x['task']}, "
                 f"episode {x['episode']} ({field} {x[field]} and {y[field]})"
             }
     return {}
@@ -174,8 +174,8 @@ class Comparison:
 
     Attributes:
         a, b: their names.
-        pairs: how many episodes.
-        notes: what a reader must know.
+        pairs: number of episodes.
+        notes: warnings for the reader.
         inputs: of each policy.
         headline: the report's first line.
         control: the control that they are, if any.
@@ -232,17 +232,17 @@ def compare(
 
 
 def controls_among(runs: Sequence[Run]) -> Iterator[Comparison]:
-    """Yield the comparison of each two evaluations that are a control and differ in nothing else."""
+    """Yield the comparison of each two evaluations that differ only in the setting of a control."""
     for a, b in ordered(runs, 2):
         try:
             if control_between(a, b) is not None:
                 yield compare(a, b)
-        except MemobenchError:  # the other way around, of two policies, or of unlike protocols: no control
+        except MemobenchError:  # reversed, of two policies, or of other protocols: no control
             continue
 
 
 def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
-    """Return the episodes that both hold; raise where anything differs that was not allowed, with all that does."""
+    """Return the common episodes; raise where a setting differs that was not allowed, naming all of them."""
     for name in allow:
         if name not in ALLOWED:
             raise MemobenchError(
@@ -259,13 +259,13 @@ def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
         raise MemobenchError(
             f"{a.folder} and {b.folder} are not of the same episodes under one protocol "
             f"({reasons}), so their difference is not the policies' alone; evaluate again"
-            + (f", or name what is meant to differ: {options}" if set(names) <= set(ALLOWED) else "")
+            + (f", or name the settings that are meant to differ: {options}" if set(names) <= set(ALLOWED) else "")
         )
     return pairs
 
 
 def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> list[str]:
-    """Return what a reader must know: what differs, what was left out, what the logs lack."""
+    """Return warnings for the reader: differing settings, episodes left out, gaps of the logs."""
     meant = () if control is None else (control.setting,)
     notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol, ignore=meant)]
     notes += other_physics(a, b)
@@ -284,7 +284,7 @@ class _Task:
     """The pairs of one task.
 
     Attributes:
-        values: metric -> what it is in both rollouts of each pair, (n, 2) in [0, 1].
+        values: metric -> its value in both rollouts of each pair, (n, 2) in [0, 1].
         drawn: metric -> mean of each bootstrap draw, (`DRAWS`, 2).
     """
 
@@ -430,7 +430,7 @@ def _adjusted(rows: Sequence[Difference]) -> list[Difference]:
 
 NOTE = (
     "Difference is the second minus the first, in points, with the 95 % interval of a bootstrap over pairs, at least "
-    "Newcombe's. p: exact McNemar for SR (pairs of which only one succeeded are given as first / second), sign-flip "
+    "Newcombe's. p: exact McNemar for SR (only one: pairs in which only the first / second succeeded), sign-flip "
     "permutation for the others; for tasks also adjusted for their number (Holm). Detectable: the smallest true "
     "difference that so many pairs would show with 80 % power at 5 %."
 )

@@ -1,8 +1,8 @@
-"""Controls: was it memory? A control is a comparison of two evaluations that differ in one setting on purpose.
+"""Controls: comparisons of two evaluations that differ in one setting on purpose, to test for memory.
 
 `CONTROLS` lists these settings; `comparison.compare` pairs, tests and reports a control like any two evaluations.
-Evidence needs one evaluation alone (`evidence`). Granularity compares several policies by the language level of the
-subgoals that each was taught with.
+Evidence needs only one evaluation (`evidence`). Granularity compares policies by the language level of the subgoals in
+their training.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES
 
 LEAST_GAP = 0.01
-"""Smallest gap to 100 % of which a share is given: below it, one rollout would turn the share around."""
+"""Smallest gap to 100 % for which a share is given: below it, one rollout would reverse the share."""
 
 
 @dataclass(frozen=True)

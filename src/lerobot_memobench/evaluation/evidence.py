@@ -1,4 +1,4 @@
-"""Evidence: how often the choice follows the past, where each scene was run with each variant of its task.
+"""Evidence: share of choices that follow the past, where each scene was run with each variant of its task.
 
 A policy without the past that cannot look before it chooses gives the same answer in all variants of a scene. Its rate
 of right answers is the chance (`tasks.evidence.chance`), for any scenes. The terms *warranted choice* and *reliable
@@ -43,12 +43,12 @@ SENTENCE = (
 
 @dataclass(frozen=True)
 class Evidence:
-    """Rates of one task, or of several: means over scenes, in each of which every variant weighs the same.
+    """Rates of one or several tasks: means over scenes; the variants of a scene have equal weights.
 
     Attributes:
         scenes, variants: how many; of several tasks the sum of scenes, and no number of variants.
         chance: of following without the past; None where the instruction names the answer.
-        rates: of `RATES`, `RIGHT` and `RELIABLE`, with intervals; no `RIGHT` where nothing was decided.
+        rates: of `RATES`, `RIGHT` and `RELIABLE`, with intervals; `RIGHT` is missing where no rollout had an answer.
         p: one-sided, of as many right answers when they are permuted within scenes.
         effective: number of scenes of equal weight with the same variance.
     """
@@ -66,7 +66,7 @@ class FoundEvidence(NamedTuple):
 
     Attributes:
         average: mean over memory types, None where no task has a chance.
-        notes: what a reader must know.
+        notes: warnings for the reader.
     """
 
     tasks: dict[str, Evidence]

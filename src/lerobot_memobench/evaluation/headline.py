@@ -19,17 +19,17 @@ def headline(runs: Sequence[Run]) -> str:
     """Return the first line of a report of one or several evaluations."""
     if len(runs) == 1:
         (run,) = runs
-        return f"{whose(run)}: {', '.join(protocol_phrases(run))}; {given(run)}"
+        return f"{policy_name(run)}: {', '.join(protocol_phrases(run))}; {inputs_of(run)}"
     protocols = [", ".join(protocol_phrases(run)) for run in runs]
     alike = len(set(protocols)) == 1
     parts = [
-        f"{run.name}: {whose(run)}, {given(run)}{'' if alike else f' ({protocol})'}"
+        f"{run.name}: {policy_name(run)}, {inputs_of(run)}{'' if alike else f' ({protocol})'}"
         for run, protocol in zip(runs, protocols, strict=True)
     ]
     return "; ".join([f"{len(runs)} evaluations{f', {protocols[0]}' if alike else ''}", *parts])
 
 
-def whose(run: Run) -> str:
+def policy_name(run: Run) -> str:
     """Return the policy: its type and, where it is known, its checkpoint."""
     policy = run.protocol[POLICY]
     name = policy.get("type") or next((str(r["policy"]) for r in run.records if r.get("policy")), None)
@@ -48,7 +48,7 @@ def protocol_phrases(run: Run) -> list[str]:
     return [
         f"{of_all(records, 'suite')} suite",
         *(f"{key} {value}" for key in ("world", "protocol") if (value := of_all(records, key)) != OMITTED[key]),
-        *([count_of(len(missing), "stand-in")] if (missing := stand_ins_of(records)) else []),
+        *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),
         f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
         *_seeds(run),
         _extent(records),
@@ -88,7 +88,7 @@ def _replan(records: Sequence[Record]) -> list[str]:
     return [f"replan interval {', '.join(map(str, found))}"] if found else []
 
 
-def given(run: Run) -> str:
+def inputs_of(run: Run) -> str:
     """Return the policy's inputs and, where there was a demonstration prompt, whether the policy observed it."""
     return ", ".join([f"inputs: {policy_inputs(run.records)}", *_prompt(run.records, run.protocol)])
 
@@ -96,7 +96,7 @@ def given(run: Run) -> str:
 def _prompt(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]:
     if protocol.get("demonstration_prompt") is False:
         return ["no demonstration prompt"]
-    # A strict task without a prompt idles all the same; it shows nothing then.
+    # A strict task without a prompt idles too; its prompt steps show no scene.
     if not any(record.get("prompt_steps") and record.get("prompt_shown", True) is not None for record in records):
         return []
     prompt_in = protocol.get("prompt_in")

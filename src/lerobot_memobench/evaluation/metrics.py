@@ -49,19 +49,19 @@ def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
     """Group records by task, in the order of memory types and then of names.
 
     Raises:
-        MemobenchError: rollouts of one task do not agree on what the task is.
+        MemobenchError: rollouts of one task differ in its memory type or operations.
     """
     grouped: dict[str, list[Record]] = {}
     for record in records:
         grouped.setdefault(record["task"], []).append(record)
     for name, group in grouped.items():
-        for what, found in (
+        for field, found in (
             ("memory_type", {record["memory_type"] for record in group}),
             ("operations", {operations(record) for record in group}),
         ):
             if len(found) > 1:
                 raise MemobenchError(
-                    f"rollouts of {name!r} disagree on their {what} ({', '.join(sorted(found))}); "
+                    f"rollouts of {name!r} disagree on their {field} ({', '.join(sorted(found))}); "
                     "report logs of different versions of a task separately"
                 )
         if group[0]["memory_type"] not in MEMORY_TYPES:
@@ -137,8 +137,8 @@ def stand_ins_of(records: Iterable[Record]) -> list[str]:
 def missing_scans(records: Iterable[Record]) -> list[str]:
     """Return a sentence where boxes replaced scans."""
     missing = ", ".join(stand_ins_of(records))
-    said = f"scans were missing, so boxes replaced {missing}: figures with and without them do not compare"
-    return [said] if missing else []
+    note = f"scans were missing, so boxes replaced {missing}: figures with and without them do not compare"
+    return [note] if missing else []
 
 
 def unshown_prompts(records: Iterable[Record]) -> list[str]:
@@ -151,7 +151,7 @@ def unshown_prompts(records: Iterable[Record]) -> list[str]:
 
 
 def faults(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each task of which rollouts were broken off, and so failed, with the first reason."""
+    """Return a sentence for each task with rollouts that were broken off, and so failed, with the first reason."""
     return [
         f"{task}: {count_of(len(group), 'rollout')} {'was' if len(group) == 1 else 'were'} broken off and "
         f"{'counts' if len(group) == 1 else 'count'} as failed, the first in episode "
@@ -344,8 +344,8 @@ class Summary:
         tasks: name -> metrics.
         memory_types: name -> metrics, each the mean over its applicable tasks.
         average: mean over the applicable memory types.
-        pooled: MSR, MUR, MCR over all checkpoint records of the operation, whatever the task; n counts records.
-        pooled_checkpoints: the same over all checkpoint records, whatever the operation.
+        pooled: MSR, MUR, MCR over all checkpoint records of the operation, of all tasks; n counts records.
+        pooled_checkpoints: the same over all checkpoint records, of all operations.
         prefix: task -> per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any
             order.
         ordered_prefix: the same in order.

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
 from lerobot_memobench.evaluation.metrics import METRICS, Rate
 from lerobot_memobench.evaluation.records import Run, sweeps
-from lerobot_memobench.evaluation.report_tables import PAPER_INPUTS, extent, outcomes, published_rate
+from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.io import draft_of
-from lerobot_memobench.paper import failure_taxonomy, published_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -120,15 +119,11 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     return paths
 
 
-def draw_figures(runs: Sequence[Run], folder: Path, paper: bool = False) -> list[Path]:
-    """Draw the figures of a report into a folder; return the files.
-
-    Args:
-        paper: draw the published figures as well.
-    """
-    files = save(draw_outcomes(bars(runs, paper)), folder, "outcomes")
+def draw_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
+    """Draw the figures of a report into a folder; return the files."""
+    files = save(draw_outcomes(bars(runs)), folder, "outcomes")
     if sweeps(runs):
-        files += save(draw_replan(runs, paper), folder, "replan")
+        files += save(draw_replan(runs), folder, "replan")
     return files
 
 
@@ -153,25 +148,19 @@ class Bar(NamedTuple):
     parts: Mapping[str, int]
 
 
-def bars(runs: Sequence[Run], paper: bool = False) -> list[Bar]:
-    """Return the bars of all rollouts, then of each memory type, and of the paper's temporal task."""
+def bars(runs: Sequence[Run]) -> list[Bar]:
+    """Return the bars of all rollouts, then of each memory type."""
     groups: dict[str, dict[str, list[str]]] = {}  # heading -> name of the evaluation -> tasks
     for run in runs:
         for task, memory_type in run.summary.memory_type_of.items():
             for heading in ("all rollouts", memory_type):
                 groups.setdefault(heading, {}).setdefault(run.name, []).append(task)
     summaries = {run.name: run.summary for run in runs}
-    found = [
+    return [
         Bar(heading, name if len(runs) > 1 else "", outcomes(summaries[name], tasks))
         for heading, members in groups.items()
         for name, tasks in members.items()
     ]
-    if paper:
-        counts = failure_taxonomy()
-        late = counts["stale_memory_first_update"] + counts["stale_memory_late"]
-        parts = {"success": counts["success"], "storage_failure": counts["storage_failure"], "stale_memory": late}
-        found.append(Bar("paper, a temporal task", "", parts))
-    return found
 
 
 def draw_outcomes(found: Sequence[Bar]) -> Figure:
@@ -227,20 +216,17 @@ Curve = Mapping[int, Rate]
 """Replan interval -> rate."""
 
 
-def draw_replan(runs: Sequence[Run], paper: bool = False) -> Figure:
+def draw_replan(runs: Sequence[Run]) -> Figure:
     """Draw SR, MSR, MUR and MCR on average over replan intervals, a line per method, with Wilson's intervals."""
     from matplotlib.lines import Line2D
 
-    methods = {
-        **{(name, False): _curves(group) for name, group in sweeps(runs).items()},
-        **({(name, True): found for name, found in _published_curves().items()} if paper else {}),
-    }
-    styles = {key: line_style(number, published=key[1]) for number, key in enumerate(methods)}
+    methods = {name: _curves(group) for name, group in sweeps(runs).items()}
+    styles = {name: line_style(number, published=False) for number, name in enumerate(methods)}
     with paper_style():
         figure = new_figure(7.4, 2.5)
         for metric, place in zip(METRICS, figure.subplots(1, len(METRICS)), strict=True):
-            for key, found in methods.items():
-                _draw_curve(place, found[metric], styles[key])
+            for name, found in methods.items():
+                _draw_curve(place, found[metric], styles[name])
             place.set_title(f"{metric} ({METRIC_NAMES[metric]})", fontsize=7.5)
             place.set_xlabel("replan interval, steps")
             place.set_xticks(sorted({steps for found in methods.values() for steps in found[metric]}))
@@ -249,21 +235,8 @@ def draw_replan(runs: Sequence[Run], paper: bool = False) -> Figure:
             place.set_ylim(top=min(102.0, max(10.0, place.get_ylim()[1])))
             place.grid(axis="y", color=GRID, lw=0.5)
         figure.axes[0].set_ylabel("average, %")
-        remarks = {name: remark(group[0]) for name, group in sweeps(runs).items()} if paper else {}
-        handles = {
-            f"paper: {name}" if published else f"{name}{remarks.get(name, '')}": Line2D(
-                [], [], **styles[name, published]
-            )
-            for name, published in methods
-        }
-        legend_below(figure, handles, 3)
+        legend_below(figure, {name: Line2D([], [], **styles[name]) for name in methods}, 3)
         return figure
-
-
-def remark(run: Run) -> str:
-    """Return how much was run and the policy's inputs, each where it is not the paper's, for a legend."""
-    inputs = "" if run.summary.inputs == PAPER_INPUTS else f"inputs: {run.summary.inputs}"
-    return "".join(f"\n({part})" for part in (extent(run), inputs) if part)
 
 
 def _curves(runs: Sequence[Run]) -> dict[str, Curve]:
@@ -276,17 +249,6 @@ def _curves(runs: Sequence[Run]) -> dict[str, Curve]:
         }
         for metric in METRICS
     }
-
-
-def _published_curves() -> dict[str, dict[str, Curve]]:
-    """Return model -> the same of the paper's main results."""
-    found: dict[str, dict[str, dict[int, Rate]]] = {}
-    for row in published_rows("main"):
-        curves = found.setdefault(row.label, {metric: {} for metric in METRICS})
-        for metric, value in row.average.items():
-            if value is not None and row.replan_steps is not None:
-                curves[metric][row.replan_steps] = published_rate(value)
-    return {name: dict(curves) for name, curves in found.items()}
 
 
 def _draw_curve(place: Any, found: Curve, style: Mapping[str, Any]) -> None:

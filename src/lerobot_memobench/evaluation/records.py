@@ -50,10 +50,10 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     """
     folder = Path(folder)
     card = read_evaluation(folder)
-    told: dict[str, Any] = card.get("protocol", {})
-    if not {*EXTENT, *SETTINGS} - {*OMITTED} <= set(told):
-        told = {**protocol_of_log(read_episodes(folder)), **told}
-    return {**told, POLICY: card.get(POLICY) or told.get(POLICY) or {}}
+    protocol: dict[str, Any] = card.get("protocol", {})
+    if not {*EXTENT, *SETTINGS} - {*OMITTED} <= set(protocol):
+        protocol = {**protocol_of_log(read_episodes(folder)), **protocol}
+    return {**protocol, POLICY: card.get(POLICY) or protocol.get(POLICY) or {}}
 
 
 def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -105,7 +105,7 @@ class Run:
 
     Attributes:
         name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
-        notes: what a reader must know, such as lines that could not be read.
+        notes: warnings for the reader, such as unreadable lines.
     """
 
     name: str
@@ -196,8 +196,8 @@ def other_physics(a: Run, b: Run) -> list[str]:
 
 
 def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the rollouts of an evaluation, and what a reader must know: unreadable lines, what was not run or
-    was broken off, mixed protocols.
+    """Return the rollouts of an evaluation and warnings: unreadable lines, episodes that were not run or were
+    broken off, mixed protocols.
 
     Raises:
         MemobenchError: there are none.

@@ -7,18 +7,16 @@ of several evaluations also the controls among them.
 
 from __future__ import annotations
 
-import gzip
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import RenderableType
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, not_run, read_log, write_episodes
-from lerobot_memobench.envs.evaluation_file import EARLIER_CARD
-from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.envs.episode_log import POLICY, not_run, read_log, write_episodes
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import Comparison, comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.controls import granularity_data, granularity_section
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
@@ -32,9 +30,8 @@ from lerobot_memobench.evaluation.metrics import (
     percent,
     report_values,
 )
-from lerobot_memobench.evaluation.records import CARD_FILE, Run, asked_for, read_protocol, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
-    PAPER_INPUTS,
     beside_paper,
     best_interval,
     check_beside,
@@ -49,24 +46,12 @@ from lerobot_memobench.evaluation.report_tables import (
     sweep,
     tasks_table,
 )
-from lerobot_memobench.evaluation.tables import WRITERS, Report, Section, csv_tables, csv_text, markdown, terminal_table
-from lerobot_memobench.io import file_bytes, is_there, packed, write_file
+from lerobot_memobench.evaluation.tables import Report, Section, markdown, terminal_table
+from lerobot_memobench.io import write_file
 from lerobot_memobench.paper import PublishedRow, published_rows
 
 REPORT_JSON = "report.json"
 REPORT_MARKDOWN = "report.md"
-
-FILES: dict[str, str] = {
-    "table": "report.txt",
-    "markdown": REPORT_MARKDOWN,
-    "csv": "report.csv",
-    "latex": "report.tex",
-    "json": REPORT_JSON,
-}
-"""Format -> file that it is written to."""
-
-TABLES = "tables"
-"""Folder of the tables as CSV."""
 
 
 # --- in the folder of the log ---
@@ -83,10 +68,10 @@ def write_report(directory: str | Path, episodes: int | None = None) -> Run:
             last one may hold more than were asked for.
 
     Returns:
-        The evaluation, with notes a reader must know: unreadable lines, what was not run, mixed protocols.
+        The evaluation with warnings: unreadable lines, episodes that were not run, mixed protocols.
 
     Raises:
-        MemobenchError: there is no rollout: nothing was run, or nothing could be.
+        MemobenchError: there is no rollout.
     """
     directory = Path(directory)
     notes: list[str] = []
@@ -115,19 +100,6 @@ def table(summary: Summary) -> RenderableType:
 def evaluation_markdown(run: Run) -> str:
     """Return the report of one evaluation as Markdown."""
     return markdown(Report(headline([run]), (_section(run), *_evidence(run))))
-
-
-def keep_log(folder: Path, kept: Path) -> None:
-    """Compress the log and the card of an evaluation into another folder, which reads as the evaluation does.
-
-    Raises:
-        MemobenchError: there is no rollout. FileNotFoundError: there is no card.
-    """
-    write_report(folder)  # merges the workers' files
-    kept.mkdir(parents=True, exist_ok=True)
-    card = CARD_FILE if is_there(folder / CARD_FILE) else EARLIER_CARD
-    for file in (MERGED_FILE, card):
-        write_file(packed(kept / file), gzip.compress(file_bytes(folder / file), mtime=0))
 
 
 # --- documents ---
@@ -181,49 +153,6 @@ def _evidence(run: Run) -> list[Section]:
 def evidence_values(run: Run) -> dict[str, Any]:
     """Return ``evidence`` with its rates as JSON values, {} where scenes were not run with each variant."""
     return {} if run.evidence is None else {"evidence": evidence_data(run.evidence, run.records)}
-
-
-def render(found: Report, runs: Sequence[Run], format_: str, paper: bool = False) -> str:
-    """Return a report in one of the formats of ``FILES``."""
-    if format_ == "csv":
-        return csv_text(csv_rows(runs, paper), HEADER)
-    if format_ not in WRITERS:
-        raise MemobenchError(f"found the format {format_!r}, {nearest(format_, FILES)}")
-    return WRITERS[format_](_unique_keys(found) if format_ == "latex" else found)
-
-
-def write_documents(runs: Sequence[Run], out: Path, wanted: Sequence[str], paper: bool = False) -> list[Path]:
-    """Write a report of evaluations into a folder in the formats wanted; return the files.
-
-    CSV is every figure in a row of its own, and each table of the report as a file in ``tables``.
-    """
-    found = build(runs, paper)
-    if out.exists() and not out.is_dir():
-        raise MemobenchError(f"--out {out} is a file; name a folder")
-    out.mkdir(parents=True, exist_ok=True)
-    files = [write_file(out / FILES[name], render(found, runs, name, paper)) for name in wanted]
-    if "csv" in wanted:
-        (out / TABLES).mkdir(exist_ok=True)
-        files += [write_file(out / TABLES / f"{key}.csv", text) for key, text in csv_tables(found).items()]
-    return files
-
-
-OF_EACH_EVALUATION = ("memory-types", "tasks", "prefix", "failures")
-"""Keys of the tables in the section of every evaluation."""
-
-
-def _unique_keys(found: Report) -> Report:
-    """Number the labels of tables that several sections have."""
-    if len(found.sections) < 2:
-        return found
-    sections = []
-    for number, section in enumerate(found.sections, start=1):
-        tables = []
-        for each in section.tables:
-            title = f"{each.title}: {section.title}" if section.title and each.key in OF_EACH_EVALUATION else each.title
-            tables.append(replace(each, key=f"{each.key}-{number}", title=title))
-        sections.append(replace(section, tables=tuple(tables)))
-    return replace(found, sections=tuple(sections))
 
 
 # --- JSON ---
@@ -307,66 +236,3 @@ def _published_data(row: PublishedRow) -> dict[str, Any]:
         "memory_types": {name: dict(figures) for name, figures in row.memory_types.items()},
         "average": dict(row.average),
     }
-
-
-# --- CSV: one figure a row ---
-
-HEADER = ("evaluation", "replan_steps", "table", "name", "figure", "percent", "low", "high", "n", "inputs")
-"""``table`` is tasks, memory_types, average, pooled, prefix, ordered_prefix, failures, or extent."""
-
-CsvRow = tuple[object, ...]
-
-
-def csv_rows(runs: Sequence[Run], paper: bool) -> list[CsvRow]:
-    """Return every figure of evaluations, and the published ones where asked for."""
-    rows = [row for run in runs for row in _run_rows(run)]
-    if paper:
-        rows += [row for run in runs for row in _extent(run)]
-        rows += [row for published in published_rows() for row in _published_rows(published)]
-    return rows
-
-
-def _run_rows(run: Run) -> Iterator[CsvRow]:
-    for place, name, figure, rate in _figures(run.summary):
-        # Records of one rollout are not independent: an interval over them would be too narrow.
-        interval = None if place == "pooled" and figure != "SR" else _interval(rate)
-        figures = (percent(rate.value), *(interval or (None, None)), rate.n or None)
-        yield (run.name, run.replan_steps, place, name, figure, *figures, run.summary.inputs)
-
-
-def _extent(run: Run) -> Iterator[CsvRow]:
-    """Yield how much was run; the paper's rows are of 30 tasks and 1,500 rollouts."""
-    for figure, count in (("tasks", len(run.summary.tasks)), ("rollouts", run.summary.rollouts)):
-        yield (run.name, run.replan_steps, "extent", "", figure, None, None, None, count, run.summary.inputs)
-
-
-def _published_rows(published: PublishedRow) -> Iterator[CsvRow]:
-    method = f"paper, {published.table}: {published.model}"
-    groups: list[tuple[str, str, Mapping[str, float | None]]] = [
-        *(("memory_types", name, figures) for name, figures in published.memory_types.items()),
-        ("average", "", published.average),
-    ]
-    for place, name, figures in groups:
-        for metric in METRICS:
-            yield (method, published.replan_steps, place, name, metric, figures[metric], None, None, None, PAPER_INPUTS)
-
-
-def _figures(summary: Summary) -> Iterator[tuple[str, str, str, Rate]]:
-    """Yield (table, name, figure, rate) of everything in a summary."""
-    rows: list[tuple[str, str, Row]] = [
-        *(("tasks", name, row) for name, row in summary.tasks.items()),
-        *(("memory_types", name, row) for name, row in summary.memory_types.items()),
-        ("average", "", summary.average),
-        ("pooled", "", summary.pooled),
-    ]
-    for place, name, row in rows:
-        for metric in METRICS:
-            yield place, name, metric, row[metric]
-    yield "pooled", "", "checkpoints", summary.pooled_checkpoints
-    for place, prefixes in (("prefix", summary.prefix), ("ordered_prefix", summary.ordered_prefix)):
-        for name, rates in prefixes.items():
-            for k, rate in enumerate(rates):
-                yield place, name, f"c{k + 1}", rate
-    total = summary.rollouts
-    for failure, count in summary.failures.items():
-        yield "failures", "", failure, Rate(count / total, total)

@@ -44,7 +44,7 @@ def pooled_sentence(summary: Summary) -> str:
     ]
     overall = summary.pooled_checkpoints
     return (
-        f"Pooled over all rollouts, whatever the task: SR {figure(summary.pooled['SR'].value)}, "
+        f"Pooled over all rollouts of all tasks: SR {figure(summary.pooled['SR'].value)}, "
         f"checkpoints satisfied {figure(overall.value)} ({count_of(overall.n, 'record')}): {', '.join(parts)}."
     )
 
@@ -138,7 +138,7 @@ def prefix_table(summary: Summary) -> Table:
 
 FURTHER_NOTES = {
     "wrong_order": " Wrong order: the steps of a procedure were done in another order than its prompt's.",
-    "cut_off": " Cut off: the horizon is shorter than the protocol's, so it is unknown what was remembered.",
+    "cut_off": " Cut off: the horizon is shorter than the protocol's, so the memory may have worked.",
     "miscount": " Miscount: the event was done too seldom or too often.",
     "wrong_place": " Wrong place: the thing was looked for where it is not.",
     "invalid_action": " Invalid action: one of another shape, or not finite, broke the rollout off.",
@@ -191,7 +191,7 @@ NOTE = "inputs: of the policy; k: the replan interval."
 
 
 def overview(runs: Sequence[Run]) -> Table:
-    """Return one row per evaluation, and under the table in what they were not run alike."""
+    """Return one row per evaluation; the note names the settings in which they differ."""
     rows = tuple(run_row(run) for run in runs)
     return wide_table("overview", "Evaluations", rows, note=" ".join([NOTE, *unlike(runs)]), best=best_in_columns(rows))
 
@@ -293,9 +293,9 @@ PAPER_INPUTS = "pixels"
 PAPER_TASKS, PAPER_EPISODES = 30, 50
 
 TABLES = (
-    ("paper-main", "Beside the paper's main results", ("main",)),
-    ("paper-alignment", "Beside the paper's memory alignment results", ("alignment",)),
-    ("paper-reference", "Beside the paper's oracle memory and MemER", ("oracle", "memer")),
+    ("paper-main", "With the paper's main results", ("main",)),
+    ("paper-alignment", "With the paper's memory alignment results", ("alignment",)),
+    ("paper-reference", "With the paper's oracle memory and MemER", ("oracle", "memer")),
 )
 """Key, title, and which of the paper's tables it holds."""
 
@@ -315,10 +315,10 @@ def check_beside(runs: Sequence[Run], paper: bool) -> None:
 
 
 def beside_paper(runs: Sequence[Run]) -> Section:
-    """Return the paper's tables of rates with these evaluations on top of each, and in what they depart from it."""
+    """Return the paper's tables of rates with these evaluations in the first rows, and departures from its protocol."""
     tables = [_beside(runs, *each) for each in TABLES]
     notes = [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
-    return Section("Beside the paper", (*tables, paper_failures()), notes=tuple(notes))
+    return Section("With the paper's figures", (*tables, paper_failures()), notes=tuple(notes))
 
 
 def extent(run: Run) -> str:
@@ -371,7 +371,7 @@ def paper_failures() -> Table:
 
 
 def departures(run: Run) -> list[str]:
-    """Return in what an evaluation was not run as the paper's were, each as a phrase."""
+    """Return a phrase for each departure of an evaluation from the paper's protocol."""
     found = []
     if len(run.summary.tasks) != PAPER_TASKS:
         found.append(f"{len(run.summary.tasks)} of {PAPER_TASKS} tasks")

@@ -6,7 +6,7 @@ it each task, weighs the same).
 
 Intervals are percentiles of a bootstrap that draws episodes within each task and keeps the pairs together, so that what
 both share (an easy scene) does not widen them; `scipy.stats.bootstrap` draws from one sample and knows no tasks. Draws
-from outcomes that are all equal are equal, as if nothing else could have happened: no interval is narrower than
+from equal outcomes are equal, as if no other outcome were possible: no interval is narrower than
 Newcombe's of so many pairs.
 """
 

@@ -45,7 +45,7 @@ class PrefixRates(NamedTuple):
 
 
 Cell = Rate | PrefixRates | str | int | None
-"""A rate (per cent, with its interval where it has one) or two, text, a number; None where nothing applies."""
+"""A rate (per cent, with its interval where it has one) or two, text, a number; None: not applicable."""
 
 
 @dataclass(frozen=True)
@@ -236,10 +236,13 @@ def latex(report: Report) -> str:
         f"% {' '.join(report.title.split())}, written by `memobench report`.",
         r"% Needs \usepackage[T1]{fontenc}, \usepackage{booktabs} and \usepackage{graphicx}.",
     ]
-    for section in report.sections:
+    keys = Counter(table.key for table in report.tables)
+    for number, section in enumerate(report.sections, start=1):
         if section.title:
             lines += ["", f"% {' '.join(section.title.split())}"]
         for table in section.tables:
+            if keys[table.key] > 1:  # of several evaluations
+                table = replace(table, key=f"{table.key}-{number}", title=f"{table.title}: {section.title}")
             lines += ["", *latex_table(table)]
     return "\n".join(lines) + "\n"
 
@@ -357,7 +360,7 @@ class Unbroken:
         wished = [[Measurement.get(PLAIN, PLAIN.options, cell) for cell in (c.header, *c.cells)] for c in after]
         least, most = ([max(one[end] for one in each) for each in wished] for end in (0, 1))
         space = room - INDENT * len(after)
-        last = min(most[-1], space - sum(most[:-1]))  # text at the end of a row takes what is left
+        last = min(most[-1], space - sum(most[:-1]))  # text at the end of a row takes the remaining width
         widths = [*most[:-1], last] if last >= least[-1] else least
 
         def row(cells: Sequence[RenderableType], style: str = "") -> RichTable:
@@ -454,6 +457,7 @@ WRITERS: Mapping[str, Callable[[Report], str]] = {
     "markdown": markdown,
     "latex": latex,
     "json": json_text,
+    "csv": lambda report: "\n".join(csv_tables(report).values()),
 }
 """Format -> its writer."""
 

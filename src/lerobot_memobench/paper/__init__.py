@@ -2,7 +2,7 @@
 
 Source: H. Sun, H. Wang, J. Chen et al., "MEMOBench: A Process Level Memory Benchmark for Robotic Manipulation",
 https://github.com/Collab-Gen/MEMOBench. The data are the figures as printed there, percentages with one decimal. It
-imports nothing of the project but its errors, so every other package may use them.
+imports only errors of the project, so every other package may use them.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import BLOCKS, WIDTHS, VisualEncoder
 
 SHIPPED = Path(__file__).parent / "detector.safetensors"
-"""The detector that comes with the package: docs/research/detector.md."""
+"""The detector that comes with the package: results/detector.md."""
 PACKAGE, RANDOM = "package", "random"
 """Names that are no file's: the package's detector, and a visual encoder with random weights."""
 

@@ -1,6 +1,6 @@
-"""From episode logs to the data of the page: rates, texts and timelines, as plain JSON values.
+"""Data of the page from episode logs: rates, texts and timelines, as plain JSON values.
 
-Every figure is computed here, by ``evaluation.metrics``; the page only draws and filters.
+All figures are computed by ``evaluation.metrics``; the page only draws and filters.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ def page_data(
     known: Mapping[str, Task],
     reads: Sequence[Mapping[int, Sequence[Chunk]]] | None = None,
 ) -> dict[str, Any]:
-    """Return everything that the page shows.
+    """Return all data of the page.
 
     Args:
         videos: per run, position of a rollout in its records -> address of its video, relative to the page.
-        reads: the same -> what its chunks have read of what the policy remembered; nothing is known where None.
+        reads: per run, position of a rollout -> memory reads of its chunks; None: not recorded.
         known: task name -> task, for language and checkpoint texts.
     """
     controls: dict[str, list[str]] = {run.name: [] for run in runs}

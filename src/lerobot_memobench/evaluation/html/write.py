@@ -1,8 +1,8 @@
 """Write the report: find each rollout's video, fill the template, make the folder.
 
 Everything but the videos is inside ``index.html``, because a browser lets a page from disk read no other file. Its
-content security policy allows this style, this script and videos from its own place, and nothing else: the page cannot
-reach the network.
+content security policy allows only this style, this script and videos in its own folder, so the page cannot reach the
+network.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
     out.mkdir(parents=True, exist_ok=True)
     with locked(out, out):
         if not (out / PAGE).exists():
-            write_file(out / PAGE, UNFINISHED)  # the folder is known as ours from now on
+            write_file(out / PAGE, UNFINISHED)  # marks the folder as a report
         place_videos(chosen)
         write_file(out / PAGE, text)
         _remove_other_videos(out, chosen)
@@ -106,12 +106,12 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
 
 
 def _slugs(names: Sequence[str]) -> list[str]:
-    """Return for each name that of a folder: plain characters, no two alike."""
+    """Return for each name that of a folder: plain characters, all distinct."""
     slugs: list[str] = []
     for name in names:
         base = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "run"
         slug, k = base, 1
-        while slug.lower() in (other.lower() for other in slugs):  # file systems may not tell A from a
+        while slug.lower() in (other.lower() for other in slugs):  # some file systems ignore case
             k += 1
             slug = f"{base}_{k}"
         slugs.append(slug)
@@ -119,15 +119,9 @@ def _slugs(names: Sequence[str]) -> list[str]:
 
 
 def _check_target(out: Path) -> None:
-    """Refuse to write among files that are not a report's, or through a link that leads out of it."""
+    """Refuse a folder that holds other files than a report's."""
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"--out {out} is a file; name a folder")
-    for folder in (out / VIDEOS, *(out / VIDEOS).glob("*")):
-        if folder.is_symlink():
-            raise MemobenchError(
-                f"{folder} is a link, and a report writes and removes videos there; remove the link, or name another "
-                "folder by --out"
-            )
     if not out.is_dir() or not any(out.iterdir()):
         return
     head = ""
@@ -244,14 +238,14 @@ def page(data: Mapping[str, Any], title: str) -> str:
         "script": script,
         "data": inline_json(data),
     }
-    # In one pass, so that what is put in is never taken for a place to put something.
+    # In one pass, so that inserted text is never taken for a placeholder.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read(PAGE))
 
 
 def inline_json(value: Any) -> str:
     """Return JSON for the inside of ``<script type="application/json">``.
 
-    Nothing in it can end the element or open a comment: ``<``, ``>`` and ``&`` are written as escapes.
+    ``<``, ``>`` and ``&`` are escaped, so the text cannot end the element or open a comment.
     """
     text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

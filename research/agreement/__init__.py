@@ -1,1 +1,0 @@
-"""How far do raters agree, with one another and with the released operation labels?"""
