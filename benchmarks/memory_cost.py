@@ -41,7 +41,7 @@ from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, fram
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep, gathering
 from lerobot_memobench.protocol import CONTROL_HZ, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE
-from lerobot_memobench.training.speed import keep_freed_memory
+from lerobot_memobench.training.loop import keep_freed_memory
 
 EPISODES, MOMENTS = 12, 6
 MINUTE, MINUTES = 60 * CONTROL_HZ, (1, 5, 20)

@@ -33,7 +33,7 @@ from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import Memo
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.protocol import OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
-from lerobot_memobench.training.speed import keep_freed_memory
+from lerobot_memobench.training.loop import keep_freed_memory
 
 HERE = Path(__file__).parents[1] / "src"
 EPISODES, MOMENTS = 12, 6

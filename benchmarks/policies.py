@@ -21,7 +21,7 @@ from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.training.average import WeightAverage
-from lerobot_memobench.training.speed import quick_products
+from lerobot_memobench.training.loop import quick_products
 
 # A size between tiny and pi05 that a CPU can train, with the full size's proportions: 256 patches per image, a VLM
 # that is wider than its expert, a chunk of 50, memory of 512 tokens.

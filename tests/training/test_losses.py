@@ -19,7 +19,7 @@ from tests.support.small_policy import CHUNK, batch_of, made_for_training, small
 
 
 @pytest.mark.parametrize("memory", ["none", "frames"])
-def test_lerobots_own_trainer_trains_without_a_memory(synthetic: Path, memory: str) -> None:
+def test_lerobots_batches_train_policies_without_memory(synthetic: Path, memory: str) -> None:
     """Frames as LeRobot draws them; actions of prompts do not count."""
     config = small_config(size="tiny", memory=memory)
     times = {"action": [step / 20 for step in range(CHUNK)]}
@@ -60,7 +60,7 @@ def test_mean_losses_without_padding_is_the_mean() -> None:
 
 
 @pytest.mark.parametrize("memory", ["subgoal", "keyframes"])
-def test_a_loss_that_is_measured_follows_the_memorys_own_choice(objects: Path, memory: str) -> None:
+def test_evaluation_loss_uses_the_memorys_own_choice(objects: Path, memory: str) -> None:
     policy, before, _, dataset = made_for_training(
         objects, memory=memory, memory_frames=32, perception="objects", size="small"
     )
@@ -73,7 +73,7 @@ def test_a_loss_that_is_measured_follows_the_memorys_own_choice(objects: Path, m
             mine, other = (policy.train(learns).forward(one)[1] for one in (batch, {**batch, **others}))
             assert (mine["action_loss"] == other["action_loss"]) is not learns
             own = [name for name in mine if name.startswith("memory_")]
-            assert any(mine[name] != other[name] for name in own), "it is measured by the labels all the same"
+            assert any(mine[name] != other[name] for name in own), "the labels still measure it"
 
 
 @pytest.fixture(scope="module")
