@@ -1,7 +1,7 @@
-"""LeRobot's own policies here: a step of training on our columns, a rollout in our environment, without a rename map.
+"""LeRobot's policies: an update on our datasets and a rollout in our environment, without a rename map.
 
-Weights are random and small. Where LeRobot fixes sizes or fetches a tokenizer inside the policy, the test hands it
-smaller numbers or a tokenizer built here; the policy's own code runs unchanged.
+Policies are small. If LeRobot fixes sizes or downloads a tokenizer, the test replaces those; the policy's code is
+LeRobot's.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.lerobots_trainer import trainer_in_this_process
 from tests.support.tiny_paligemma import shrink_paligemma, word_tokenizer
 
 TASK = "turn_on_the_stove_and_turn_it_off"
@@ -71,16 +72,14 @@ def written(folder: Path, *, pictures: bool) -> Path:
 
 
 def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] = INPUTS) -> dict[str, Any]:
-    """One optimiser step and one short episode by the two commands, as a user types them; check what came of both.
-
-    Returns the protocol of the evaluation.
-    """
+    """Train one step and run one short episode by the two commands; return the protocol of the evaluation."""
     run = out / "train"
     words = ("steps=1", "batch_size=2", "num_workers=0", "save_freq=1", f"output_dir={run}", "policy.device=cpu")
-    assert main(["train", *policy, f"dataset={dataset}", *words]) == 0
+    with trainer_in_this_process():
+        assert main(["train", *policy, f"dataset={dataset}", *words]) == 0
     checkpoint = run / "checkpoints" / "last" / "pretrained_model"
     config = json.loads((checkpoint / "config.json").read_text())
-    # Phase, checkpoints, subgoals and language rows are for memory policies: to others they are no input.
+    # Phase, checkpoints, subgoals and language are inputs of memory policies alone.
     assert set(config["input_features"]) == inputs
     assert set(config["output_features"]) == {"action"}
     assert normalised(checkpoint, inputs) <= {*inputs, "action"} | KEPT
@@ -91,7 +90,7 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
     return protocol_of(out / "eval")
 
 
-#: LeRobot keeps the statistics of every column in the file; which of them are used its step's features say.
+#: LeRobot saves the statistics of every column; the features of its step list the ones in use.
 KEPT = {
     *PICTURES,
     OBJECTS,
@@ -106,7 +105,7 @@ KEPT = {
 
 
 def normalised(checkpoint: Path, inputs: set[str]) -> set[str]:
-    """Return the columns whose statistics a checkpoint's preprocessor holds; check which of them it applies."""
+    """Return the columns whose statistics a checkpoint's preprocessor holds; check the ones in use."""
     steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
     (step,) = [step for step in steps if step.get("registry_name") == "normalizer_processor"]
     assert set(step["config"]["features"]) == {*inputs, "action"}
@@ -127,30 +126,31 @@ DIFFUSION = (
 
 
 @pytest.mark.parametrize("policy", [pytest.param(ACT, marks=pytest.mark.slow), DIFFUSION], ids=["act", "diffusion"])
-def test_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> None:
+def test_policies_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> None:
     assert train_and_roll_out(dataset, tmp_path, *policy)["obs_type"] == "pixels_agent_pos"
 
 
 @pytest.mark.parametrize("policy", [ACT, pytest.param(DIFFUSION, marks=pytest.mark.slow)], ids=["act", "diffusion"])
 @pytest.mark.parametrize(
-    ("pictures", "said", "seen"),
+    ("pictures", "obs_type", "seen"),
     [
-        (False, None, "environment_state_agent_pos"),
-        (True, None, "pixels_agent_pos"),
-        (True, "environment_state_agent_pos", "environment_state_agent_pos"),
         (True, "both", "both"),
+        pytest.param(False, None, "environment_state_agent_pos", marks=pytest.mark.slow),
+        pytest.param(True, None, "pixels_agent_pos", marks=pytest.mark.slow),
+        pytest.param(True, "environment_state_agent_pos", "environment_state_agent_pos", marks=pytest.mark.slow),
     ],
 )
-def test_on_objects(policy: tuple[str, ...], pictures: bool, said: str | None, seen: str, tmp_path: Path) -> None:
-    """The evaluation shows what the policy was trained on, without a word."""
+def test_evaluation_has_the_inputs_of_training(
+    policy: tuple[str, ...], pictures: bool, obs_type: str | None, seen: str, tmp_path: Path
+) -> None:
     of = {"pixels_agent_pos": PICTURES, "environment_state_agent_pos": {OBJECTS}, "both": PICTURES | {OBJECTS}}
     dataset = written(tmp_path, pictures=pictures)
-    words = policy if said is None else (*policy, f"obs_type={said}")
+    words = policy if obs_type is None else (*policy, f"obs_type={obs_type}")
     protocol = train_and_roll_out(dataset, tmp_path, *words, inputs={STATE} | of[seen])
     assert protocol["obs_type"] == seen
 
 
-# --- those with a language model ---
+# --- policies with a language model ---
 
 
 @pytest.fixture
@@ -172,7 +172,7 @@ def test_pi(dataset: Path, tmp_path: Path, name: str) -> None:
 
 @pytest.fixture
 def tiny_smolvlm(tmp_path: Path) -> Path:
-    """A folder with a small SmolVLM's configuration and processor, as the hub has the large one's."""
+    """A folder with the configuration and processor of a small SmolVLM."""
     from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
 
     folder = tmp_path / "smolvlm"
@@ -228,19 +228,19 @@ HORIZON = 20
 
 
 def flags(words: tuple[str, ...], **other: int) -> list[str]:
-    """Return our words as LeRobot's flags, with other values."""
+    """Return words as LeRobot's flags, some with other values."""
     pairs = dict(word.split("=", 1) for word in words) | {f"policy.{name}": str(value) for name, value in other.items()}
     return [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in pairs.items()]
 
 
 class Watched:
-    """What a policy plans in a rollout, and what its environments are given."""
+    """Record the plans of a policy in a rollout, and the actions of its environments."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, policy: type) -> None:
         self.plans: list[tuple[list[int], list[int], np.ndarray]] = []
-        """Of each plan: phase and step of every row's observation, actions (rows, chunk, 7)."""
+        """For each plan: phase and step of every row's observation, actions (rows, chunk, 7)."""
         self.applied: dict[int, list[np.ndarray]] = defaultdict(list)
-        """Seed -> actions that were given in the execution."""
+        """Seed -> actions of the execution."""
         self._seen: Any = None
         plan, select, step = policy.predict_action_chunk, policy.select_action, MemobenchEnv.step  # type: ignore[attr-defined]
 
@@ -266,7 +266,7 @@ class Watched:
 
 @pytest.fixture
 def lerobot_eval(tmp_path: Path) -> Any:
-    """Two episodes with prompts of different lengths in one batch, by LeRobot's own command."""
+    """Run two episodes with prompts of different lengths in one batch, by LeRobot's command."""
     import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
 
     def run(*policy: str) -> None:
@@ -292,8 +292,8 @@ def diffusion() -> tuple[type, list[str], int]:
     return DiffusionPolicy, flags(DIFFUSION, horizon=16, n_action_steps=8), 8
 
 
-@pytest.mark.parametrize("kind", [act, diffusion])
-def test_the_first_plan_is_made_from_the_first_execution_frame(
+@pytest.mark.parametrize("kind", [act, pytest.param(diffusion, marks=pytest.mark.slow)])
+def test_first_plan_reads_the_first_execution_frame(
     kind: Any, lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy, words, interval = kind()
@@ -304,14 +304,14 @@ def test_the_first_plan_is_made_from_the_first_execution_frame(
     assert [record["prompt_shown"] for record in records] == [True, True]
     phases, steps, _ = watched.plans[0]
     assert phases == [EXECUTION, EXECUTION]
-    assert steps == [0, 0], "the clock of the execution, whatever the prompts took"
+    assert steps == [0, 0], "the clock of the execution"
     for row, seed in enumerate((7, 8)):
         planned = np.concatenate([actions[row, :interval] for _, _, actions in watched.plans])[:HORIZON]
-        np.testing.assert_array_equal(np.stack(watched.applied[seed]), planned)  # none of them is stale
+        np.testing.assert_array_equal(np.stack(watched.applied[seed]), planned)
     assert protocol_of(tmp_path)["prompt_in"] == "reset"
 
 
-def test_a_policy_that_reads_prompts_is_shown_them(
+def test_prompts_are_observed_by_policies_that_read_them(
     lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy
