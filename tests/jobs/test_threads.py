@@ -1,4 +1,4 @@
-"""Who gets how many threads, on machines of 2 and 16 cores that are made up."""
+"""Numbers of threads on imitated machines of 2 and 16 cores."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from lerobot_memobench.jobs.threads import ACTING, BESIDE, LARGE, LEARNING, core
 
 
 class Machine:
-    """So many processors for this process, of cores with so many hyperthreads each, in a container with a quota."""
+    """Imitate processors, hyperthreads and a container's quota."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         self.monkeypatch, self.folder = monkeypatch, tmp_path
 
     def has(self, processors: int, quota: str | None = None, hyperthreads: int = 1) -> None:
         self.monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(processors)))
-        self.monkeypatch.setattr(os, "cpu_count", lambda: 128)  # the machine's, which is not this process's
+        self.monkeypatch.setattr(os, "cpu_count", lambda: 128)
         self.monkeypatch.setattr(threads, "_CGROUPS", self.folder)
         (self.folder / "cpu.max").write_text(quota or "max 100000\n")
         read = Path.read_text
@@ -61,7 +61,7 @@ def test_cores_are_those_of_this_process(machine: Machine) -> None:
     assert cores() == 2
 
 
-def test_a_limit_above_counts_as_well(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_of_outer_groups_count(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine.has(16)
     read = Path.read_text
     place = tmp_path / "job_1" / "step_0"
@@ -70,19 +70,6 @@ def test_a_limit_above_counts_as_well(machine: Machine, tmp_path: Path, monkeypa
     (tmp_path / "job_1" / "cpu.max").write_text("400000 100000")
     monkeypatch.setattr(Path, "read_text", lambda path: "0::/job_1/step_0\n" if path.name == "cgroup" else read(path))
     assert cores() == 4
-
-
-def test_control_groups_of_the_first_version(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    machine.has(16)
-    read = Path.read_text
-    (tmp_path / "cpu" / "docker").mkdir(parents=True)
-    for name, value in (("quota", "200000"), ("period", "100000")):
-        (tmp_path / "cpu" / "docker" / f"cpu.cfs_{name}_us").write_text(value)
-    text = "4:memory:/docker\n2:cpu,cpuacct:/docker\n0::/\n"
-    monkeypatch.setattr(Path, "read_text", lambda path: text if path.name == "cgroup" else read(path))
-    assert cores() == 2
-    (tmp_path / "cpu" / "docker" / "cpu.cfs_quota_us").write_text("-1")
-    assert cores() == 16
 
 
 @pytest.mark.parametrize(
@@ -101,7 +88,7 @@ def test_control_groups_of_the_first_version(machine: Machine, tmp_path: Path, m
         (2, LEARNING, False, 2, 1),
     ],
 )
-def test_the_rule(
+def test_threads_of_each_role(
     machine: Machine, processors: int, role: str, large: bool, processes: int, threads_of_torch: int | None
 ) -> None:
     machine.has(processors)
@@ -117,7 +104,7 @@ def test_hyperthreads_and_quotas(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("role", [ACTING, LEARNING])
-def test_a_users_own_setting_wins(machine: Machine, environment: dict[str, str], role: str) -> None:
+def test_variables_of_the_user_stay(machine: Machine, environment: dict[str, str], role: str) -> None:
     machine.has(16)
     own = {"OMP_NUM_THREADS": "7", "LP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "3", "OMP_WAIT_POLICY": "active"}
     environment.update(own)
@@ -130,7 +117,7 @@ def test_a_users_own_setting_wins(machine: Machine, environment: dict[str, str],
     assert torch.get_num_threads() == before
 
 
-def test_a_process_decides_anew_what_its_parent_has_decided(machine: Machine, environment: dict[str, str]) -> None:
+def test_child_processes_decide_again(machine: Machine, environment: dict[str, str]) -> None:
     machine.has(16)
     threads.use_threads(ACTING)
     known = {key: value for key, value in environment.items() if key.endswith(("_NUM_THREADS", "SPINCOUNT"))}
@@ -145,7 +132,7 @@ def test_a_process_decides_anew_what_its_parent_has_decided(machine: Machine, en
     assert environment["LP_NUM_THREADS"] == "1"
 
 
-def test_a_large_policy_gets_its_share_once_it_is_known(machine: Machine, environment: dict[str, str]) -> None:
+def test_large_policies_get_more_threads(machine: Machine, environment: dict[str, str]) -> None:
     machine.has(16)
     threads.use_threads(ACTING)
     before = torch.get_num_threads()
@@ -175,7 +162,7 @@ print(torch.get_num_threads(), os.environ.get("OPENBLAS_NUM_THREADS"), os.enviro
         ("jobs.processes", "process_pool", "", None),
     ],
 )
-def test_the_commands_follow_it_before_the_libraries_load(
+def test_commands_set_threads_before_libraries_load(
     module: str, begin: str, call: str, found: str | None, tmp_path: Path
 ) -> None:
     clean = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
