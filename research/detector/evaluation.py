@@ -88,7 +88,8 @@ def outcomes(localise: Localise, pictures: Pictures) -> tuple[Outcomes, Outcomes
     Args:
         pictures: both cameras' of each frame, one after the other.
     """
-    right, wrong = [np.zeros(0, OBJECT)], [np.zeros(0, OBJECT)]
+    right: list[Outcomes] = [np.zeros(0, OBJECT)]
+    wrong: list[Outcomes] = [np.zeros(0, OBJECT)]
     for start in range(0, len(pictures), len(MJCF_CAMERAS)):
         rows = pictures.rows(np.arange(start, start + len(MJCF_CAMERAS)))
         found, false = _frame_outcomes(rows, *localise(rows))

@@ -22,7 +22,7 @@ import pytest
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, protocol_of_log, read_rollouts
-from lerobot_memobench.jobs.threads import BESIDE
+from lerobot_memobench.jobs.threads import PROCESSES
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.learning import stages
@@ -696,7 +696,7 @@ def test_cells_that_run_at_once_share_the_cores(grid: Grid, tmp_path: Path, monk
     told = set[str]()
 
     def fake(words: list[str], output: IO[str], environment: dict[str, str]) -> tuple[int, Cost]:
-        told.add(environment[BESIDE])
+        told.add(environment[PROCESSES])
         return 0, Cost(1.0, 1.0)
 
     monkeypatch.setattr(stages, "_run", fake)

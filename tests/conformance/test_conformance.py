@@ -70,7 +70,7 @@ def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
 
     class ForgetsNothing(base):
         def reset(self) -> None:
-            """Keep the rows, of which there are always enough."""
+            """Keep all rows."""
             self.rows = list(getattr(self, "rows", []))
 
         def select_action(self, batch: Any, **_: Any) -> Any:
@@ -79,6 +79,12 @@ def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
             action = super().select_action(batch)
             self.rows += kept
             return action
+
+    class ForgetsEverything(base):
+        def select_action(self, batch: Any, **_: Any) -> Any:
+            for row in self.rows:
+                row.past.clear()
+            return super().select_action(batch)
 
     class MixesRows(base):
         def tokens(self, batch: Any) -> Any:
@@ -111,7 +117,7 @@ def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
             return super().select_action(batch)
 
     class ActsLate(base):
-        """What was planned in the prompt is carried out in the execution."""
+        """Actions planned in the prompt are executed afterwards."""
 
         def reset(self) -> None:
             super().reset()
@@ -142,6 +148,7 @@ def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
     compared = {"deterministic given a seed", "reset forgets", "rows are independent", history}
     return {
         "reset": (ForgetsNothing, {"reset forgets"}),
+        "memoryless": (ForgetsEverything, {"remembers"}),
         "mixed rows": (
             MixesRows,
             {"rows are independent", "finished rows change no other", "same history in training"},
@@ -156,7 +163,7 @@ def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
     }
 
 
-NAMES = ("reset", "mixed rows", "one queue", "per chunk", "prompt", "late", "finished", "noise", "needs")
+NAMES = ("reset", "memoryless", "mixed rows", "one queue", "per chunk", "prompt", "late", "finished", "noise", "needs")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -175,7 +182,7 @@ def test_flaws_fail_their_checks(name: str, exactly: bool, window: Subject) -> N
         window.policy.__class__ = base
     if not exactly:
         assert found == {check}
-    elif name in ("reset", "noise"):  # other checks cannot compare actions then
+    elif name in ("reset", "memoryless", "noise"):  # other checks fail too
         assert found >= expected
     else:
         assert found == expected
@@ -221,8 +228,8 @@ def test_errors_of_the_policy_fail_checks(window: Subject, monkeypatch: pytest.M
     result = run_check("rows are independent", Behaviour(window))
     assert result.outcome is Outcome.FAILED
     assert "no such row" in result.sentence
-    monkeypatch.setattr(window.policy, "select_action", lambda batch: batch["observation.nothing"])
-    with pytest.raises(MemobenchError, match=r"observation\.nothing"):
+    monkeypatch.setattr(window.policy, "select_action", lambda batch: batch["observation.missing"])
+    with pytest.raises(MemobenchError, match=r"observation\.missing"):
         Behaviour(window)
 
 

@@ -35,7 +35,7 @@ def test_finished_jobs_are_reported_first_and_not_run_again(jobs: list[Note], wo
     assert heard[0].seed == 2
     assert {news.seed: news.failure for news in heard} == {0: None, 1: "odd", 2: None, 3: "odd"}
     assert {(news.total, news.found) for news in heard} == {(4, 1)}
-    assert run_jobs(jobs, slurm=Slurm((), Needs(), Path("/nowhere"))), "nothing is submitted where all is finished"
+    assert run_jobs(jobs, slurm=Slurm((), Needs(), Path("/nowhere"))), "finished jobs are not submitted"
 
 
 def test_killed_workers_are_reported(jobs: list[Note]) -> None:

@@ -12,7 +12,16 @@ import pytest
 import torch
 
 from lerobot_memobench.jobs import threads
-from lerobot_memobench.jobs.threads import ACTING, BESIDE, LARGE, LEARNING, cores, limit_torch, sharing, torch_threads
+from lerobot_memobench.jobs.threads import (
+    ACTING,
+    LARGE,
+    LEARNING,
+    PROCESSES,
+    cores,
+    limit_torch,
+    sharing,
+    torch_threads,
+)
 
 
 class Machine:
@@ -66,7 +75,7 @@ def test_limits_of_outer_groups_count(machine: Machine, tmp_path: Path, monkeypa
     read = Path.read_text
     place = tmp_path / "job_1" / "step_0"
     place.mkdir(parents=True)
-    (place / "cpu.max").write_text("max 100000")
+    (place / "cpu.max").write_text("800000 100000")
     (tmp_path / "job_1" / "cpu.max").write_text("400000 100000")
     monkeypatch.setattr(Path, "read_text", lambda path: "0::/job_1/step_0\n" if path.name == "cgroup" else read(path))
     assert cores() == 4
@@ -137,49 +146,39 @@ def test_large_policies_get_more_threads(machine: Machine, environment: dict[str
     threads.use_threads(ACTING)
     before = torch.get_num_threads()
     try:
-        for parameters, beside, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
-            environment[BESIDE] = str(beside)
+        for parameters, processes, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
+            environment[PROCESSES] = str(processes)
             limit_torch(parameters)
             assert torch.get_num_threads() == found
     finally:
         torch.set_num_threads(before)
 
 
-ASK = """
-import sys
-from lerobot_memobench.{module} import {begin}
-{call}
+COMMAND = """
+from lerobot_memobench.cli.memobench import main
+main(["tasks", "--help"])
 import torch, os
-print(torch.get_num_threads(), os.environ.get("OPENBLAS_NUM_THREADS"), os.environ.get("LP_NUM_THREADS"))
+print(torch.get_num_threads(), os.environ["OPENBLAS_NUM_THREADS"], os.environ["LP_NUM_THREADS"])
+"""
+WORKER = """
+from lerobot_memobench.jobs.processes import process_pool
+from asked import ask
+if __name__ == "__main__":
+    with process_pool(1) as pool:
+        print(*pool.submit(ask).result())
+"""
+ASKED = """
+def ask():
+    import torch, os
+    return torch.get_num_threads(), os.environ["LP_NUM_THREADS"], os.environ["MEMOBENCH_WORKER"]
 """
 
 
-@pytest.mark.parametrize(
-    ("module", "begin", "call", "found"),
-    [
-        pytest.param("run.lerobot_commands", "load_command", 'load_command("eval")', "1 1 1", marks=pytest.mark.slow),
-        ("cli.memobench", "main", 'main(["tasks", "--help"])', "1 1 1"),
-        ("jobs.processes", "process_pool", "", None),
-    ],
-)
-def test_commands_set_threads_before_libraries_load(
-    module: str, begin: str, call: str, found: str | None, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("program", [COMMAND, WORKER], ids=["command", "worker"])
+def test_threads_are_set_before_libraries_load(program: str, tmp_path: Path) -> None:
     clean = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
-    code = ASK.format(module=module, begin=begin, call=call)
-    if found is None:  # a worker of a pool
-        (tmp_path / "asked.py").write_text(
-            "def ask():\n    import torch, os\n"
-            "    return torch.get_num_threads(), os.environ['LP_NUM_THREADS'], os.environ['MEMOBENCH_WORKER']\n"
-        )
-        code = (
-            f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom asked import ask\n"
-            "from lerobot_memobench.jobs.processes import process_pool\n"
-            "if __name__ == '__main__':\n    with process_pool(1) as pool:\n        print(*pool.submit(ask).result())\n"
-        )
-        found = "1 1 1"
-    (tmp_path / "here.py").write_text(code)
-    done = subprocess.run(
-        [sys.executable, str(tmp_path / "here.py")], env=clean, capture_output=True, text=True, check=True, timeout=300
-    )
-    assert done.stdout.splitlines()[-1] == found
+    (tmp_path / "asked.py").write_text(ASKED)
+    (tmp_path / "program.py").write_text(program)
+    words = [sys.executable, str(tmp_path / "program.py")]
+    done = subprocess.run(words, env=clean, capture_output=True, text=True, check=True, timeout=300)
+    assert done.stdout.splitlines()[-1] == "1 1 1"

@@ -98,7 +98,7 @@ def test_a_pooled_token_is_of_its_own_four() -> None:
     used = tokens.grad[0].abs().sum(dim=1).reshape(GRID, GRID) > 0
     assert used.nonzero().tolist() == [[2, 4], [2, 5], [3, 4], [3, 5]]
     parts = encoder.pool.weight.reshape(encoder.width, 4, encoder.width)
-    assert not torch.allclose(parts[:, 0], parts[:, 1])  # what is where in it is kept
+    assert not torch.allclose(parts[:, 0], parts[:, 1])  # positions in the square are kept
 
 
 def test_a_cell_of_the_pyramid_reads_its_own_token() -> None:
@@ -106,7 +106,7 @@ def test_a_cell_of_the_pyramid_reads_its_own_token() -> None:
     pyramid = FeaturePyramid(encoder).eval()
     for block in (module for module in pyramid.modules() if isinstance(module, ResidualBlock)):
         for convolution in (block.first, block.second):
-            torch.nn.init.zeros_(convolution.conv.weight)  # it would look at the cells beside, too
+            torch.nn.init.zeros_(convolution.conv.weight)  # it would read neighbouring cells
     tokens = torch.rand(1, GRID**2, encoder.width, requires_grad=True)
     _, maps = encoder.tokens_and_maps(torch.rand(1, 3, SIDE, SIDE))
     maps = [one.detach().requires_grad_() for one in maps]
@@ -117,7 +117,7 @@ def test_a_cell_of_the_pyramid_reads_its_own_token() -> None:
     assert tokens.grad[0].any(dim=1).nonzero().flatten().tolist() == [1 * GRID + 2]
     used = [None if one.grad is None else one.grad[0].any(dim=0).nonzero().tolist() for one in maps]
     assert used == [None, None, [[6, 11]], [[3, 5]]], "the maps of the last stages, each the cell that it lies in"
-    assert not torch.allclose(cells[0, 4, 8], cells[0, 4, 9]), "what is where in a token's square is told apart"
+    assert not torch.allclose(cells[0, 4, 8], cells[0, 4, 9]), "cells of one token differ"
 
 
 def test_uncertainties_are_of_the_image_and_of_metres() -> None:
@@ -141,7 +141,7 @@ def test_the_refinement_head_scores_peaks() -> None:
 
 
 def test_the_refinement_head_sees_what_is_around_a_peak() -> None:
-    """The score moves with its surroundings; it depends on its whole square and on nothing outside."""
+    """The score moves with its surroundings; it depends on its whole square and not on the rest."""
     torch.manual_seed(0)
     look, side = RefinementHead(6, 5, KINDS), 16
     maps = {"fine": torch.rand(side, side, 6), "close": torch.rand(2 * side, 2 * side, 5)}

@@ -117,12 +117,12 @@ def count(
 def test_two_cameras_detect_one_object(localizer: ObjectLocalizer) -> None:
     state = bent(simulation(BOWLS)).proprio().astype(float)
     x, y = float(state[0]), float(state[1])
-    here, beside = (x, y, 0.91), (x, y + 0.8 * SAME, 0.91)
-    assert count(localizer, state, ("agentview", "butter", 0.9, here), ("wrist", "butter", 0.8, beside)) == 1
+    here, near = (x, y, 0.91), (x, y + 0.8 * SAME, 0.91)
+    assert count(localizer, state, ("agentview", "butter", 0.9, here), ("wrist", "butter", 0.8, near)) == 1
     assert count(localizer, state, ("agentview", "butter", 0.9, here), ("wrist", "milk", 0.8, here)) == 2
-    twice = [("agentview", "butter", 0.9, here), ("agentview", "butter", 0.8, beside)]
+    twice = [("agentview", "butter", 0.9, here), ("agentview", "butter", 0.8, near)]
     assert APART < 0.8 * SAME
-    assert count(localizer, state, *twice) == 2, "two of a kind may stand side by side"
+    assert count(localizer, state, *twice) == 2, "two objects of a kind may be close"
     assert count(localizer, state, twice[0], ("agentview", "butter", 0.8, (x, y + 0.8 * APART, 0.91))) == 1
     far = ("agentview", "wooden_cabinet", 0.8, (x, y + 0.3, 0.91))
     assert count(localizer, state, ("wrist", "wooden_cabinet", 0.9, here), far) == 1, "a scene has one"

@@ -261,9 +261,9 @@ def write_header(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
 
 def test_weights_of_repositories_are_required_if_lerobot_would_use_random_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    with pytest.raises(MemobenchError, match=r"nobody/pi .*pi05 .*random"):
-        check_weights("nobody/pi", config("pi05"))
-    check_weights("nobody/act", config())  # LeRobot refuses it
+    with pytest.raises(MemobenchError, match=r"someone/pi .*pi05 .*random"):
+        check_weights("someone/pi", config("pi05"))
+    check_weights("someone/act", config())  # LeRobot refuses it
 
 
 def test_huge_configurations_allocate_nothing(act: Path, memory_policy: Path) -> None:

@@ -16,20 +16,17 @@ import pytest
 from safetensors import safe_open
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.lerobot_commands import call_lerobot
-from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.lerobots_trainer import trainer_in_this_process
 from tests.support.tiny_paligemma import shrink_paligemma, word_tokenizer
 
 TASK = "turn_on_the_stove_and_turn_it_off"
-LENGTH, PROMPT_LENGTH, SIDE = 12, 4, 256
 STATE, OBJECTS, PRIVILEGED = "observation.state", "observation.environment_state", "privileged.environment_state"
 PICTURES = {"observation.images.image", "observation.images.wrist_image"}
 INPUTS = {*PICTURES, STATE}
@@ -37,38 +34,8 @@ INPUTS = {*PICTURES, STATE}
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short demonstrations with pictures of the real size."""
-    return written(tmp_path_factory.mktemp("others"), pictures=True)
-
-
-def written(folder: Path, *, pictures: bool) -> Path:
-    """Two short demonstrations with every column that `memobench generate` writes."""
-    task = get_task(TASK)
-    rng = np.random.default_rng(3)
-    satisfied = np.zeros((LENGTH, len(task.checkpoints)), np.bool_)
-    satisfied[7:] = True
-    shade = np.linspace(0, 200, SIDE, dtype=np.uint8)
-    frames = np.stack([np.broadcast_to(np.roll(shade, 9 * t)[None, :, None], (SIDE, SIDE, 3)) for t in range(LENGTH)])
-
-    def demonstration(seed: int) -> Demonstration:
-        return Demonstration(
-            task=task,
-            seed=seed,
-            referent="fixed",
-            variant=0,
-            states=rng.normal(size=(LENGTH, 5)),
-            actions=rng.uniform(-1, 1, size=(LENGTH, 7)).astype(np.float32),
-            proprio=rng.normal(size=(LENGTH, 8)).astype(np.float32),
-            images=dict.fromkeys(("image", "wrist_image"), frames) if pictures else None,
-            objects=rng.normal(size=(LENGTH, SIZE)).astype(np.float32),
-            exec_start=PROMPT_LENGTH,
-            satisfied=satisfied,
-            success=True,
-            fixture_poses={},
-            scene_hash="abc",
-        )
-
-    return write_dataset((demonstration(seed) for seed in (10_000, 10_001)), folder / "demonstrations")
+    """Short demonstrations with pictures and objects."""
+    return write_streams(tmp_path_factory.mktemp("others") / "demonstrations", frames=9, task=TASK)
 
 
 def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] = INPUTS) -> dict[str, Any]:
@@ -144,7 +111,7 @@ def test_evaluation_has_the_inputs_of_training(
     policy: tuple[str, ...], pictures: bool, obs_type: str | None, seen: str, tmp_path: Path
 ) -> None:
     of = {"pixels_agent_pos": PICTURES, "environment_state_agent_pos": {OBJECTS}, "both": PICTURES | {OBJECTS}}
-    dataset = written(tmp_path, pictures=pictures)
+    dataset = write_streams(tmp_path / "demonstrations", pictures, frames=9, task=TASK)
     words = policy if obs_type is None else (*policy, f"obs_type={obs_type}")
     protocol = train_and_roll_out(dataset, tmp_path, *words, inputs={STATE} | of[seen])
     assert protocol["obs_type"] == seen
@@ -224,107 +191,72 @@ def test_smolvla(dataset: Path, tmp_path: Path, tiny_smolvlm: Path) -> None:
 MILK = "find_the_specific_milk_pointed_out_in_the_prompt_video_and_put_it_on_the_plate"
 PROMPTS = [147, 165]
 """Steps of the prompt in the episodes of seeds 7 and 8."""
-HORIZON = 20
-
-
-def flags(words: tuple[str, ...], **other: int) -> list[str]:
-    """Return words as LeRobot's flags, some with other values."""
-    pairs = dict(word.split("=", 1) for word in words) | {f"policy.{name}": str(value) for name, value in other.items()}
-    return [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in pairs.items()]
-
-
-class Watched:
-    """Record the plans of a policy in a rollout, and the actions of its environments."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, policy: type) -> None:
-        self.plans: list[tuple[list[int], list[int], np.ndarray]] = []
-        """For each plan: phase and step of every row's observation, actions (rows, chunk, 7)."""
-        self.applied: dict[int, list[np.ndarray]] = defaultdict(list)
-        """Seed -> actions of the execution."""
-        self._seen: Any = None
-        plan, select, step = policy.predict_action_chunk, policy.select_action, MemobenchEnv.step  # type: ignore[attr-defined]
-
-        def selected(this: Any, batch: Any, **options: Any) -> Any:
-            self._seen = batch
-            return select(this, batch, **options)
-
-        def planned(this: Any, batch: Any, **options: Any) -> Any:
-            actions = plan(this, batch, **options)
-            rows = [self._seen[f"observation.{name}"].flatten().int().tolist() for name in ("phase", "step")]
-            self.plans.append((rows[0], rows[1], actions.numpy().copy()))
-            return actions
-
-        def stepped(this: MemobenchEnv, action: Any) -> Any:
-            if this.episode.phase == EXECUTION:
-                self.applied[this.episode.seed].append(np.array(action))
-            return step(this, action)
-
-        monkeypatch.setattr(policy, "select_action", selected)
-        monkeypatch.setattr(policy, "predict_action_chunk", planned)
-        monkeypatch.setattr(MemobenchEnv, "step", stepped)
+HORIZON, INTERVAL = 20, 8
 
 
 @pytest.fixture
-def lerobot_eval(tmp_path: Path) -> Any:
-    """Run two episodes with prompts of different lengths in one batch, by LeRobot's command."""
+def observed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run two episodes in one batch by LeRobot's command; return each step's phases and steps of both rows."""
     import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
 
-    def run(*policy: str) -> None:
+    def run(policy: type, *flags: str) -> list[tuple[list[int], list[int]]]:
+        clocks, select = [], policy.select_action  # type: ignore[attr-defined]
+
+        def selected(this: Any, batch: Any, **options: Any) -> Any:
+            phases, steps = (batch[f"observation.{name}"].flatten().int().tolist() for name in ("phase", "step"))
+            clocks.append((phases, steps))
+            return select(this, batch, **options)
+
+        monkeypatch.setattr(policy, "select_action", selected)
         line = [
             *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}", "--env.render=fast"),
             *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
             *("--policy.device=cpu", f"--output_dir={tmp_path}", f"--env.log_dir={tmp_path}"),
         ]
-        assert call_lerobot("eval", [*line, *policy]) == 0
+        assert call_lerobot("eval", [*line, *flags]) == 0
+        return clocks
 
     return run
 
 
-def act() -> tuple[type, list[str], int]:
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    return ACTPolicy, flags(ACT, chunk_size=50, n_action_steps=50), 50
-
-
-def diffusion() -> tuple[type, list[str], int]:
+def test_first_plan_reads_the_first_execution_frame(
+    observed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The environments receive the planned actions and no earlier ones, whatever the lengths of the prompts."""
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
-    return DiffusionPolicy, flags(DIFFUSION, horizon=16, n_action_steps=8), 8
+    plans: list[np.ndarray] = []
+    applied: dict[int, list[np.ndarray]] = defaultdict(list)
+    plan, step = DiffusionPolicy.predict_action_chunk, MemobenchEnv.step
 
+    def planned(this: Any, batch: Any, **options: Any) -> Any:
+        plans.append(plan(this, batch, **options))
+        return plans[-1]
 
-@pytest.mark.parametrize("kind", [act, pytest.param(diffusion, marks=pytest.mark.slow)])
-def test_first_plan_reads_the_first_execution_frame(
-    kind: Any, lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    policy, words, interval = kind()
-    watched = Watched(monkeypatch, policy)
-    lerobot_eval(*words, "--env.prompt_in=reset")
+    def stepped(this: MemobenchEnv, action: Any) -> Any:
+        if this.episode.phase == EXECUTION:
+            applied[this.episode.seed].append(np.array(action))
+        return step(this, action)
+
+    monkeypatch.setattr(DiffusionPolicy, "predict_action_chunk", planned)
+    monkeypatch.setattr(MemobenchEnv, "step", stepped)
+    words = dict(word.split("=", 1) for word in DIFFUSION) | {"policy.horizon": "16", "policy.n_action_steps": "8"}
+    flags = [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in words.items()]
+    clocks = observed(DiffusionPolicy, *flags, "--env.prompt_in=reset")
     records = read_episodes(tmp_path)
     assert [(record["prompt_steps"], record["steps"]) for record in records] == [(steps, HORIZON) for steps in PROMPTS]
     assert [record["prompt_shown"] for record in records] == [True, True]
-    phases, steps, _ = watched.plans[0]
-    assert phases == [EXECUTION, EXECUTION]
-    assert steps == [0, 0], "the clock of the execution"
+    assert clocks[0] == ([EXECUTION] * 2, [0, 0])
     for row, seed in enumerate((7, 8)):
-        planned = np.concatenate([actions[row, :interval] for _, _, actions in watched.plans])[:HORIZON]
-        np.testing.assert_array_equal(np.stack(watched.applied[seed]), planned)
+        expected = np.concatenate([actions[row, :INTERVAL].numpy() for actions in plans])[:HORIZON]
+        np.testing.assert_array_equal(np.stack(applied[seed]), expected)
     assert protocol_of(tmp_path)["prompt_in"] == "reset"
 
 
-def test_prompts_are_observed_by_policies_that_read_them(
-    lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_prompts_are_observed_by_policies_that_read_them(observed: Any, tmp_path: Path) -> None:
     from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy
 
-    seen: list[list[int]] = []
-    select = MemobenchExpertPolicy.select_action
-
-    def selected(this: Any, batch: Any, **options: Any) -> Any:
-        seen.append(batch["observation.phase"].flatten().int().tolist())
-        return select(this, batch, **options)
-
-    monkeypatch.setattr(MemobenchExpertPolicy, "select_action", selected)
-    nothing_drawn = "--env.obs_type=environment_state_agent_pos"
-    lerobot_eval("--policy.type=memobench_expert", "--env.expert_action=true", "--env.horizon=2", nothing_drawn)
-    assert [sum(row == PROMPT for row in rows) for rows in zip(*seen, strict=True)] == PROMPTS
+    settings = ("--env.expert_action=true", "--env.horizon=2", "--env.obs_type=environment_state_agent_pos")
+    clocks = observed(MemobenchExpertPolicy, "--policy.type=memobench_expert", *settings)
+    assert [sum(phases[row] == PROMPT for phases, _ in clocks) for row in range(2)] == PROMPTS
     assert protocol_of(tmp_path)["prompt_in"] == "steps"

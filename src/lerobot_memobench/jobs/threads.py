@@ -30,7 +30,7 @@ SPINNING = {"GOMP_SPINCOUNT": "2000"}
 """How long idle threads of torch spin; the default is milliseconds."""
 CHOSEN_HERE = "MEMOBENCH_THREADS"
 """Variable with the names of the variables set here; child processes may change those, but not the user's."""
-BESIDE = "MEMOBENCH_PROCESSES"
+PROCESSES = "MEMOBENCH_PROCESSES"
 """Variable with the number of processes of this package that share the cores, including this one."""
 
 _CGROUPS = Path("/sys/fs/cgroup")
@@ -91,13 +91,13 @@ def is_users_own(variable: str) -> bool:
 
 def sharing_processes() -> int:
     """Return the number of processes that share the cores of this one, including itself."""
-    text = os.environ.get(BESIDE, "")
+    text = os.environ.get(PROCESSES, "")
     return int(text) if text.isdecimal() and int(text) else 1
 
 
 def sharing(processes: int, environment: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the environment of one of so many processes that share the cores."""
-    return {**(os.environ if environment is None else environment), BESIDE: str(processes)}
+    return {**(os.environ if environment is None else environment), PROCESSES: str(processes)}
 
 
 def _affinity() -> set[int]:

@@ -69,12 +69,12 @@ SMALLEST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0,
 """Setting -> its smallest value."""
 
 
-def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) -> int:
+def train(given: Arguments, line: Sequence[str], notify: Callable[[str], None]) -> int:
     """Run ``lerobot train``; return the exit status.
 
     Args:
         line: the words of the command, for the message that explains how to resume.
-        tell: called with notes.
+        notify: called with notes.
     """
     begun = time.time()
     prompt_frames, obs_type, given = take_training_options(resolve_recipe(resumed(given)))
@@ -82,10 +82,10 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
     arguments = read_arguments("train", given)
     if given.wants_help:
         return run_lerobot(arguments.for_parser)
-    arguments = complete_training(arguments, tell)
+    arguments = complete_training(arguments, notify)
     note, updates_left = note_on_resume(arguments)
     if note is not None:
-        tell(note)
+        notify(note)
     if not updates_left:
         return 0
     make_room_for_link(arguments)
@@ -104,7 +104,7 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
             return 0
         from lerobot_memobench.training.view import viewed
 
-        status = run_lerobot(viewed(arguments, prompt_frames, obs_type, tell).for_parser)
+        status = run_lerobot(viewed(arguments, prompt_frames, obs_type, notify).for_parser)
         if status and root and (Path(root) / INFO_FILE).is_file() and not arguments.has("dataset.episodes"):
             check_whole(Path(root))  # LeRobot's error does not name the damaged file
         return status
@@ -161,11 +161,11 @@ def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Ar
     return {"true": True, "false": False}.get(prompts), obs_type, replace(given, pairs=rest)
 
 
-def complete_training(arguments: LerobotArguments, tell: Callable[[str], None] = print) -> LerobotArguments:
+def complete_training(arguments: LerobotArguments, notify: Callable[[str], None] = print) -> LerobotArguments:
     """Check a training's arguments, and add the benchmark's defaults.
 
     Args:
-        tell: called with notes.
+        notify: called with notes.
 
     Raises:
         MemobenchError: no policy is named, a number is too small, the dataset or the checkpoint cannot be used, or a
@@ -194,7 +194,7 @@ def complete_training(arguments: LerobotArguments, tell: Callable[[str], None] =
         changed = list(differing(policy, trained, getattr(policy, "fixed_by_training", ())))
         if changed:
             was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
-            tell(f"note: '{path}' was trained with {was}; this training continues from its weights with {now}")
+            notify(f"note: '{path}' was trained with {was}; this training continues from its weights with {now}")
     check_observations(policy, env_config(arguments))
     steps = whole_number(arguments.get("steps"))
     if steps is not None and steps < SHORT_TRAINING and arguments.get("resume") != "true":

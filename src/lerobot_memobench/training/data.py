@@ -6,7 +6,6 @@ import copy
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from torch.utils.data import Dataset
 from lerobot_memobench.datasets.frames import TextEncoder, read_frame_table
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, read_info, without_pattern
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
-from lerobot_memobench.datasets.lookup import FrameLookup, read_recorded
+from lerobot_memobench.datasets.lookup import Encoded, FrameLookup, Remember, read_recorded
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
@@ -181,47 +180,43 @@ def open_lookup(
         MemobenchError: the dataset lacks a column, or features cannot be computed.
     """
     in_data = {known: given for given, known in (renamed or {}).items()}
-    stride = config.memory_stride
+    remember: Remember | None = None
     if isinstance(encoder, ImageTowerEncoder):
-        table, remember = read_frame_table(root), None
+        table = read_frame_table(root)
         if config.memory != "none":
             remembered = encoder.memory_input
             camera = in_data.get(remembered, remembered) or next(iter(cameras_of(read_info(root)["features"])), "")
-            how = {"progress": partial(logger.info, "feature cache: %d of %d episodes")}
-            remember = remembered_features(root, config, encoder, camera, **how).tokens
-        return FrameLookup(root, table, stride=stride, texts=text_encoder(config), remember=remember)
+            remember = remembered_features(root, config, encoder, camera).tokens
+        return FrameLookup(root, table, stride=config.memory_stride, texts=text_encoder(config), remember=remember)
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
     columns, table = read_recorded(root, names)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
+    encoded: dict[str, Encoded] = {}
     if isinstance(encoder, VisualTokenEncoder):
         cameras = dict.fromkeys(encoder.cameras or [*cameras_of(read_info(root)["features"]), encoder.memory_input])
-        names_in_data = {name: in_data.get(name, name) for name in cameras}
-        how = {"progress": partial(logger.info, "pictures encoded: %d of %d episodes")}
-        memory, present = picture_tokens(root, config, encoder, names_in_data, **how)
+        memory, present = picture_tokens(root, config, encoder, {name: in_data.get(name, name) for name in cameras})
         encoded = {encoded_key(camera): one.of_frames for camera, one in present.items()}
         remember = None if memory is None else memory.tokens
-        return FrameLookup(
-            root, table, stride=stride, texts=text_encoder(config), remember=remember, columns=columns, encoded=encoded
-        )
-    observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
-    encoded = {}
-    if isinstance(encoder, DetectionEncoder):
-        names_in_data = {name: in_data.get(name, name) for name in VIEWS}
-        how = {"progress": partial(logger.info, "objects detected in %d of %d episodes")}
-        found = detections(root, encoder.detect, names_in_data, in_data.get(OBS_STATE, OBS_STATE), **how)
-        slots = found.all_frames().sum(dim=1, dtype=torch.float32)
-        observed[DETECTED], encoded[DETECTED] = slots, lambda indices: slots[indices]
+    else:
+        observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
+        if isinstance(encoder, DetectionEncoder):
+            views = {name: in_data.get(name, name) for name in VIEWS}
+            found = detections(root, encoder.detect, views, in_data.get(OBS_STATE, OBS_STATE))
+            slots = found.all_frames().sum(dim=1, dtype=torch.float32)
+            observed[DETECTED], encoded[DETECTED] = slots, lambda indices: slots[indices]
 
-    def remember_objects(episode: int, slots: Sequence[int]) -> Tensor:
-        first = int(table.episodes[episode])
-        return encoder.remember(observed, [first + slot * stride for slot in slots])
+        def remember_objects(episode: int, slots: Sequence[int]) -> Tensor:
+            first = int(table.episodes[episode])
+            return encoder.remember(observed, [first + slot * config.memory_stride for slot in slots])
+
+        remember = remember_objects
 
     return FrameLookup(
         root,
         table,
-        stride=stride,
+        stride=config.memory_stride,
         texts=text_encoder(config),
-        remember=remember_objects,
+        remember=remember,
         columns=columns,
         encoded=encoded,
     )

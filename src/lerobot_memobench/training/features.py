@@ -159,7 +159,7 @@ def make_features(
         MemobenchError: ``root`` is not a dataset, lacks the camera, or the disk is full.
     """
     folder, table = features_folder(root, prefix, features, camera, stride), read_frame_table(root)
-    progress = progress or (lambda _done, _all: None)
+    progress = progress or functools.partial(logger.info, "feature cache: %d of %d episodes")
     counts = -(-np.diff(table.episodes) // stride)
     missing = [number for number in range(table.num_episodes) if not episode_file(folder, number).is_file()]
     progress(table.num_episodes - len(missing), table.num_episodes)

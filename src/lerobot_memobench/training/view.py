@@ -91,14 +91,14 @@ class Choice:
 
 
 def viewed(
-    arguments: LerobotArguments, prompt_frames: bool | None, obs_type: str | None, tell: Callable[[str], None]
+    arguments: LerobotArguments, prompt_frames: bool | None, obs_type: str | None, notify: Callable[[str], None]
 ) -> LerobotArguments:
     """Return the arguments for LeRobot's trainer, with a view of the dataset if it is needed.
 
     Args:
         prompt_frames: whether to train on prompt frames; None: if the policy reads prompts.
         obs_type: kind of observation; None: pictures if the dataset has them, else objects.
-        tell: called with the view's folder.
+        notify: called with the view's folder.
 
     Raises:
         MemobenchError: the dataset lacks the observations, or is streamed from the hub.
@@ -140,7 +140,7 @@ def viewed(
     folder = cache_folder() / "views" / f"{root.resolve().name}-{view_hash(root, choice)}"
     if not (folder / INFO_FILE).is_file():
         write_view(root, folder, choice)
-    tell(f"LeRobot's trainer reads {folder}: {described(choice)}")
+    notify(f"LeRobot's trainer reads {folder}: {described(choice)}")
     return completed.changed("dataset.root", folder).changed("dataset.repo_id", given.repo_id)
 
 

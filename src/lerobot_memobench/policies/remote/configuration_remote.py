@@ -44,7 +44,6 @@ class Dialect:
         keys: the server's name of each observation -> our name.
         image_size: side of sent images, pixels; None: as rendered, and the server resizes them.
         n_action_steps: default number of executed actions of each answer.
-        memory: the server remembers observations, so a restarted one needs the episode again.
         shared: all connections share one memory, so the server serves one environment at a time.
         buffers: the server receives every frame, in a message before each question (``add_buffer``).
         history: the server receives the whole demonstration prompt with the first question of the execution.
@@ -55,7 +54,6 @@ class Dialect:
     keys: Mapping[str, str] = field(default_factory=lambda: dict(OPENPI_KEYS))
     image_size: int | None = None
     n_action_steps: int = 5
-    memory: bool = False
     shared: bool = False
     buffers: bool = False
     history: bool = False
@@ -65,10 +63,10 @@ DIALECTS: dict[str, Dialect] = {
     # openpi: examples/libero/main.py, src/openpi/serving/websocket_policy_server.py, openpi-client 0.1.2
     "openpi": Dialect(image_size=224),
     # RoboMME/robomme_policy_learning: examples/robomme/{eval,utils}.py, serving/websocket_policy_server.py
-    "robomme": Dialect(port=8011, memory=True, shared=True, buffers=True),
+    "robomme": Dialect(port=8011, shared=True, buffers=True),
     # vla-eval 0.8: protocol/{messages,numpy_codec,image_codec}.py, connection.py, model_servers/{serve,predict}.py. Its
     # servers answer one action, and queue the rest of a chunk.
-    "vla_eval": Dialect(protocol=VLA_EVAL, keys=VLA_EVAL_KEYS, n_action_steps=1, memory=True, history=True),
+    "vla_eval": Dialect(protocol=VLA_EVAL, keys=VLA_EVAL_KEYS, n_action_steps=1, history=True),
 }
 
 BY_DIALECT: Any = None
@@ -91,13 +89,11 @@ class RemoteConfig(UntrainedConfig):
         image_size: side of sent images, padded to a square, pixels; 0: as rendered.
         mirror: send images mirrored left to right, for checkpoints trained on LIBERO's images as openpi rotates them.
         gripper: meaning of the last number of an action, one of `GRIPPERS`.
-        memory: whether the server remembers observations; the dialect's if left out.
         send_prompt: send the demonstration prompt; set to false to save time with a policy without memory.
         history_every: steps between sent frames of the prompt; default ``n_action_steps``, for ``vla_eval`` 1. A
             server that buffers frames (robomme) receives all of them.
-        connect_timeout: longest wait for the first connection, s.
+        connect_timeout: longest wait for a connection, s.
         timeout: longest wait for an answer, s; the first one may include compilation.
-        retry: longest wait for a server that disconnected, s.
         label: name of the checkpoint for the result card; servers do not send one.
     """
 
@@ -112,12 +108,10 @@ class RemoteConfig(UntrainedConfig):
     image_size: int | None = None
     mirror: bool = False
     gripper: str = LIBERO
-    memory: bool | None = None
     send_prompt: bool = True
     history_every: int | None = None
     connect_timeout: float = 60.0
     timeout: float = 300.0
-    retry: float = 300.0
     label: str | None = None
 
     def __post_init__(self) -> None:
@@ -132,7 +126,7 @@ class RemoteConfig(UntrainedConfig):
             number = getattr(self, name)
             if number is not None and number < 1:
                 raise MemobenchError(f"policy.{name} is {number}; expected a whole number from 1 on")
-        for name in ("connect_timeout", "timeout", "retry"):
+        for name in ("connect_timeout", "timeout"):
             if getattr(self, name) <= 0:
                 raise MemobenchError(f"policy.{name} is {getattr(self, name)}; expected seconds above 0")
         if self.image_size is not None and self.image_size < 0:
@@ -152,11 +146,6 @@ class RemoteConfig(UntrainedConfig):
     def spoken(self) -> Dialect:
         """The server's dialect."""
         return DIALECTS[self.dialect]
-
-    @property
-    def remembers(self) -> bool:
-        """Whether the server has a memory."""
-        return self.spoken.memory if self.memory is None else self.memory
 
     @property
     def needs_every_frame(self) -> bool:

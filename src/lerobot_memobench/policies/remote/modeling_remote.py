@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cached_property, partial
+from operator import call
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from lerobot_memobench.policies.remote.session import Row, Session
 from lerobot_memobench.protocol import ACTION_DIM, EXECUTION
 
 Action = NDArray[np.float32]
+MOST_THREADS = 256
+"""Largest number of servers that are asked at a time; threads are started as they are needed."""
 
 
 class Actor:
@@ -103,8 +106,6 @@ class RemotePolicy(UntrainedPolicy):
         super().__init__(config)
         self.config: RemoteConfig = config
         self._actors: list[Actor] = []
-        self._pool: ThreadPoolExecutor | None = None
-        self._threads = 0
 
     def reset(self) -> None:
         """Begin a rollout. Connections stay open; a missing server is an error before any simulation."""
@@ -138,14 +139,11 @@ class RemotePolicy(UntrainedPolicy):
         while len(self._actors) < rows:
             self._add_actor()
         jobs = [partial(actor.act, Row(batch, k)) for k, actor in enumerate(self._actors[:rows])]
-        return torch.from_numpy(np.stack([job() for job in jobs] if rows == 1 else self._together(jobs)))
+        return torch.from_numpy(np.stack([job() for job in jobs] if rows == 1 else [*self._pool.map(call, jobs)]))
 
-    def _together(self, jobs: list[partial[Action]]) -> list[Action]:
-        if self._pool is None or self._threads < len(jobs):
-            if self._pool is not None:
-                self._pool.shutdown()
-            self._pool, self._threads = ThreadPoolExecutor(len(jobs), "policy-server"), len(jobs)
-        return list(self._pool.map(lambda job: job(), jobs))
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(MOST_THREADS, "policy-server")
 
 
 def _size(batch: Mapping[str, Any]) -> int:

@@ -1,10 +1,10 @@
-"""One environment's session with its server, which continues an episode after the server restarts."""
+"""One environment's session with its server."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,20 +41,14 @@ HISTORY = {IMAGE: "video_history", WRIST_IMAGE: "wrist_video_history", STATE: "s
 """Our name of an observation -> vla-evaluation-harness's name of its frames in the demonstration prompt."""
 
 
-@dataclass(frozen=True)
-class Question:
-    """A message to a server; ``remembered``: whether a restarted server needs it again."""
-
-    content: dict[str, Any]
-    remembered: bool
-
-
 class Session:
     """A connection to one server on behalf of one environment.
 
+    An episode that loses its server is not continued, because a server that starts again has lost its memory and its
+    random state: the evaluation stops, and resuming it repeats the episode.
+
     Args:
-        config: the policy's.
-        address: of the server.
+        config: of the policy. address: of the server.
     """
 
     def __init__(self, config: RemoteConfig, address: str) -> None:
@@ -63,13 +57,8 @@ class Session:
         self._speaks_vla_eval = self._dialect.protocol == VLA_EVAL
         self._transport = (VlaEval if self._speaks_vla_eval else Websocket)(address, config.timeout)
         self._connected = False
-        self._fresh = False  # whether the connection has served no episode yet
-        self._begin_memory()
-
-    def _begin_memory(self) -> None:
-        self._sent: list[Question] = []  # messages for a restarted server
+        self._used = False  # whether the connection has served an episode
         self._frames: list[dict[str, Any]] = []  # by our names, not sent yet
-        self._opening: dict[str, Any] | None = None  # the message that begins an episode
         self._seen, self._execution_starts = 0, 0
 
     # --- for the policy ---
@@ -80,32 +69,20 @@ class Session:
         Raises:
             MemobenchError: the server does not answer within ``connect_timeout``.
         """
-        if self._connected:
-            return
-        metadata = self._until(
-            time.monotonic() + self.config.connect_timeout,
-            self._transport.open,
-            lambda reason: (
-                f"no policy server answered at {self.address} within {self.config.connect_timeout:g} s ({reason}); "
-                "start it, or give its address by host= and port="
-            ),
-            on_wait=lambda reason: logger.warning("waiting for the policy server at %s (%s)", self.address, reason),
-        )
-        self._connected = self._fresh = True
-        logger.info("connected with the policy server at %s: %s", self.address, short(metadata))
+        if not self._connected:
+            logger.info("connected with the policy server at %s: %s", self.address, short(self._open()))
+            self._connected = True
 
     def begin(self, row: Row) -> None:
-        """Start an episode; the server's memory, of the connection or its own, is cleared."""
+        """Start an episode on a connection of its own; the server's memory is cleared."""
         self.connect()
-        self._begin_memory()
+        if self._used:
+            self._open()
+        self._used, self._frames, self._seen, self._execution_starts = True, [], 0, 0
         if self._dialect.buffers:
-            self._opening = dict(RESET)
+            self._ask(dict(RESET))
         elif self._speaks_vla_eval:
-            self._opening = episode_start(row.get(TASK))
-        if not self._fresh:
-            self._again(time.monotonic() + self.config.retry)
-        elif self._opening is not None:
-            self._deliver(Question(self._opening, remembered=False))
+            self._ask(episode_start(row.get(TASK)))
 
     def watch(self, row: Row) -> None:
         """Keep a frame for the next question."""
@@ -121,20 +98,14 @@ class Session:
         """Return the server's actions for an observation, (H, 7).
 
         Raises:
-            MemobenchError: the server failed, took too long, did not return, or gave a wrong answer.
+            MemobenchError: the server failed, took too long, disconnected, or gave a wrong answer.
         """
         if self._dialect.buffers:
             self.watch(row)
-            self._deliver(self._buffer())
-        question = self._observation(row)
-        answer = self._deliver(Question(question, self.config.remembers and not self._dialect.buffers))
-        return read_actions(answer, self.config, self.address)
+            self._ask(self._buffer())
+        return read_actions(self._ask(self._observation(row)), self.config, self.address)
 
-    def close(self) -> None:
-        """Disconnect."""
-        self._transport.close()
-
-    # --- questions ---
+    # --- messages ---
 
     def _observation(self, row: Row) -> dict[str, Any]:
         found = {theirs: self._value(row, ours) for theirs, ours in self._keys.items()}
@@ -156,89 +127,43 @@ class Session:
             return png_map(image) if self._speaks_vla_eval else image
         return value
 
-    def _buffer(self) -> Question:
+    def _buffer(self) -> dict[str, Any]:
         frames, self._frames = self._frames, []
         self._seen += len(frames)
-        content = {
+        return {
             "images": np.stack([frame[IMAGE] for frame in frames])[:, None],
             "state": np.stack([frame[STATE] for frame in frames]),
             "add_buffer": True,
             "exec_start_idx": self._execution_starts,
         }
-        return Question(content, self.config.remembers)
 
-    # --- delivery ---
+    # --- the connection ---
 
-    def _deliver(self, question: Question) -> dict[str, Any]:
-        """Send a question until it is answered; after a new connection the episode is sent again."""
-        deadline = 0.0
+    def _open(self) -> dict[str, Any]:
+        """Connect; return the server's metadata."""
+        deadline, warned = time.monotonic() + self.config.connect_timeout, False
         while True:
             try:
-                answer = self._transport.ask(question.content)
-                break
+                return self._transport.open(max(deadline - time.monotonic(), 0.0))
             except ServerAway as error:
-                if deadline:  # it returned and failed at the same question
-                    time.sleep(PAUSE)
-                deadline = deadline or time.monotonic() + self.config.retry
-                logger.warning("the policy server at %s disconnected (%s); waiting for it", self.address, error)
-                self._again(deadline, str(error))
-        self._fresh = False
-        if question.remembered:
-            self._sent.append(question)
-        return answer
+                if time.monotonic() >= deadline:
+                    raise MemobenchError(
+                        f"no policy server answered at {self.address} within {self.config.connect_timeout:g} s "
+                        f"({error}); start it, or give its address by host= and port="
+                    ) from error
+                if not warned:
+                    logger.warning("waiting for the policy server at %s (%s)", self.address, error)
+                warned = True
+            time.sleep(min(PAUSE, max(0.0, deadline - time.monotonic())))
 
-    def _again(self, deadline: float, reason: str = "") -> None:
-        """Connect again and send the episode so far.
-
-        Raises:
-            MemobenchError: the server does not return before the deadline.
-        """
-        self._until(
-            deadline,
-            self._send_again,
-            lambda reason: (
-                f"the policy server at {self.address} disconnected and did not return within {self.config.retry:g} s "
-                f"({reason}); the running episode is not counted: start the server, and resume with resume=true "
-                "output_dir=<this run's folder>"
-            ),
-            reason=reason,
-        )
-
-    def _send_again(self, patience: float) -> None:
-        self._transport.open(patience)
-        if self._opening is not None:
-            self._transport.ask(self._opening)
-        for question in self._sent:
-            self._transport.ask(question.content)
-        self._fresh = not self._sent
-
-    def _until[Result](
-        self,
-        deadline: float,
-        attempt: Callable[[float], Result],
-        failed: Callable[[str], str],
-        *,
-        reason: str = "",
-        on_wait: Callable[[str], None] | None = None,
-    ) -> Result:
-        """Repeat an attempt until the server answers; return its result.
-
-        Args:
-            attempt: called with the seconds left. failed: makes the error message of the last reason.
-            on_wait: called with the first reason.
-        """
-        while True:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                raise MemobenchError(failed(reason))
-            try:
-                return attempt(left)
-            except ServerAway as error:
-                reason = str(error)
-            if on_wait is not None:
-                on_wait(reason)
-                on_wait = None
-            time.sleep(min(PAUSE, max(0.0, left)))
+    def _ask(self, content: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return self._transport.ask(content)
+        except ServerAway as error:
+            raise MemobenchError(
+                f"the policy server at {self.address} disconnected ({error}); its episode is not counted: start the "
+                "server, and resume the evaluation by resume=true output_dir=<this run's folder>"
+            ) from error
 
 
 def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) -> NDArray[np.float32]:

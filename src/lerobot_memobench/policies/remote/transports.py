@@ -6,12 +6,7 @@ frame. Messages are msgpack, which cannot carry code.
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
-from concurrent.futures import Future
-from contextlib import ExitStack, suppress
-from functools import partial
-from socket import SHUT_RDWR
+from contextlib import ExitStack
 from typing import Any
 
 import msgpack
@@ -31,40 +26,13 @@ LONGEST_LIST = 1 << 16
 
 
 class ServerAway(Exception):
-    """The server cannot be reached or disconnected; it may return."""
-
-
-def within[Result](seconds: float, call: Callable[[], Result]) -> Result:
-    """Return the result of a call that waits for a server.
-
-    Libraries limit the time of each read or write, but not the sum: reading one byte per second could take hours.
-
-    Raises:
-        TimeoutError: the call takes longer. Its thread ends with the process at the latest.
-    """
-    done: Future[Result] = Future()
-
-    def work() -> None:
-        try:
-            done.set_result(call())
-        except BaseException as error:
-            done.set_exception(error)
-
-    threading.Thread(target=work, daemon=True).start()
-    return done.result(seconds)
+    """The server cannot be reached, or disconnected."""
 
 
 def last_line(text: str) -> str:
     """Return the last line of a traceback, printable and short."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return reason(lines[-1]) if lines else "without a reason"
-
-
-def too_slow(address: str, timeout: float) -> MemobenchError:
-    """Return the error of a late answer."""
-    return MemobenchError(
-        f"the policy server at {address} took more than {timeout:g} s for an answer; give it longer by policy.timeout="
-    )
 
 
 def reason(error: BaseException | str) -> str:
@@ -95,8 +63,20 @@ class Websocket:
             MemobenchError: the server has another protocol.
         """
         self.close()
+        patience = max(patience, 1.0)
         try:
-            return self._bounded(patience := max(patience, 1.0), partial(self._connect, patience))
+            # No pings: openpi's servers do not answer them during inference, and the first one can take minutes.
+            connection = connect(
+                self.address,
+                compression=None,
+                max_size=LARGEST_ANSWER,
+                open_timeout=patience,
+                ping_interval=None,
+                close_timeout=1.0,
+                proxy=None,
+            )
+            self._connection = self._stack.enter_context(connection)
+            return self.greet(patience)
         except InvalidStatus as error:
             code = error.response.status_code
             if code >= 500:
@@ -108,30 +88,6 @@ class Websocket:
             raise self.foreign(reason(error)) from error
         except (OSError, TimeoutError, WebSocketException) as error:
             raise ServerAway(reason(error)) from error
-
-    def _bounded[Result](self, seconds: float, call: Callable[[], Result]) -> Result:
-        """Return the result of a call; disconnect if it takes longer than so many seconds."""
-        try:
-            return within(seconds, call)
-        except TimeoutError:
-            if self._connection is not None:
-                with suppress(OSError):
-                    self._connection.socket.shutdown(SHUT_RDWR)  # close() would wait for the write
-            raise
-
-    def _connect(self, patience: float) -> dict[str, Any]:
-        # No pings: openpi's servers do not answer them during inference, and the first one can take minutes.
-        connection = connect(
-            self.address,
-            compression=None,
-            max_size=LARGEST_ANSWER,
-            open_timeout=patience,
-            ping_interval=None,
-            close_timeout=1.0,
-            proxy=None,
-        )
-        self._connection = self._stack.enter_context(connection)
-        return self.greet(patience)
 
     def greet(self, patience: float) -> dict[str, Any]:
         """Return the server's metadata, within ``patience`` seconds."""
@@ -175,9 +131,12 @@ class Websocket:
             MemobenchError: the server failed, took too long, or has another protocol.
         """
         try:
-            answer = self._bounded(self.timeout, partial(self.exchange, question))
+            answer = self.exchange(question)
         except TimeoutError as error:
-            raise too_slow(self.address, self.timeout) from error
+            raise MemobenchError(
+                f"the policy server at {self.address} took more than {self.timeout:g} s for an answer; set a longer "
+                "policy.timeout="
+            ) from error
         except (ConnectionClosed, OSError) as error:
             raise ServerAway(reason(error)) from error
         if not isinstance(answer, dict):
