@@ -1,5 +1,5 @@
 """Train and test the object detector on the simulator's own labels: ``python -m research.detector train|test``.
 
-`labels` says what an image shows. `randomisation` adds distractors and moves things and the arm, `data` takes labelled
-images of an expert's episodes and keeps them. `training` has targets, losses and the run; `evaluation` measures.
+`labels` labels the objects of an image, `randomisation` adds distractors and moves objects and the arm, `data` makes
+labelled images of the expert's episodes, `training` trains, `evaluation` measures.
 """

@@ -1,4 +1,4 @@
-"""``python -m research.detector train|test``: a visual encoder and object detector of one's own."""
+"""``python -m research.detector train|test``: train and measure a visual encoder and object detector."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Workers = Annotated[int, typer.Option(min=1, help="Processes that make images.")
 
 
 def train(
-    out: Annotated[Path, typer.Option(help="Folder of images, checkpoint and weights; the same command goes on.")],
+    out: Annotated[Path, typer.Option(help="Folder of images, checkpoint and weights; the same command resumes.")],
     tasks: Tasks = None,
     episodes: Episodes = 8,
     frames: Frames = 22,
@@ -48,15 +48,15 @@ def train(
 
 
 def measure(
-    detector: Annotated[Path, typer.Argument(help="File that `train` has written, or package.")],
-    out: Annotated[Path, typer.Option(help="Folder of images, table, numbers and a drawing of detections.")],
+    detector: Annotated[Path, typer.Argument(help="A file of `train`, or package.")],
+    out: Annotated[Path, typer.Option(help="Folder of images, table and numbers.")],
     tasks: Tasks = None,
     episodes: Episodes = 1,
     frames: Frames = 8,
     first_seed: Annotated[int, typer.Option(help="First seed of the episodes, 40000 to 59999.")] = 40_000,
     workers: Workers = 1,
 ) -> None:
-    """Measure a detector by kind and camera, in images of seeds that nothing is trained on."""
+    """Measure a detector by kind and camera, in images of seeds that no training uses."""
     from research.detector.data import TESTED, DetectorData
     from research.detector.evaluation import evaluate
 

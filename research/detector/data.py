@@ -25,17 +25,18 @@ from research.detector.labels import PICTURE, Labeller, Rows, kinds
 from research.detector.randomisation import NEAR, DomainRandomisation, widened, with_distractors
 
 TRAINED, TESTED = SPLITS["detector"], SPLITS["detector test"]
-"""Seeds to train and to test on: scenes of nothing else. (The shipped detector was trained on 20,000 to 20,007.)"""
+"""Seeds of training and of tests; other parts of the benchmark do not use them. (The shipped detector was trained on
+20,000 to 20,007.)"""
 SCENES = ("as it was", "things elsewhere", "things elsewhere, arm above one")
 """Scenes of a frame: the expert's own; the same with objects put elsewhere and distractors; and with the arm too."""
 PER_FRAME = len(SCENES) * len(MJCF_CAMERAS)
 """Images of one frame."""
 TRIES = 4
-"""How often a frame is randomised anew because the arm penetrated something."""
+"""How often a frame is randomised again if the arm penetrates something."""
 EVERY = 3
-"""Steps between the expert's states of which some are chosen."""
+"""Steps between the expert's candidate states."""
 NEAR_WEIGHT = 3.0
-"""How much likelier a state with the hand near an object is chosen than another."""
+"""Relative probability of a state with the hand near an object."""
 STATE_STREAM, SCENE_STREAM = 5, 6
 """Of an episode's random numbers: perturbations and choice of states; randomisation of scenes."""
 KINDS_FILE = "kinds.json"
@@ -68,9 +69,9 @@ def _read(file: Path) -> Rows:
     try:
         rows = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise MemobenchError(f"{file} cannot be read as pictures ({error}); remove it and make it anew") from None
+        raise MemobenchError(f"{file} cannot be read as pictures ({error}); remove it and repeat the command") from None
     if rows.dtype != PICTURE:
-        raise MemobenchError(f"{file} holds no pictures of this version; remove it and make it anew")
+        raise MemobenchError(f"{file} holds no pictures of this version; remove it and repeat the command")
     return np.asarray(rows) if not len(rows) else rows
 
 
@@ -98,15 +99,15 @@ class DetectorData:
         seeds = range(self.first_seed, self.first_seed + self.episodes)
         if seeds[0] not in allowed or seeds[-1] not in allowed:
             raise MemobenchError(
-                f"the seeds {seeds[0]} to {seeds[-1]} were asked for; here they are {allowed[0]} to {allowed[-1]}, so "
-                "that nothing is tested on what it was trained on"
+                f"found seeds {seeds[0]} to {seeds[-1]}; expected {allowed[0]} to {allowed[-1]}, so that training and "
+                "test scenes differ"
             )
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / KINDS_FILE).is_file():
             write_file(folder / KINDS_FILE, json.dumps(kinds()))
-        advice = "remove the folder; pictures are made anew"
+        advice = "remove the folder and repeat the command"
         if tuple(read_json(folder / KINDS_FILE, list[str], advice)) != kinds():
-            raise MemobenchError(f"{folder} holds pictures of other kinds of things than there are now; {advice}")
+            raise MemobenchError(f"{folder} holds pictures of other kinds of objects than this version has; {advice}")
         jobs = [
             EpisodeImages(name, seed, folder / f"{task_index(name):02d}-{seed}-{self.frames}.npy", self.frames)
             for name in self.names

@@ -1,4 +1,4 @@
-"""Label images by the simulator: which objects they show, where those are, how many pixels show them, and the camera.
+"""Label images by the simulator: visible objects, their positions and numbers of pixels, and the camera.
 
 Places in an image are fractions of its side, x to the right and y down, from its upper left corner.
 """
@@ -20,7 +20,7 @@ from lerobot_memobench.sim.object_slots import ObjectSlots, Thing, classes, is_l
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 
 MASK = 32
-"""Side of the masks: each of their cells says what the image shows in its centre."""
+"""Side of the masks; a cell holds the kind in its centre."""
 
 THING = np.dtype(
     [
@@ -34,7 +34,7 @@ THING = np.dtype(
     ]
 )
 """Label of an object. ``pixels``: how many of the rendered image (256 x 256) show it. ``anchor``: their centre, a place
-in the image. ``position``: of its origin in the world, m. ``joint``: m or rad, NaN without one. ``lit``: it stands in a
+in the image. ``position``: of its origin in the world, m. ``joint``: m or rad, NaN without one. ``lit``: it is in a
 highlight. ``turn``: cosine and sine of twice the angle of its x axis in the image (a half turn changes its looks
 little); NaN of round objects."""
 
@@ -52,7 +52,7 @@ PICTURE = np.dtype(
         ("slope", "<f4"),
     ]
 )
-"""A labelled image. ``mask``: kind + 1 of what is shown, 0 for background. ``things``: the first ``count`` are visible.
+"""A labelled image. ``mask``: visible kind + 1, 0 for background. ``things``: the first ``count`` are visible.
 ``camera``: index into `MJCF_CAMERAS`. ``scene``: index into `data.SCENES`. ``hand``: position of the grip site, m.
 ``eye``, ``turned``, ``slope``: see `geometry.View`."""
 

@@ -1,7 +1,7 @@
 """Domain randomisation of a scene without stepping its physics: distractors, objects put elsewhere, the arm above one.
 
 A task has few objects, and most classes are in one or two tasks: distractors of all other classes wait where no camera
-looks. Poses are free: objects lie on their sides, float in the hand, stand in open drawers and on one another, and
+looks. Poses are free: objects lie on their sides, float in the hand, are in open drawers and on one another, and
 doors and drawers are half open. Objects that still overlap are taken out of sight.
 """
 
@@ -203,7 +203,7 @@ class DomainRandomisation:
 
 @cache
 def object_classes() -> tuple[str, ...]:
-    """Return the classes, variants told apart, of all objects of the catalogue."""
+    """Return the classes, including variants, of all objects of the catalogue."""
     return tuple(sorted({one for name in task_names(suite=None) for one in get_task(name).objects.values()}))
 
 

@@ -1,4 +1,4 @@
-"""Labelled images on disk: made once, the same again, and refused where they are not what they should be."""
+"""Labelled images on disk: made once, reproducible, and checked when they are read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Labels are what the picture shows: held against rays, against the camera's mathematics and against colours."""
+"""Labels, compared with rays, with the camera's geometry and with colours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Domain randomisation: nothing penetrates anything, objects are held, distractors wait, and the state comes back."""
+"""Domain randomisation: no penetration, held objects, distractors out of sight, and a restored state."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_nothing_stands_in_anything() -> None:
         places.append([sim.body_pose(name)[0] for name in objects])
         for pair in sim.data.contact.geom[sim.data.contact.dist < -MAX_CONTACT_DEPTH]:
             roots = {sim.model.body(sim.model.body_rootid[sim.model.geom_bodyid[geom]]).name for geom in pair}
-            assert roots - set(objects) == {"robot0_base"}  # only what is held is touched, by the fingers
+            assert roots - set(objects) == {"robot0_base"}  # the fingers touch the held object alone
     assert free > 10
     seen = np.array(places).reshape(-1, 3)
     assert (np.std(seen[seen[:, 2] < 2], axis=0)[:2] > 0.05).all()
@@ -120,6 +120,6 @@ def test_some_are_seen_when_they_are_put() -> None:
         crowd.set_state(widened(sim.state(), sim, crowd), sim.fixture_poses())
         if randomise.apply(reach=True):
             seen.append(labeller.take("agentview")["count"])
-    assert len(seen) > 6, "the arm reaches for what is there, not for what waits"
+    assert len(seen) > 6, "the arm reaches for visible objects, not for distractors out of sight"
     assert max(seen) >= 9
     assert min(seen) < 7

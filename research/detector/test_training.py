@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.detector import READINGS, Detector, detections
+from lerobot_memobench.perception.detector import Detector, detections
 from lerobot_memobench.perception.geometry import projected
 from lerobot_memobench.perception.visual_encoder import GRID, SIDE
 from lerobot_memobench.perception.weights import load_detector, save_detector
@@ -22,7 +22,8 @@ from research.detector.labels import Rows, images_of
 from research.detector.training import (
     CELLS,
     CHECKPOINT,
-    CURVE,
+    LOSSES,
+    TokenHeads,
     Training,
     augmented,
     loss,
@@ -51,7 +52,7 @@ FINE_SIDE = 2 * GRID
 
 
 class Stopped(Exception):
-    """What a killed process looks like from inside."""
+    """Imitate a kill of the process."""
 
 
 @pytest.fixture
@@ -67,13 +68,13 @@ def pictures(tmp_path: Path) -> Pictures:
         pytest.param(
             8,
             6 + 1 + 12,
-            id="from update 6, then one read whitens and what is trained last takes twelve",
+            id="first part",
             marks=pytest.mark.slow,
         ),
-        pytest.param(19, 1 + 8, id="from update 4 of what is trained last"),
+        pytest.param(19, 1 + 8, id="last part"),
     ],
 )
-def test_a_stopped_run_ends_as_another(
+def test_resume_repeats_a_whole_run(
     at: int,
     again: int,
     pictures: Pictures,
@@ -96,7 +97,7 @@ def test_a_stopped_run_ends_as_another(
     stopped = train(pictures, KINDS, tmp_path / "stopped", settings, encoder=small_encoder, save_every=2)
     assert len(asked) == at + again
     assert stopped.read_bytes() == whole.read_bytes()
-    assert (tmp_path / "stopped" / CURVE).is_file()
+    assert (tmp_path / "stopped" / LOSSES).is_file()
 
 
 def test_the_last_part_of_another_training_is_not_resumed(pictures: Pictures, tmp_path: Path) -> None:
@@ -108,28 +109,18 @@ def test_the_last_part_of_another_training_is_not_resumed(pictures: Pictures, tm
     assert again.read_bytes() == alone.read_bytes()
 
 
-@pytest.mark.slow
-def test_it_learns(pictures: Pictures, tmp_path: Path) -> None:
-    settings = Training(updates=60, batch=4, rate=1e-2)
-    train(pictures, KINDS, tmp_path / "run", settings, encoder=small_encoder, save_every=60)
-    points = torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)["points"]
-    assert len(points) == 6
-    assert all(points[-1][name] < 0.8 * points[0][name] for name in points[0]), points
-    assert {name.split()[0] for name in points[0]} == set(READINGS)
-
-
 def test_every_weight_learns(pictures: Pictures, tmp_path: Path) -> None:
     settings = Training(updates=3, batch=4)
     train(pictures, KINDS, tmp_path, settings, encoder=small_encoder)
-    learned = torch.load(tmp_path / CHECKPOINT, weights_only=True)["detector"]
+    learned = torch.load(tmp_path / CHECKPOINT, weights_only=True)["model"]
     torch.manual_seed(settings.seed)
-    first = dict(Detector(small_encoder(), KINDS).named_parameters())
+    first = dict(TokenHeads(Detector(small_encoder(), KINDS)).named_parameters())
     same = {name for name, value in first.items() if torch.equal(value, learned[name])}
-    assert {name.rpartition(".")[0] for name in same} == TRAINED_LAST, "only what is trained last"
+    assert {name.rpartition(".")[0].removeprefix("detector.") for name in same} == TRAINED_LAST
 
 
 @pytest.mark.slow
-def test_what_is_trained_last_fits_and_changes_nothing_else(
+def test_last_part_fits_and_changes_no_other_weight(
     pictures: Pictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "UNCERTAINTY_RATE", 0.1)
@@ -143,7 +134,7 @@ def test_what_is_trained_last_fits_and_changes_nothing_else(
     rows = pictures.rows(np.arange(12))
     wanted = targets(rows, len(KINDS), *CELLS["fine"])
     with torch.inference_mode():
-        learned = detector.detect(images_of(rows))
+        learned = detector(images_of(rows))
         uncertainty, score = learned.uncertainty, learned.score
         assert uncertainty is not None
         assert score is not None
@@ -156,13 +147,13 @@ def test_what_is_trained_last_fits_and_changes_nothing_else(
     monkeypatch.undo()
     train_last(detector, pictures, Training(updates=150, batch=12))
     with torch.inference_mode():
-        learned = detector.detect(images_of(rows))
+        learned = detector(images_of(rows))
         score = learned.score
         assert score is not None
         for same in np.linspace(-6, 0, 13):
             other = replace(learned, score=lambda *cells, same=same: torch.full_like(score(*cells), same))
             assert 5 * score_loss(learned, wanted) < score_loss(other, wanted), (
-                "right detections are told from wrong ones"
+                "scores separate right detections from wrong ones"
             )
 
 
@@ -182,17 +173,16 @@ def test_changed_pictures_stay_pictures() -> None:
 
 
 @torch.no_grad()
-def test_heads_of_whitened_tokens_predict_the_same(tmp_path: Path) -> None:
-    detector, images = (
-        Detector(trained_a_little(small_encoder()), ("cork", "cap")).eval(),
-        torch.rand(24, 3, SIDE, SIDE),
-    )
+def test_whitening_keeps_the_output(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    detector = Detector(trained_a_little(small_encoder()), ("cork", "cap")).eval()
+    images = torch.rand(24, 3, SIDE, SIDE)
     before = all_outputs(detector(images))
     whiten(detector, images.split(10))
     assert all(map(partial(torch.allclose, atol=1e-3), all_outputs(detector(images)), before))
     save_detector(detector, tmp_path / "detector.safetensors")
     kept = load_detector(tmp_path / "detector.safetensors")
-    for encoder, rounding in ((detector.encoder, 1e-3), (kept.encoder, 0.1)):  # the file's bfloat16 moves means
+    for encoder, rounding in ((detector.encoder, 1e-3), (kept.encoder, 0.2)):  # the file's bfloat16 moves means
         for tokens in (encoder(images), encoder.pooled(encoder(images))):
             rows = tokens.flatten(0, 1)
             variances = torch.linalg.eigvalsh(torch.cov(rows.T))
@@ -218,7 +208,7 @@ def test_detections_undo_targets(cells: tuple[int, int, int]) -> None:
         assert ((things["lit"] > 0.5) == true["lit"]).all()
 
 
-def test_losses_are_of_what_is_wrong() -> None:
+def test_each_loss_measures_its_own_part() -> None:
     wanted = targets(synthetic(3), SQUARES, GRID)
     right = perfect(wanted, FINE_SIDE)
     assert all(float(value) < 1e-3 for value in loss(right, wanted).values())
@@ -233,7 +223,7 @@ def test_losses_are_of_what_is_wrong() -> None:
         assert [other for other, value in costs.items() if float(value) > 0.5] == [name]
 
 
-def test_what_hardly_shows_is_no_target() -> None:
+def test_objects_of_few_pixels_are_no_targets() -> None:
     rows = synthetic(1)
     rows["things"]["pixels"][:, 1] = 3
     wanted = targets(rows, SQUARES, GRID)
@@ -250,7 +240,7 @@ def test_of_two_of_a_kind_in_a_cell_the_nearer_is_the_target() -> None:
 
 
 def test_an_origin_outside_the_image_is_predicted() -> None:
-    """Of a stove or a pan the wrist's camera shows a corner; what was asked for then had once ended at a quarter."""
+    """The wrist camera shows only a corner of a stove or a pan."""
     rows = synthetic(4)
     rows["things"]["position"][:, :, 0] += 0.8 * 2 * HEIGHT * SLOPE
     for row, things in zip(rows, detections(perfect(targets(rows, SQUARES, GRID), FINE_SIDE)), strict=True):

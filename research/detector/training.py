@@ -1,7 +1,8 @@
-"""Train the detector on labelled images: targets and losses, whitening of its tokens, a run that resumes.
+"""Train the detector on labelled images, in a run that can be resumed.
 
-First all is trained but expected errors and refinement head. Then tokens are whitened and batch normalisation is
-folded; the heads' output stays the same. Last, those two are trained alone.
+The first part trains everything except expected errors and refinement head. Linear heads on the 64 tokens and on the 16
+pooled ones are trained too, so that these hold the objects; they are not saved. Then the tokens are whitened and batch
+normalisation is folded, which leaves the output as it was. The last part trains expected errors and refinement head.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy, logsigmoid
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import draft_of
+from lerobot_memobench.io import draft_of, write_file
 from lerobot_memobench.perception.detector import (
     COARSE,
     FINE,
@@ -35,13 +36,12 @@ from lerobot_memobench.perception.geometry import projected
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
-from lerobot_memobench.training.speed import keep_freed_memory, quicker_in_bfloat16
-from research.detector.curve import draw_curve, mean_of
+from lerobot_memobench.training.loop import keep_freed_memory, quicker_in_bfloat16
 from research.detector.data import Pictures
 from research.detector.labels import MASK, Rows, images_of
 
 CHECKPOINT, LAST_CHECKPOINT = "training.pt", "last.pt"
-WEIGHTS, CURVE = "detector.safetensors", "training_curve.png"
+WEIGHTS, LOSSES = "detector.safetensors", "losses.csv"
 LOSS_WEIGHTS = {"heat": 1.0, "place": 2.0, "rest": 1.0, "mask": 0.5}
 READING_WEIGHTS = {"fine": 1.0, "tokens": 0.5, "pooled": 0.5}
 CELLS = {"fine": (FINER * GRID, FINE // FINER, 1), "tokens": (GRID, FINE, COARSE), "pooled": (POOLED, FINE, COARSE)}
@@ -50,7 +50,7 @@ GAIN, SHIFT, NOISE = 0.12, 0.06, 0.02
 """Augmentation: largest gain of each colour and shift of all, and the noise's standard deviation at most, as shares of
 white. Videos change colours and edges about as much."""
 WINDOW = 10
-"""Updates that one point of the curve is the mean of."""
+"""Updates over which a row of `LOSSES` averages."""
 WHITENING_IMAGES = 2048
 """Images over which tokens are whitened."""
 LAST_UPDATES, UNCERTAINTY_RATE, SCORE_RATE = 5000, 1e-2, 3e-3
@@ -109,7 +109,7 @@ def train(
     """Train a detector, or resume the training that a folder holds; return the file of its weights.
 
     Args:
-        pictures: labelled images. kinds: names of the objects in them. folder: gets checkpoint, curve and weights.
+        pictures: labelled images. kinds: names of the objects in them. folder: for checkpoint, losses and weights.
         encoder: makes the one to train. save_every: updates between two checkpoints.
 
     Raises:
@@ -118,7 +118,7 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     keep_freed_memory()
     torch.manual_seed(settings.seed)
-    trainer = _Trainer(Detector(encoder(), kinds), settings, len(pictures))
+    trainer = _Trainer(TokenHeads(Detector(encoder(), kinds)), settings, len(pictures))
     trainer.restore(folder / CHECKPOINT)
     if trainer.update < settings.updates:
         (folder / LAST_CHECKPOINT).unlink(missing_ok=True)  # of another detector, whose checkpoint was taken away
@@ -129,19 +129,40 @@ def train(
         if progress is not None and trainer.update % WINDOW == 0:
             newest = ", ".join(f"{name} {value:.3f}" for name, value in trainer.points[-1].items())
             progress(trainer.update, settings.updates, newest)
-    whiten(trainer.detector, _sample(pictures))
-    train_last(trainer.detector, pictures, settings, progress, folder / LAST_CHECKPOINT, save_every)
-    save_detector(trainer.detector, folder / WEIGHTS)
+    detector = trainer.model.detector
+    whiten(detector, _sample(pictures))
+    train_last(detector, pictures, settings, progress, folder / LAST_CHECKPOINT, save_every)
+    save_detector(detector, folder / WEIGHTS)
     return folder / WEIGHTS
 
 
-class _Trainer:
-    """A detector with its optimizer, its place in the run and its curve."""
+class TokenHeads(nn.Module):
+    """A detector in training, with heads on its encoder's tokens and pooled tokens."""
 
-    def __init__(self, detector: Detector, settings: Training, pictures: int) -> None:
-        self.detector, self._settings, self._pictures = detector, settings, pictures
-        detector.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._optimizer = torch.optim.AdamW(detector.parameters(), settings.rate, weight_decay=settings.decay)
+    def __init__(self, detector: Detector) -> None:
+        super().__init__()
+        width, kinds = detector.encoder.width, len(detector.kinds)
+        self.detector = detector
+        self.token_heads, self.pooled_heads = Heads(width, kinds, GRID), Heads(width, kinds, POOLED)
+
+    def forward(self, images: Tensor) -> dict[str, DetectorOutput]:
+        """Return the output of each of `CELLS` for images (N, 3, SIDE, SIDE) in [0, 1]."""
+        encoder = self.detector.encoder
+        tokens, maps = encoder.tokens_and_maps(images)
+        return {
+            "fine": self.detector.read(self.detector.fpn(tokens, maps), maps),
+            "tokens": self.token_heads(tokens),
+            "pooled": self.pooled_heads(encoder.pooled(tokens)),
+        }
+
+
+class _Trainer:
+    """A detector with its optimizer, its place in the run and its losses."""
+
+    def __init__(self, model: TokenHeads, settings: Training, pictures: int) -> None:
+        self.model, self._settings, self._pictures = model, settings, pictures
+        model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._optimizer = torch.optim.AdamW(model.parameters(), settings.rate, weight_decay=settings.decay)
         self._schedule = torch.optim.lr_scheduler.OneCycleLR(
             self._optimizer, settings.rate, settings.updates, pct_start=0.05, cycle_momentum=False
         )
@@ -151,32 +172,33 @@ class _Trainer:
 
     def step(self, rows: Rows) -> None:
         """Make one update."""
-        self.detector.train()
+        self.model.train()
         images = augmented(images_of(rows), _generator(self._settings, self.update))
         with torch.autocast("cpu", torch.bfloat16, enabled=quicker_in_bfloat16()):
-            outputs = self.detector(images)
+            outputs = self.model(images)
         losses, weighted = {}, []
         for reading, cells in CELLS.items():
-            for name, value in loss(outputs[reading], targets(rows, len(self.detector.kinds), *cells)).items():
+            for name, value in loss(outputs[reading], targets(rows, len(self.model.detector.kinds), *cells)).items():
                 losses[f"{reading} {name}"] = value.detach()
                 weighted.append(READING_WEIGHTS[reading] * LOSS_WEIGHTS[name] * value)
         self._optimizer.zero_grad()
         torch.stack(weighted).sum().backward()
-        torch.nn.utils.clip_grad_norm_(self.detector.parameters(), CLIP)
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), CLIP)
         self._optimizer.step()
         self._schedule.step()
         self.update += 1
         self._window.append(losses)
         if len(self._window) == WINDOW:
-            self.points.append(mean_of(self._window))
+            means = {name: float(torch.stack([one[name] for one in self._window]).mean()) for name in losses}
+            self.points.append(means)
             self._window = []
 
     def save(self, folder: Path) -> None:
-        """Write checkpoint and curve."""
+        """Write checkpoint and losses."""
         state = {
             "settings": asdict(self._settings),
             "pictures": self._pictures,
-            "detector": self.detector.state_dict(),
+            "model": self.model.state_dict(),
             "optimizer": self._optimizer.state_dict(),
             "schedule": self._schedule.state_dict(),
             "update": self.update,
@@ -185,7 +207,11 @@ class _Trainer:
         }
         with draft_of(folder / CHECKPOINT) as draft:
             torch.save(state, draft)
-        draw_curve(self.points, WINDOW, folder / CURVE)
+        rows = [",".join(["update", *(self.points[0] if self.points else ())])]
+        rows += [
+            f"{WINDOW * (place + 1)},{','.join(map(str, means.values()))}" for place, means in enumerate(self.points)
+        ]
+        write_file(folder / LOSSES, "\n".join(rows) + "\n")
 
     def restore(self, path: Path) -> None:
         """Resume from a checkpoint, if there is one."""
@@ -197,7 +223,7 @@ class _Trainer:
                 f"{path} is of a training with {state['settings']} and {state['pictures']} pictures, and now "
                 f"{asdict(self._settings)} and {self._pictures} are asked for; ask for the same, or take another folder"
             )
-        self.detector.load_state_dict(state["detector"])
+        self.model.load_state_dict(state["model"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._schedule.load_state_dict(state["schedule"])
         self.update, self.points, self._window = state["update"], state["points"], state["window"]
@@ -297,7 +323,7 @@ class Targets:
         heat: (N, kinds, cells, cells), 1 at an object's visible centre, falling off around it.
         cells: (n, 4) coarse cells near objects: image, kind, row, column.
         geometry: (n, len(GEOMETRY)) of those, NaN where there is none. weights: (n,).
-        mask: (N, cells, cells), kind + 1 of what is shown, 0 for background.
+        mask: (N, cells, cells), visible kind + 1, 0 for background.
     """
 
     heat: Tensor
@@ -420,7 +446,7 @@ def score_loss(output: DetectorOutput, wanted: Targets) -> Tensor:
 
 @torch.no_grad()
 def whiten(detector: Detector, batches: Iterable[Tensor]) -> None:
-    """Fold a detector and whiten its tokens, and pooled ones, over images; the heads' output stays as it was.
+    """Fold a detector and whiten its encoder's tokens and pooled tokens over images; its output stays as it was.
 
     Half of all variance of the encoder's own tokens is in one direction, and their mean is as large as what varies;
     gradients learn that first. Of whitened tokens, a memory of where the butter was put is read after 50 updates
@@ -443,12 +469,9 @@ def whiten(detector: Detector, batches: Iterable[Tensor]) -> None:
     _undo_in_input(encoder.pool, torch.block_diag(*[whitening] * near), mean.repeat(near))
     coarsest = detector.fpn.levels[0]
     assert isinstance(coarsest, PyramidLevel)
-    for linear in (*_linears(detector.token_heads), coarsest.upsample):
-        _undo_in_input(linear, whitening, mean)
+    _undo_in_input(coarsest.upsample, whitening, mean)
     mean, whitening = pooled.whitening()
     _whiten_output(encoder.pool, whitening, mean)
-    for linear in _linears(detector.pooled_heads):
-        _undo_in_input(linear, whitening, mean)
 
 
 class _Moments:
@@ -473,17 +496,13 @@ class _Moments:
         return mean, ((directions / sizes) @ directions.T).bfloat16().double()
 
 
-def _linears(heads: Heads) -> list[nn.Linear]:
-    return [module for module in heads.modules() if isinstance(module, nn.Linear)]
-
-
 def _whiten_output(linear: nn.Linear, whitening: Tensor, mean: Tensor) -> None:
-    """Have A (y - m) come out of a Linear in place of y."""
+    """Change a Linear so that it returns A (y - m) instead of y."""
     _set(linear, whitening @ linear.weight.double(), whitening @ (linear.bias.double() - mean))
 
 
 def _undo_in_input(linear: nn.Linear, whitening: Tensor, mean: Tensor) -> None:
-    """Have a Linear, given A (x - m), return what it returned of x."""
+    """Change a Linear so that its output for A (x - m) is the former output for x."""
     weight = linear.weight.double()
     _set(linear, weight @ torch.linalg.inv(whitening), linear.bias.double() + weight @ mean)
 

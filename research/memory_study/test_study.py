@@ -21,7 +21,7 @@ import pytest
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, protocol_of_log, read_rollouts
-from lerobot_memobench.jobs.threads import BESIDE
+from lerobot_memobench.jobs.threads import PROCESSES
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.memory_study import cells, commands
 from research.memory_study import tables as tables_module
@@ -199,7 +199,7 @@ def test_killed_cells_resume(frames: Cell, monkeypatch: pytest.MonkeyPatch) -> N
     ran, dies = list[str](), [True] * 3
 
     def fake(words: list[str], output: IO[str], environment: dict[str, str]) -> tuple[int, Cost]:
-        assert environment[BESIDE] == "2"
+        assert environment[PROCESSES] == "2"
         ran.append(words[1] if words[1] == "eval" else "resume" if "resume=true" in words else "train")
         print("…", file=output)
         if dies and dies.pop():

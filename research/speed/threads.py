@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from lerobot_memobench.jobs.threads import BESIDE, CHOSEN_HERE, ONE_EACH, SPINNING, TORCH, cores, physical_cores
+from lerobot_memobench.jobs.threads import CHOSEN_HERE, ONE_EACH, PROCESSES, SPINNING, TORCH, cores, physical_cores
 
 
 def by_the_libraries() -> dict[str, str]:
@@ -18,5 +18,5 @@ def by_the_libraries() -> dict[str, str]:
 def by_the_rule() -> dict[str, str]:
     """Return this process's environment by the rule for one that acts, without a user's own values."""
     chosen = {**ONE_EACH, **SPINNING, TORCH: "1"}
-    kept = {key: value for key, value in os.environ.items() if key not in (BESIDE, "OMP_WAIT_POLICY")}
+    kept = {key: value for key, value in os.environ.items() if key not in (PROCESSES, "OMP_WAIT_POLICY")}
     return {**kept, **chosen, CHOSEN_HERE: ",".join(chosen)}

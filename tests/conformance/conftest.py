@@ -39,7 +39,7 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="session")
 def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Streams of object state, without pictures: nothing is encoded or decoded."""
+    """Streams of object state, without pictures, so that no video is decoded."""
     from lerobot_memobench.conformance.streams import write_streams
 
     return write_streams(tmp_path_factory.mktemp("streams") / "objects", pictures=False, frames=13)

@@ -1,4 +1,4 @@
-"""Who gets how many threads, on machines of 2 and 16 cores that are made up."""
+"""Numbers of threads on imitated machines of 2 and 16 cores."""
 
 from __future__ import annotations
 
@@ -12,18 +12,27 @@ import pytest
 import torch
 
 from lerobot_memobench.jobs import threads
-from lerobot_memobench.jobs.threads import ACTING, BESIDE, LARGE, LEARNING, cores, limit_torch, sharing, torch_threads
+from lerobot_memobench.jobs.threads import (
+    ACTING,
+    LARGE,
+    LEARNING,
+    PROCESSES,
+    cores,
+    limit_torch,
+    sharing,
+    torch_threads,
+)
 
 
 class Machine:
-    """So many processors for this process, of cores with so many hyperthreads each, in a container with a quota."""
+    """Imitate processors, hyperthreads and a container's quota."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         self.monkeypatch, self.folder = monkeypatch, tmp_path
 
     def has(self, processors: int, quota: str | None = None, hyperthreads: int = 1) -> None:
         self.monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(processors)))
-        self.monkeypatch.setattr(os, "cpu_count", lambda: 128)  # the machine's, which is not this process's
+        self.monkeypatch.setattr(os, "cpu_count", lambda: 128)
         self.monkeypatch.setattr(threads, "_CGROUPS", self.folder)
         (self.folder / "cpu.max").write_text(quota or "max 100000\n")
         read = Path.read_text
@@ -61,28 +70,15 @@ def test_cores_are_those_of_this_process(machine: Machine) -> None:
     assert cores() == 2
 
 
-def test_a_limit_above_counts_as_well(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_of_outer_groups_count(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     machine.has(16)
     read = Path.read_text
     place = tmp_path / "job_1" / "step_0"
     place.mkdir(parents=True)
-    (place / "cpu.max").write_text("max 100000")
+    (place / "cpu.max").write_text("800000 100000")
     (tmp_path / "job_1" / "cpu.max").write_text("400000 100000")
     monkeypatch.setattr(Path, "read_text", lambda path: "0::/job_1/step_0\n" if path.name == "cgroup" else read(path))
     assert cores() == 4
-
-
-def test_control_groups_of_the_first_version(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    machine.has(16)
-    read = Path.read_text
-    (tmp_path / "cpu" / "docker").mkdir(parents=True)
-    for name, value in (("quota", "200000"), ("period", "100000")):
-        (tmp_path / "cpu" / "docker" / f"cpu.cfs_{name}_us").write_text(value)
-    text = "4:memory:/docker\n2:cpu,cpuacct:/docker\n0::/\n"
-    monkeypatch.setattr(Path, "read_text", lambda path: text if path.name == "cgroup" else read(path))
-    assert cores() == 2
-    (tmp_path / "cpu" / "docker" / "cpu.cfs_quota_us").write_text("-1")
-    assert cores() == 16
 
 
 @pytest.mark.parametrize(
@@ -101,7 +97,7 @@ def test_control_groups_of_the_first_version(machine: Machine, tmp_path: Path, m
         (2, LEARNING, False, 2, 1),
     ],
 )
-def test_the_rule(
+def test_threads_of_each_role(
     machine: Machine, processors: int, role: str, large: bool, processes: int, threads_of_torch: int | None
 ) -> None:
     machine.has(processors)
@@ -117,7 +113,7 @@ def test_hyperthreads_and_quotas(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("role", [ACTING, LEARNING])
-def test_a_users_own_setting_wins(machine: Machine, environment: dict[str, str], role: str) -> None:
+def test_variables_of_the_user_stay(machine: Machine, environment: dict[str, str], role: str) -> None:
     machine.has(16)
     own = {"OMP_NUM_THREADS": "7", "LP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "3", "OMP_WAIT_POLICY": "active"}
     environment.update(own)
@@ -130,7 +126,7 @@ def test_a_users_own_setting_wins(machine: Machine, environment: dict[str, str],
     assert torch.get_num_threads() == before
 
 
-def test_a_process_decides_anew_what_its_parent_has_decided(machine: Machine, environment: dict[str, str]) -> None:
+def test_child_processes_decide_again(machine: Machine, environment: dict[str, str]) -> None:
     machine.has(16)
     threads.use_threads(ACTING)
     known = {key: value for key, value in environment.items() if key.endswith(("_NUM_THREADS", "SPINCOUNT"))}
@@ -145,54 +141,44 @@ def test_a_process_decides_anew_what_its_parent_has_decided(machine: Machine, en
     assert environment["LP_NUM_THREADS"] == "1"
 
 
-def test_a_large_policy_gets_its_share_once_it_is_known(machine: Machine, environment: dict[str, str]) -> None:
+def test_large_policies_get_more_threads(machine: Machine, environment: dict[str, str]) -> None:
     machine.has(16)
     threads.use_threads(ACTING)
     before = torch.get_num_threads()
     try:
-        for parameters, beside, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
-            environment[BESIDE] = str(beside)
+        for parameters, processes, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
+            environment[PROCESSES] = str(processes)
             limit_torch(parameters)
             assert torch.get_num_threads() == found
     finally:
         torch.set_num_threads(before)
 
 
-ASK = """
-import sys
-from lerobot_memobench.{module} import {begin}
-{call}
+COMMAND = """
+from lerobot_memobench.cli.memobench import main
+main(["tasks", "--help"])
 import torch, os
-print(torch.get_num_threads(), os.environ.get("OPENBLAS_NUM_THREADS"), os.environ.get("LP_NUM_THREADS"))
+print(torch.get_num_threads(), os.environ["OPENBLAS_NUM_THREADS"], os.environ["LP_NUM_THREADS"])
+"""
+WORKER = """
+from lerobot_memobench.jobs.processes import process_pool
+from asked import ask
+if __name__ == "__main__":
+    with process_pool(1) as pool:
+        print(*pool.submit(ask).result())
+"""
+ASKED = """
+def ask():
+    import torch, os
+    return torch.get_num_threads(), os.environ["LP_NUM_THREADS"], os.environ["MEMOBENCH_WORKER"]
 """
 
 
-@pytest.mark.parametrize(
-    ("module", "begin", "call", "found"),
-    [
-        pytest.param("run.lerobot_commands", "load_command", 'load_command("eval")', "1 1 1", marks=pytest.mark.slow),
-        ("cli.memobench", "main", 'main(["tasks", "--help"])', "1 1 1"),
-        ("jobs.processes", "process_pool", "", None),
-    ],
-)
-def test_the_commands_follow_it_before_the_libraries_load(
-    module: str, begin: str, call: str, found: str | None, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("program", [COMMAND, WORKER], ids=["command", "worker"])
+def test_threads_are_set_before_libraries_load(program: str, tmp_path: Path) -> None:
     clean = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
-    code = ASK.format(module=module, begin=begin, call=call)
-    if found is None:  # a worker of a pool
-        (tmp_path / "asked.py").write_text(
-            "def ask():\n    import torch, os\n"
-            "    return torch.get_num_threads(), os.environ['LP_NUM_THREADS'], os.environ['MEMOBENCH_WORKER']\n"
-        )
-        code = (
-            f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom asked import ask\n"
-            "from lerobot_memobench.jobs.processes import process_pool\n"
-            "if __name__ == '__main__':\n    with process_pool(1) as pool:\n        print(*pool.submit(ask).result())\n"
-        )
-        found = "1 1 1"
-    (tmp_path / "here.py").write_text(code)
-    done = subprocess.run(
-        [sys.executable, str(tmp_path / "here.py")], env=clean, capture_output=True, text=True, check=True, timeout=300
-    )
-    assert done.stdout.splitlines()[-1] == found
+    (tmp_path / "asked.py").write_text(ASKED)
+    (tmp_path / "program.py").write_text(program)
+    words = [sys.executable, str(tmp_path / "program.py")]
+    done = subprocess.run(words, env=clean, capture_output=True, text=True, check=True, timeout=300)
+    assert done.stdout.splitlines()[-1] == "1 1 1"

@@ -32,7 +32,7 @@ def localizer() -> ObjectLocalizer:
 
 
 def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
-    """Return what is found by detector that say of a picture what its labels do."""
+    """Return the detections of a detector without errors."""
     things = row["things"][: row["count"]]
     detected = np.zeros(len(things), DETECTION)
     place, depth = projected(things["position"].astype(float), row)
@@ -114,15 +114,15 @@ def count(
     return len(objects_of(localizer.slots(detected, views_of(state))))
 
 
-def test_one_thing_is_seen_by_both_cameras(localizer: ObjectLocalizer) -> None:
+def test_two_cameras_detect_one_object(localizer: ObjectLocalizer) -> None:
     state = bent(simulation(BOWLS)).proprio().astype(float)
     x, y = float(state[0]), float(state[1])
-    here, beside = (x, y, 0.91), (x, y + 0.8 * SAME, 0.91)
-    assert count(localizer, state, ("agentview", "butter", 0.9, here), ("wrist", "butter", 0.8, beside)) == 1
+    here, near = (x, y, 0.91), (x, y + 0.8 * SAME, 0.91)
+    assert count(localizer, state, ("agentview", "butter", 0.9, here), ("wrist", "butter", 0.8, near)) == 1
     assert count(localizer, state, ("agentview", "butter", 0.9, here), ("wrist", "milk", 0.8, here)) == 2
-    twice = [("agentview", "butter", 0.9, here), ("agentview", "butter", 0.8, beside)]
+    twice = [("agentview", "butter", 0.9, here), ("agentview", "butter", 0.8, near)]
     assert APART < 0.8 * SAME
-    assert count(localizer, state, *twice) == 2, "two of a kind may stand side by side"
+    assert count(localizer, state, *twice) == 2, "two objects of a kind may be close"
     assert count(localizer, state, twice[0], ("agentview", "butter", 0.8, (x, y + 0.8 * APART, 0.91))) == 1
     far = ("agentview", "wooden_cabinet", 0.8, (x, y + 0.3, 0.91))
     assert count(localizer, state, ("wrist", "wooden_cabinet", 0.9, here), far) == 1, "a scene has one"
@@ -158,7 +158,7 @@ def test_a_detection_of_one_camera_needs_a_higher_score(localizer: ObjectLocaliz
     assert count(localizer, state, (camera, "butter", MIN_SCORE_ALONE + 0.01, here)) == 1
 
 
-def test_a_kind_that_this_version_does_not_know_is_passed_over() -> None:
+def test_unknown_kinds_are_ignored() -> None:
     foreign = ObjectLocalizer(Detector(small_encoder(), ("teapot", "butter")))
     detected = np.zeros(1, DETECTION)
     detected["score"], detected["place"], detected["depth"], detected["turn"] = 1.0, 0.5, 1.0, (1.0, 0.0)
@@ -168,7 +168,7 @@ def test_a_kind_that_this_version_does_not_know_is_passed_over() -> None:
         assert len(objects_of(foreign.slots({"agentview": detected, "wrist": detected[:0]}, views_of(state)))) == count
 
 
-def test_the_package_detector_detects_what_stands_on_a_table() -> None:
+def test_package_detector_detects_objects_on_the_table() -> None:
     sim = simulation(BOWLS)
     pictures = {name: torch.from_numpy(sim.render(name)).permute(2, 0, 1)[None] / 255 for name in MJCF_CAMERAS}
     found = ObjectLocalizer(load_detector(PACKAGE))(pictures, torch.from_numpy(sim.proprio())[None])

@@ -1,4 +1,4 @@
-"""Starting from a checkpoint with other settings: the saved preprocessor follows them, or refuses."""
+"""Training that begins with a checkpoint: its processors follow new settings or refuse them; adapters."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import WordTokenizerProcessorStep
+from lerobot_memobench.training.average import begin_average
 from lerobot_memobench.training.configuration import read_training
 from lerobot_memobench.training.loop import train
-from tests.support.small_policy import train_with
+from tests.support.small_policy import batch_of, made_for_training, train_with
 
 
 @pytest.fixture(scope="module")
 def start(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Checkpoint of one step without alignment, read with eight frames of memory."""
+    """A checkpoint of one step, without alignment."""
     out = tmp_path_factory.mktemp("start") / "run"
     config = TrainPipelineConfig(
         dataset=DatasetConfig(repo_id="memobench/synthetic", root=str(dataset_root)),
@@ -42,7 +43,7 @@ def start(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def go_on(dataset_root: Path, start: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Train one step from the checkpoint; give its batch and the checkpoint it wrote."""
+    """Train one step from the checkpoint; return its batch and the new checkpoint."""
     seen: list[dict[str, Any]] = []
     forward = MemobenchMemPolicy.forward
 
@@ -64,29 +65,29 @@ def go_on(dataset_root: Path, start: Path, tmp_path: Path, monkeypatch: pytest.M
     return run
 
 
-def test_oracle_memory_is_spelled_out_behind_the_checkpoints_own_words(go_on: Any, start: Path) -> None:
+def test_oracle_memory_extends_the_vocabulary(go_on: Any, start: Path) -> None:
     before = _tokenizer(start)
     batch, written = go_on("oracle_memory=true")
     after = _tokenizer(written)
     assert after.vocabulary[: len(before.vocabulary)] == before.vocabulary
-    said = [
+    texts = [
         after.input_tokenizer.decode(row[mask])
         for row, mask in zip(
             batch["observation.language.tokens"], batch["observation.language.attention_mask"].bool(), strict=True
         )
     ]
-    assert all("memory" in text and "action" in text and "<unk>" not in text for text in said), said
+    assert all("memory" in text and "action" in text and "<unk>" not in text for text in texts), texts
 
 
 def _tokenizer(checkpoint: Path) -> WordTokenizerProcessorStep:
     config = PreTrainedConfig.from_pretrained(checkpoint)
-    MemobenchMemPolicy.from_pretrained(checkpoint, config=config)  # for evaluation: nothing is followed
+    MemobenchMemPolicy.from_pretrained(checkpoint, config=config)
     pipeline, _ = make_pre_post_processors(config, pretrained_path=str(checkpoint))
     return next(step for step in pipeline.steps if isinstance(step, WordTokenizerProcessorStep))
 
 
 def _edited(start: Path, target: Path, **changed: dict[str, Any] | None) -> Path:
-    """Copy of a checkpoint whose named preprocessor steps have other settings, or are not there (None)."""
+    """Copy a checkpoint with other settings of preprocessor steps, or without them (None)."""
     shutil.copytree(start, target)
     path = target / "policy_preprocessor.json"
     saved = json.loads(path.read_text())
@@ -97,16 +98,40 @@ def _edited(start: Path, target: Path, **changed: dict[str, Any] | None) -> Path
     return target
 
 
-def test_what_saved_steps_cannot_follow_is_refused(go_on: Any, start: Path, tmp_path: Path) -> None:
+def test_settings_that_saved_processors_lack_are_refused(go_on: Any, start: Path, tmp_path: Path) -> None:
     old = _edited(start, tmp_path / "old", memobench_oracle_memory=None)  # as checkpoints were before
-    with pytest.raises(MemobenchError, match=r"oracle_memory=True would have no effect.*base_weights"):
+    with pytest.raises(MemobenchError, match="oracle_memory"):
         go_on("oracle_memory=true", source=old)
     relative = _edited(start, tmp_path / "relative", relative_actions_processor={"enabled": True})
-    with pytest.raises(MemobenchError, match=r"use_relative_actions=False would have no effect"):
+    with pytest.raises(MemobenchError, match="use_relative_actions"):
         go_on(source=relative)
-    with pytest.raises(MemobenchError, match=r"tokenizer_name=google/some would have no effect.*words"):
+    with pytest.raises(MemobenchError, match="tokenizer_name"):
         go_on("tokenizer_name=google/some", source=start)
     config = PreTrainedConfig.from_pretrained(start)
     config.oracle_memory = True  # type: ignore[attr-defined]
-    with pytest.raises(MemobenchError, match=r"oracle_memory=True would have no effect"):
+    with pytest.raises(MemobenchError, match="oracle_memory"):
         MemobenchMemPolicy.from_pretrained(start, config=config)
+
+
+@pytest.mark.parametrize("memory_fusion", ["modulation", "none"])
+def test_adapters_leave_memory_and_heads_whole(dataset_root: Path, memory_fusion: str, tmp_path: Path) -> None:
+    align = "none" if memory_fusion == "none" else "contrastive"
+    policy, before, _, dataset = made_for_training(dataset_root, memory_fusion=memory_fusion, align=align)
+    names = policy._get_default_peft_targets()["modules_to_save"]  # peft compares the ends of names
+    modules = [name for name, _ in policy.named_modules() if any(name.endswith(end) for end in names)]
+    whole = {name for name, _ in policy.named_parameters() if any(name.startswith(f"{one}.") for one in modules)}
+    own = {f"model.{name}" for name in policy.model.memory_parameters()}
+    assert whole == own | {name for name, _ in policy.named_parameters() if name.startswith("alignment.")}
+    assert bool(whole) == (memory_fusion != "none")
+    if memory_fusion == "none":
+        return
+    policy.save_pretrained(tmp_path)
+    policy.config.pretrained_path = str(tmp_path)
+    wrapped = policy.wrap_with_peft(peft_cli_overrides={"method_type": "LORA", "r": 2})
+    wrapped.train()
+    loss, _ = wrapped.forward(before(batch_of(dataset, [3, 50, 80])))
+    loss.backward()
+    learning = {name for name, p in wrapped.named_parameters() if p.requires_grad and p.grad is not None}
+    for part in ("lora_A", "model.memory.", "modulator", "memory_to_expert", "alignment"):
+        assert any(part in name for name in learning), part
+    assert begin_average(policy) is None

@@ -74,7 +74,7 @@ def test_a_row_of_a_batch_has_the_history_that_it_has_alone() -> None:
 
 
 def test_a_call_is_a_step_to_it() -> None:
-    """Who asks for one chunk per call gives it another history than training did; docs/guides/evaluate.md says so."""
+    """With one call per chunk the history differs from training (docs/guides/evaluate.md)."""
     policy = pi05(use_visual_memory=True)
     policy.reset()
     for time in (0, PLAN):

@@ -1,7 +1,7 @@
-"""LeRobot's own policies here: a step of training on our columns, a rollout in our environment, without a rename map.
+"""LeRobot's policies: an update on our datasets and a rollout in our environment, without a rename map.
 
-Weights are random and small. Where LeRobot fixes sizes or fetches a tokenizer inside the policy, the test hands it
-smaller numbers or a tokenizer built here; the policy's own code runs unchanged.
+Policies are small. If LeRobot fixes sizes or downloads a tokenizer, the test replaces those; the policy's code is
+LeRobot's.
 """
 
 from __future__ import annotations
@@ -16,19 +16,17 @@ import pytest
 from safetensors import safe_open
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.lerobot_commands import call_lerobot
-from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.lerobots_trainer import trainer_in_this_process
 from tests.support.tiny_paligemma import shrink_paligemma, word_tokenizer
 
 TASK = "turn_on_the_stove_and_turn_it_off"
-LENGTH, PROMPT_LENGTH, SIDE = 12, 4, 256
 STATE, OBJECTS, PRIVILEGED = "observation.state", "observation.environment_state", "privileged.environment_state"
 PICTURES = {"observation.images.image", "observation.images.wrist_image"}
 INPUTS = {*PICTURES, STATE}
@@ -36,51 +34,19 @@ INPUTS = {*PICTURES, STATE}
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short demonstrations with pictures of the real size."""
-    return written(tmp_path_factory.mktemp("others"), pictures=True)
-
-
-def written(folder: Path, *, pictures: bool) -> Path:
-    """Two short demonstrations with every column that `memobench generate` writes."""
-    task = get_task(TASK)
-    rng = np.random.default_rng(3)
-    satisfied = np.zeros((LENGTH, len(task.checkpoints)), np.bool_)
-    satisfied[7:] = True
-    shade = np.linspace(0, 200, SIDE, dtype=np.uint8)
-    frames = np.stack([np.broadcast_to(np.roll(shade, 9 * t)[None, :, None], (SIDE, SIDE, 3)) for t in range(LENGTH)])
-
-    def demonstration(seed: int) -> Demonstration:
-        return Demonstration(
-            task=task,
-            seed=seed,
-            referent="fixed",
-            variant=0,
-            states=rng.normal(size=(LENGTH, 5)),
-            actions=rng.uniform(-1, 1, size=(LENGTH, 7)).astype(np.float32),
-            proprio=rng.normal(size=(LENGTH, 8)).astype(np.float32),
-            images=dict.fromkeys(("image", "wrist_image"), frames) if pictures else None,
-            objects=rng.normal(size=(LENGTH, SIZE)).astype(np.float32),
-            exec_start=PROMPT_LENGTH,
-            satisfied=satisfied,
-            success=True,
-            fixture_poses={},
-            scene_hash="abc",
-        )
-
-    return write_dataset((demonstration(seed) for seed in (10_000, 10_001)), folder / "demonstrations")
+    """Short demonstrations with pictures and objects."""
+    return write_streams(tmp_path_factory.mktemp("others") / "demonstrations", frames=9, task=TASK)
 
 
 def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] = INPUTS) -> dict[str, Any]:
-    """One optimiser step and one short episode by the two commands, as a user types them; check what came of both.
-
-    Returns the protocol of the evaluation.
-    """
+    """Train one step and run one short episode by the two commands; return the protocol of the evaluation."""
     run = out / "train"
     words = ("steps=1", "batch_size=2", "num_workers=0", "save_freq=1", f"output_dir={run}", "policy.device=cpu")
-    assert main(["train", *policy, f"dataset={dataset}", *words]) == 0
+    with trainer_in_this_process():
+        assert main(["train", *policy, f"dataset={dataset}", *words]) == 0
     checkpoint = run / "checkpoints" / "last" / "pretrained_model"
     config = json.loads((checkpoint / "config.json").read_text())
-    # Phase, checkpoints, subgoals and language rows are for memory policies: to others they are no input.
+    # Phase, checkpoints, subgoals and language are inputs of memory policies alone.
     assert set(config["input_features"]) == inputs
     assert set(config["output_features"]) == {"action"}
     assert normalised(checkpoint, inputs) <= {*inputs, "action"} | KEPT
@@ -91,7 +57,7 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
     return protocol_of(out / "eval")
 
 
-#: LeRobot keeps the statistics of every column in the file; which of them are used its step's features say.
+#: LeRobot saves the statistics of every column; the features of its step list the ones in use.
 KEPT = {
     *PICTURES,
     OBJECTS,
@@ -106,7 +72,7 @@ KEPT = {
 
 
 def normalised(checkpoint: Path, inputs: set[str]) -> set[str]:
-    """Return the columns whose statistics a checkpoint's preprocessor holds; check which of them it applies."""
+    """Return the columns whose statistics a checkpoint's preprocessor holds; check the ones in use."""
     steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
     (step,) = [step for step in steps if step.get("registry_name") == "normalizer_processor"]
     assert set(step["config"]["features"]) == {*inputs, "action"}
@@ -127,30 +93,31 @@ DIFFUSION = (
 
 
 @pytest.mark.parametrize("policy", [pytest.param(ACT, marks=pytest.mark.slow), DIFFUSION], ids=["act", "diffusion"])
-def test_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> None:
+def test_policies_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> None:
     assert train_and_roll_out(dataset, tmp_path, *policy)["obs_type"] == "pixels_agent_pos"
 
 
 @pytest.mark.parametrize("policy", [ACT, pytest.param(DIFFUSION, marks=pytest.mark.slow)], ids=["act", "diffusion"])
 @pytest.mark.parametrize(
-    ("pictures", "said", "seen"),
+    ("pictures", "obs_type", "seen"),
     [
-        (False, None, "environment_state_agent_pos"),
-        (True, None, "pixels_agent_pos"),
-        (True, "environment_state_agent_pos", "environment_state_agent_pos"),
         (True, "both", "both"),
+        pytest.param(False, None, "environment_state_agent_pos", marks=pytest.mark.slow),
+        pytest.param(True, None, "pixels_agent_pos", marks=pytest.mark.slow),
+        pytest.param(True, "environment_state_agent_pos", "environment_state_agent_pos", marks=pytest.mark.slow),
     ],
 )
-def test_on_objects(policy: tuple[str, ...], pictures: bool, said: str | None, seen: str, tmp_path: Path) -> None:
-    """The evaluation shows what the policy was trained on, without a word."""
+def test_evaluation_has_the_inputs_of_training(
+    policy: tuple[str, ...], pictures: bool, obs_type: str | None, seen: str, tmp_path: Path
+) -> None:
     of = {"pixels_agent_pos": PICTURES, "environment_state_agent_pos": {OBJECTS}, "both": PICTURES | {OBJECTS}}
-    dataset = written(tmp_path, pictures=pictures)
-    words = policy if said is None else (*policy, f"obs_type={said}")
+    dataset = write_streams(tmp_path / "demonstrations", pictures, frames=9, task=TASK)
+    words = policy if obs_type is None else (*policy, f"obs_type={obs_type}")
     protocol = train_and_roll_out(dataset, tmp_path, *words, inputs={STATE} | of[seen])
     assert protocol["obs_type"] == seen
 
 
-# --- those with a language model ---
+# --- policies with a language model ---
 
 
 @pytest.fixture
@@ -172,7 +139,7 @@ def test_pi(dataset: Path, tmp_path: Path, name: str) -> None:
 
 @pytest.fixture
 def tiny_smolvlm(tmp_path: Path) -> Path:
-    """A folder with a small SmolVLM's configuration and processor, as the hub has the large one's."""
+    """A folder with the configuration and processor of a small SmolVLM."""
     from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
 
     folder = tmp_path / "smolvlm"
@@ -224,107 +191,72 @@ def test_smolvla(dataset: Path, tmp_path: Path, tiny_smolvlm: Path) -> None:
 MILK = "find_the_specific_milk_pointed_out_in_the_prompt_video_and_put_it_on_the_plate"
 PROMPTS = [147, 165]
 """Steps of the prompt in the episodes of seeds 7 and 8."""
-HORIZON = 20
-
-
-def flags(words: tuple[str, ...], **other: int) -> list[str]:
-    """Return our words as LeRobot's flags, with other values."""
-    pairs = dict(word.split("=", 1) for word in words) | {f"policy.{name}": str(value) for name, value in other.items()}
-    return [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in pairs.items()]
-
-
-class Watched:
-    """What a policy plans in a rollout, and what its environments are given."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, policy: type) -> None:
-        self.plans: list[tuple[list[int], list[int], np.ndarray]] = []
-        """Of each plan: phase and step of every row's observation, actions (rows, chunk, 7)."""
-        self.applied: dict[int, list[np.ndarray]] = defaultdict(list)
-        """Seed -> actions that were given in the execution."""
-        self._seen: Any = None
-        plan, select, step = policy.predict_action_chunk, policy.select_action, MemobenchEnv.step  # type: ignore[attr-defined]
-
-        def selected(this: Any, batch: Any, **options: Any) -> Any:
-            self._seen = batch
-            return select(this, batch, **options)
-
-        def planned(this: Any, batch: Any, **options: Any) -> Any:
-            actions = plan(this, batch, **options)
-            rows = [self._seen[f"observation.{name}"].flatten().int().tolist() for name in ("phase", "step")]
-            self.plans.append((rows[0], rows[1], actions.numpy().copy()))
-            return actions
-
-        def stepped(this: MemobenchEnv, action: Any) -> Any:
-            if this.episode.phase == EXECUTION:
-                self.applied[this.episode.seed].append(np.array(action))
-            return step(this, action)
-
-        monkeypatch.setattr(policy, "select_action", selected)
-        monkeypatch.setattr(policy, "predict_action_chunk", planned)
-        monkeypatch.setattr(MemobenchEnv, "step", stepped)
+HORIZON, INTERVAL = 20, 8
 
 
 @pytest.fixture
-def lerobot_eval(tmp_path: Path) -> Any:
-    """Two episodes with prompts of different lengths in one batch, by LeRobot's own command."""
+def observed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run two episodes in one batch by LeRobot's command; return each step's phases and steps of both rows."""
     import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
 
-    def run(*policy: str) -> None:
+    def run(policy: type, *flags: str) -> list[tuple[list[int], list[int]]]:
+        clocks, select = [], policy.select_action  # type: ignore[attr-defined]
+
+        def selected(this: Any, batch: Any, **options: Any) -> Any:
+            phases, steps = (batch[f"observation.{name}"].flatten().int().tolist() for name in ("phase", "step"))
+            clocks.append((phases, steps))
+            return select(this, batch, **options)
+
+        monkeypatch.setattr(policy, "select_action", selected)
         line = [
             *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}", "--env.render=fast"),
             *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
             *("--policy.device=cpu", f"--output_dir={tmp_path}", f"--env.log_dir={tmp_path}"),
         ]
-        assert call_lerobot("eval", [*line, *policy]) == 0
+        assert call_lerobot("eval", [*line, *flags]) == 0
+        return clocks
 
     return run
 
 
-def act() -> tuple[type, list[str], int]:
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    return ACTPolicy, flags(ACT, chunk_size=50, n_action_steps=50), 50
-
-
-def diffusion() -> tuple[type, list[str], int]:
+def test_first_plan_reads_the_first_execution_frame(
+    observed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The environments receive the planned actions and no earlier ones, whatever the lengths of the prompts."""
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
-    return DiffusionPolicy, flags(DIFFUSION, horizon=16, n_action_steps=8), 8
+    plans: list[np.ndarray] = []
+    applied: dict[int, list[np.ndarray]] = defaultdict(list)
+    plan, step = DiffusionPolicy.predict_action_chunk, MemobenchEnv.step
 
+    def planned(this: Any, batch: Any, **options: Any) -> Any:
+        plans.append(plan(this, batch, **options))
+        return plans[-1]
 
-@pytest.mark.parametrize("kind", [act, diffusion])
-def test_the_first_plan_is_made_from_the_first_execution_frame(
-    kind: Any, lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    policy, words, interval = kind()
-    watched = Watched(monkeypatch, policy)
-    lerobot_eval(*words, "--env.prompt_in=reset")
+    def stepped(this: MemobenchEnv, action: Any) -> Any:
+        if this.episode.phase == EXECUTION:
+            applied[this.episode.seed].append(np.array(action))
+        return step(this, action)
+
+    monkeypatch.setattr(DiffusionPolicy, "predict_action_chunk", planned)
+    monkeypatch.setattr(MemobenchEnv, "step", stepped)
+    words = dict(word.split("=", 1) for word in DIFFUSION) | {"policy.horizon": "16", "policy.n_action_steps": "8"}
+    flags = [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in words.items()]
+    clocks = observed(DiffusionPolicy, *flags, "--env.prompt_in=reset")
     records = read_episodes(tmp_path)
     assert [(record["prompt_steps"], record["steps"]) for record in records] == [(steps, HORIZON) for steps in PROMPTS]
     assert [record["prompt_shown"] for record in records] == [True, True]
-    phases, steps, _ = watched.plans[0]
-    assert phases == [EXECUTION, EXECUTION]
-    assert steps == [0, 0], "the clock of the execution, whatever the prompts took"
+    assert clocks[0] == ([EXECUTION] * 2, [0, 0])
     for row, seed in enumerate((7, 8)):
-        planned = np.concatenate([actions[row, :interval] for _, _, actions in watched.plans])[:HORIZON]
-        np.testing.assert_array_equal(np.stack(watched.applied[seed]), planned)  # none of them is stale
+        expected = np.concatenate([actions[row, :INTERVAL].numpy() for actions in plans])[:HORIZON]
+        np.testing.assert_array_equal(np.stack(applied[seed]), expected)
     assert protocol_of(tmp_path)["prompt_in"] == "reset"
 
 
-def test_a_policy_that_reads_prompts_is_shown_them(
-    lerobot_eval: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_prompts_are_observed_by_policies_that_read_them(observed: Any, tmp_path: Path) -> None:
     from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy
 
-    seen: list[list[int]] = []
-    select = MemobenchExpertPolicy.select_action
-
-    def selected(this: Any, batch: Any, **options: Any) -> Any:
-        seen.append(batch["observation.phase"].flatten().int().tolist())
-        return select(this, batch, **options)
-
-    monkeypatch.setattr(MemobenchExpertPolicy, "select_action", selected)
-    nothing_drawn = "--env.obs_type=environment_state_agent_pos"
-    lerobot_eval("--policy.type=memobench_expert", "--env.expert_action=true", "--env.horizon=2", nothing_drawn)
-    assert [sum(row == PROMPT for row in rows) for rows in zip(*seen, strict=True)] == PROMPTS
+    settings = ("--env.expert_action=true", "--env.horizon=2", "--env.obs_type=environment_state_agent_pos")
+    clocks = observed(MemobenchExpertPolicy, "--policy.type=memobench_expert", *settings)
+    assert [sum(phases[row] == PROMPT for phases, _ in clocks) for row in range(2)] == PROMPTS
     assert protocol_of(tmp_path)["prompt_in"] == "steps"

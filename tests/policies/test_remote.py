@@ -1,62 +1,68 @@
-"""The policy that runs in a server: episodes, prompts, settings, failures, and what goes over the wire."""
+"""The policy in a server, for each dialect: messages, prompts, settings, wrong answers, lost servers."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import logging
+import re
 import socket
 import subprocess
 import sys
-import time
+import tracemalloc
+from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
+from vla_eval import serve_background
 
+from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote import transports as wire
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
-from lerobot_memobench.policies.remote.session import fit
-from tests.support import policy_server
-from tests.support.policy_server import PolicyServer, robomme, zeros
-from tests.support.remote_case import IMPATIENT, batch, counting, frames_of, free_port, make, pictures
-
-# --- an episode ---
+from lerobot_memobench.policies.remote.session import MOST_ACTIONS, fit
+from tests.support.policy_server import PolicyServer, robomme
+from tests.support.remote_case import IMPATIENT, TASK, batch, counting, frames_of, free_port, make, pictures
+from tests.support.vla_eval_server import DigestServer, ScriptedServer, action, hello
 
 
-def test_a_question_holds_what_openpis_libero_servers_expect() -> None:
+def steps_of(questions: list[dict[str, Any]]) -> list[int]:
+    """Return the steps whose pictures were sent."""
+    return [int(question["observation/image"][0, 0, 0]) for question in questions]
+
+
+# --- openpi ---
+
+
+def test_openpi_questions_hold_the_inputs_of_its_libero_servers() -> None:
     with PolicyServer() as server:
         make(server).select_action(batch(0, task="open the drawer"))
         make(server, image_size=0, mirror=True).select_action(batch(7))
-    first, second = server.questions
+        make(server, keys="video.front=image, t=step,language = task", image_size=0).select_action(batch(4))
+        with pytest.raises(MemobenchError, match=r"'gaze'.*image, phase, state, step, task, wrist_image"):
+            make(server, keys="x=gaze").select_action(batch(0))
+    first, second, third = server.questions
     assert set(first) == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
     assert first["prompt"] == "open the drawer"
     for name in ("observation/image", "observation/wrist_image"):
-        assert first[name].shape == (224, 224, 3)
-        assert first[name].dtype == np.uint8
+        assert (first[name].shape, first[name].dtype) == ((224, 224, 3), np.uint8)
     assert first["observation/state"].dtype == np.float32
     assert np.array_equal(first["observation/state"], np.arange(8) + 1)
-    # As rendered: every pixel of the camera survives LeRobot's division by 255.
+    # As rendered: every pixel survives LeRobot's division by 255.
     assert np.array_equal(second["observation/image"], pictures(7)[:, ::-1])
     assert np.array_equal(second["observation/wrist_image"], pictures(7))
+    assert (third["t"], third["language"]) == ([4], "do it")
+    assert np.array_equal(third["video.front"], pictures(4))
 
 
-def test_keys_are_renamed_and_others_are_sent_along() -> None:
-    with PolicyServer() as server:
-        make(server, keys="video.front=image, t=step,language = task", image_size=0).select_action(batch(4))
-        policy = make(server, keys="x=gaze")
-        with pytest.raises(MemobenchError, match=r"'gaze'.*known are image, phase, state, step, task, wrist_image"):
-            policy.select_action(batch(0))
-    (question,) = server.questions
-    assert question["t"] == [4]
-    assert question["language"] == "do it"
-    assert np.array_equal(question["video.front"], pictures(4))
-
-
-def test_the_first_actions_of_each_answer_are_executed() -> None:
+def test_first_actions_of_each_answer_are_executed() -> None:
     with PolicyServer(counting) as server:
         policy = make(server, n_action_steps=4, image_size=0)
         actions = torch.cat([policy.select_action(batch(step)) for step in range(9)])
@@ -67,11 +73,11 @@ def test_the_first_actions_of_each_answer_are_executed() -> None:
 
 
 def test_each_environment_has_its_own_connection_and_episode() -> None:
+    """Row 2 ends and repeats step 1; row 1 begins another episode with the last batch."""
     with PolicyServer(counting) as server:
         policy = make(server, n_action_steps=2, image_size=0)
         for steps in ((0, 0, 0), (1, 1, 1), (2, 2, 1), (3, 3, 1), (4, 0, 1)):
             actions = policy.select_action(batch(*steps))
-            # Row 2 has ended and stands still at step 1, row 1 begins anew with the last batch.
             rows = [0, 1] if steps[2] == 1 and steps[0] > 1 else [0, 1, 2]
             assert all(round(float(actions[row, 2]) * 100) == row for row in rows)
             if len(rows) == 2:
@@ -87,7 +93,7 @@ def test_each_environment_has_its_own_connection_and_episode() -> None:
     assert episodes == [(0, [0]), (0, [0, 2, 4]), (1, [0]), (1, [0]), (1, [0, 2]), (2, [0]), (2, [0])]
 
 
-def test_environments_that_are_not_simulated_are_not_asked_about() -> None:
+def test_rows_that_are_not_simulated_are_not_sent() -> None:
     with PolicyServer(counting) as server:
         policy = make(server, image_size=0)
         for step in range(2):
@@ -97,7 +103,7 @@ def test_environments_that_are_not_simulated_are_not_asked_about() -> None:
     assert actions[1].any()
 
 
-def test_an_environment_that_tells_no_steps_begins_with_the_rollout() -> None:
+def test_episodes_without_a_clock_begin_with_the_rollout() -> None:
     with PolicyServer(counting) as server:
         policy = make(server, n_action_steps=3, keys="observation/image=image", image_size=0)
         for _ in range(2):
@@ -105,33 +111,23 @@ def test_an_environment_that_tells_no_steps_begins_with_the_rollout() -> None:
             for step in range(4):
                 found = batch(step)
                 policy.select_action({key: found[key] for key in found if not key.endswith(("step", "phase"))})
-    assert [int(question["observation/image"][0, 0, 0]) for question in server.questions] == [0, 3, 0, 3]
+    assert steps_of(server.questions) == [0, 3, 0, 3]
 
 
-# --- the prompt ---
-
-
-def test_the_prompt_reaches_the_server_and_its_answers_are_not_executed() -> None:
+@pytest.mark.parametrize(
+    ("settings", "sent"), [({"history_every": 3}, [0, 3, 6, 8]), ({}, [0, 4, 8]), ({"send_prompt": False}, [8])]
+)
+def test_openpi_servers_see_frames_of_the_prompt(settings: dict[str, Any], sent: list[int]) -> None:
     with PolicyServer(counting) as server:
-        policy = make(server, n_action_steps=4, image_size=0, history_every=3)
+        policy = make(server, n_action_steps=4, image_size=0, **settings)
         shown = [policy.select_action(batch(step, phase=0)) for step in range(8)]
-        action = policy.select_action(batch(8))
+        acted = policy.select_action(batch(8))
     assert not torch.cat(shown).any()
-    assert float(action[0, 1]) == pytest.approx(0.08)
-    assert [int(question["observation/image"][0, 0, 0]) for question in server.questions] == [0, 3, 6, 8]
+    assert float(acted[0, 1]) == pytest.approx(0.08)
+    assert steps_of(server.questions) == sent
 
 
-def test_the_prompt_can_be_left_out() -> None:
-    with PolicyServer() as server:
-        policy = make(server, send_prompt=False)
-        for step in range(8):
-            policy.select_action(batch(step, phase=0))
-        assert not server.heard
-        policy.select_action(batch(8))
-    assert len(server.heard) == 1
-
-
-def test_a_robomme_server_gets_every_frame() -> None:
+def test_robomme_servers_receive_every_frame() -> None:
     with PolicyServer(counting) as server:
         policy = make(server, dialect="robomme", n_action_steps=4)
         for _ in range(2):
@@ -139,102 +135,134 @@ def test_a_robomme_server_gets_every_frame() -> None:
             for step in range(14):
                 policy.select_action(batch(step, phase=int(step >= 5)))
     half = server.questions[: len(server.heard) // 2]
-    assert [next(iter(question)) for question in half] == [
-        "reset",
-        *["images", "observation/image"] * 3,
-    ]
-    buffers = half[1::2]
-    assert [frames_of(question) for question in buffers] == [
-        [0, 1, 2, 3, 4, 5],
-        [6, 7, 8, 9],
-        [10, 11, 12, 13],
-    ]
-    # As in RoboMME's client: the index of the frame with which execution begins.
-    assert [question["exec_start_idx"] for question in buffers] == [5, 5, 5]
+    assert [next(iter(question)) for question in half] == ["reset", *["images", "observation/image"] * 3]
+    assert [frames_of(question) for question in half[1::2]] == [[*range(6)], [*range(6, 10)], [*range(10, 14)]]
+    # As in RoboMME's client: the index of the first execution frame.
+    assert [question["exec_start_idx"] for question in half[1::2]] == [5, 5, 5]
     assert [list(question) for question in server.questions[len(half) :]] == [list(question) for question in half]
 
 
-def test_a_server_with_one_memory_serves_one_environment() -> None:
+def test_robomme_servers_serve_one_environment_each() -> None:
     with PolicyServer(robomme) as one, PolicyServer(robomme) as other:
         policy = make(one, dialect="robomme")
-        with pytest.raises(MemobenchError, match="2 environments would share 1; use batch_size=1"):
+        with pytest.raises(MemobenchError, match="batch_size=1"):
             policy.select_action(batch(0, 0))
         policy = make(one, dialect="robomme", servers=f"127.0.0.1:{one.port},127.0.0.1:{other.port}")
         policy.select_action(batch(0, 0))
     assert len(one.heard) == len(other.heard) == 3
 
 
+# --- vla-eval ---
+
+
+def test_vla_eval_episode_with_a_prompt() -> None:
+    server = DigestServer(steps=2)
+    with serve_background(server) as handle:
+        policy = make(handle.port, dialect="vla_eval")
+        shown = [policy.select_action(batch(step, phase=0)) for step in range(3)]
+        acted = [policy.select_action(batch(step)) for step in range(4)]
+        policy.reset()
+        policy.select_action(batch(0))
+    assert not torch.cat(shown).any()
+    assert len({tuple(action[0].tolist()) for action in acted}) == 4
+    assert server.tasks == [{"name": "do it"}] * 2
+    assert server.ended == 2
+    (_, first), (_, second), (_, third) = [(step, observed) for _, step, observed in server.heard]
+    assert list(first["images"]) == ["agentview", "wrist"]  # servers use their order
+    assert np.array_equal(first["images"]["agentview"], pictures(0))
+    assert np.array_equal(first["images"]["wrist"], pictures(0)[:, ::-1])
+    assert (first["states"].dtype, first["states"].tolist()) == (np.float32, list(range(1, 9)))
+    assert (first["task_description"], first["episode_restart"]) == ("do it", True)
+    assert all(np.array_equal(found, pictures(step)) for step, found in enumerate(first["video_history"]))
+    assert [len(first[name]) for name in ("video_history", "wrist_video_history", "state_history")] == [3, 3, 3]
+    # The server plans two actions at a time and needs no observation for the second.
+    assert [step for _, step, _ in server.heard] == [0, 2, 0]
+    assert all(set(later) == {"images", "states", "task_description", "step"} for later in (second, third))
+
+
+@pytest.mark.parametrize(("settings", "steps"), [({"history_every": 2}, [0, 2, 4]), ({"send_prompt": False}, None)])
+def test_vla_eval_prompt_is_thinned_or_left_out(
+    settings: dict[str, Any], steps: list[int] | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = DigestServer()
+    with serve_background(server) as handle, caplog.at_level(logging.WARNING):
+        policy = make(handle.port, dialect="vla_eval", **settings)
+        for step in range(5):
+            policy.select_action(batch(step, phase=0))
+        policy.select_action(batch(0))
+    ((_, _, found),) = server.heard
+    history = found.get("video_history")
+    assert (history and [int(frame[0, 0, 0]) for frame in history]) == steps
+    (warned,) = [record.getMessage() for record in caplog.records if record.name.startswith("lerobot_memobench")]
+    assert "euler_xyz" in warned, "the server's conventions differ"
+
+
+def test_vla_eval_environments_have_their_own_sessions() -> None:
+    server = DigestServer(steps=1)
+    with serve_background(server) as handle:
+        policy = make(handle.port, dialect="vla_eval")
+        for step in range(2):
+            policy.select_action(batch(step, step))
+    rows = {(session, int(observed["images"]["agentview"][0, 0, 1])) for session, _, observed in server.heard}
+    assert len(rows) == 2
+
+
+def test_vla_eval_servers_are_asked_at_every_planned_step() -> None:
+    with ScriptedServer(observation=action((6, 7))) as server:
+        policy = make(server.port, dialect="vla_eval", n_action_steps=4)
+        for step in range(5):
+            assert policy.select_action(batch(step)).tolist() == [[0.25] * 7]
+    assert [kind for kind, _ in server.heard] == ["hello", "episode_start", "observation", "observation"]
+
+
 # --- settings ---
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "named"),
     [
-        ({"dialect": "openpy"}, "did you mean 'openpi'"),
-        ({"gripper": "closed"}, "policy.gripper is 'closed'"),
-        ({"host": "10.0.0.5/policy"}, "expected a host and a port"),
-        ({"port": 70_000}, "expected a host and a port"),
-        ({"servers": "gpu1:8000,gpu2"}, "found 'gpu2' as"),
-        ({"host": "http://gpu1"}, "reached by ws:// or wss://"),
-        ({"keys": "image"}, "expected pairs"),
-        ({"n_action_steps": 0}, "policy.n_action_steps is 0"),
-        ({"retry": 0.0}, "policy.retry is 0.0"),
-        ({"image_size": -1}, "policy.image_size is -1"),
+        ({"dialect": "openpy"}, "'openpi'"),
+        ({"gripper": "closed"}, "policy.gripper"),
+        ({"host": "10.0.0.5/policy"}, "host=.* port="),
+        ({"port": 70_000}, "host=.* port="),
+        ({"servers": "gpu1:8000,gpu2"}, "'gpu2'"),
+        ({"host": "http://gpu1"}, "ws:// or wss://"),
+        ({"keys": "image"}, "policy.keys"),
+        ({"n_action_steps": 0}, "policy.n_action_steps"),
+        ({"timeout": 0.0}, "policy.timeout"),
+        ({"image_size": -1}, "policy.image_size"),
     ],
 )
-def test_wrong_settings_are_named(settings: dict[str, Any], told: str) -> None:
-    with pytest.raises(MemobenchError, match=told):
+def test_wrong_settings_are_named(settings: dict[str, Any], named: str) -> None:
+    with pytest.raises(MemobenchError, match=named):
         RemoteConfig(**settings)
 
 
-def test_addresses() -> None:
+def test_defaults_follow_the_dialect() -> None:
     assert RemoteConfig().addresses() == ["ws://127.0.0.1:8000"]
     assert RemoteConfig(host="wss://gpu1", port=443).addresses() == ["wss://gpu1:443"]
     assert RemoteConfig(servers="a:1, b:2").addresses() == ["ws://a:1", "ws://b:2"]
     assert RemoteConfig(servers="a:1, b:2", dialect="robomme").max_environments == 2
     assert RemoteConfig().max_environments is None
+    assert [RemoteConfig(dialect=name).n_action_steps for name in ("openpi", "vla_eval")] == [5, 1]
+    assert RemoteConfig(dialect="vla_eval", n_action_steps=4).n_action_steps == 4
 
 
-def test_lerobot_finds_it_and_it_refuses_to_train() -> None:
+def test_lerobots_factories_make_it() -> None:
     assert get_policy_class("memobench_remote") is RemotePolicy
     policy = RemotePolicy(RemoteConfig())
-    with pytest.raises(MemobenchError, match="cannot be trained here"):
+    with pytest.raises(MemobenchError, match="cannot be trained"):
         policy.forward({})
     before, after = make_pre_post_processors(policy.config)
-    found = before(batch(3))
-    assert torch.equal(found["observation.images.image"], batch(3)["observation.images.image"])
+    assert torch.equal(before(batch(3))["observation.images.image"], batch(3)["observation.images.image"])
     assert torch.equal(after(torch.ones(1, 7)), torch.ones(1, 7))
 
 
-# --- failures ---
+# --- answers ---
 
 
-@pytest.mark.parametrize(
-    ("answer", "told"),
-    [
-        (
-            "Traceback (most recent call last):\n  File …\nKeyError: 'observation/joints'\n",
-            "KeyError: 'observation/joi",
-        ),
-        ({"actions": np.zeros((10, 8))}, r"actions of shape \(10, 8\); expected finite numbers of shape \(steps, 7\)"),
-        ({"actions": np.zeros((2, 10, 7))}, r"actions of shape \(2, 10, 7\)"),
-        ({"actions": ["a"]}, "no numbers"),
-        ({"action": 1}, r"without 'actions' \(it holds \['action'\]\)"),
-        ({"actions": np.zeros((3, 7))}, "answers 3 actions at a time, fewer than the 5.*replan=3 or less"),
-        ([1], "answered a list, no map"),
-    ],
-)
-def test_a_wrong_answer_is_named(answer: Any, told: str) -> None:
-    with PolicyServer(lambda question: answer) as server:
-        policy = make(server)
-        with pytest.raises(MemobenchError, match=told) as caught:
-            policy.select_action(batch(0))
-    assert "\n" not in str(caught.value)
-    assert f"ws://127.0.0.1:{server.port}" in str(caught.value)
-
-
-def test_a_gripper_of_rlds_is_turned() -> None:
-    """0 closes and 1 opens there; here 1 closes and -1 opens."""
+def test_rlds_grippers_are_converted() -> None:
+    """In RLDS 0 closes and 1 opens; in this environment 1 closes and -1 opens."""
     chunk = np.zeros((5, 7))
     chunk[:, 6] = [0.0, 0.2, 0.49, 0.51, 1.0]
     with PolicyServer(lambda question: {"actions": chunk}) as server:
@@ -243,83 +271,148 @@ def test_a_gripper_of_rlds_is_turned() -> None:
     assert actions[:, 6].tolist() == [1, 1, 1, -1, -1]
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("gripper", ["rlds", "libero"])
-def test_what_is_not_finite_is_passed_on(value: float, gripper: str) -> None:
-    """The environment ends the episode with it; here it would end all of them."""
+@pytest.mark.parametrize(("gripper", "value"), [("rlds", np.nan), ("libero", np.inf)])
+def test_infinite_actions_reach_the_environment(gripper: str, value: float) -> None:
+    """The environment ends its own episode with them; an error here would end all episodes."""
     with PolicyServer(lambda question: {"actions": np.full((10, 7), value)}) as server:
-        action = make(server, gripper=gripper).select_action(batch(0))
-    assert action.shape == (1, 7)
-    assert not torch.isfinite(action).any()
+        found = make(server, gripper=gripper).select_action(batch(0))
+    assert found.shape == (1, 7)
+    assert not torch.isfinite(found).any()
 
 
-def test_a_server_that_is_not_there_is_told() -> None:
-    with pytest.raises(MemobenchError, match=r"no policy server answered at ws://127.0.0.1:\d+ within 0.3 s"):
+ARRAY = {b"__ndarray__": True, b"data": b"11", b"dtype": "|i1", b"shape": [2]}
+WRONG: list[tuple[Any, str]] = [
+    ("Traceback (most recent call last):\n  File …\nKeyError: 'observation/joints'\n", "KeyError: 'observation/joi"),
+    ({"actions": np.zeros((10, 8))}, r"\(10, 8\).* \(steps, 7\)"),
+    ({"actions": np.zeros((2, 10, 7))}, r"\(2, 10, 7\)"),
+    ({"actions": ["a"]}, "no numbers"),
+    ({"action": 1}, r"'actions' .*\['action'\]"),
+    ({"actions": np.zeros((3, 7))}, "replan=3"),
+    ([1], "answered a list"),
+]
+WRONG_VLA_EVAL: list[tuple[dict[str, Any], str]] = [
+    ({"hello": hello(2)}, r"version 2 .*version 1.*vla-eval 0\.8"),
+    ({"hello": hello(ARRAY)}, "version array"),
+    ({"hello": [("action", {})]}, "answered a hello"),
+    ({"hello": b"\x93\x01\x02\x03"}, "type and payload"),
+    ({"hello": b"\xc1"}, "not msgpack"),
+    ({"observation": action((8,))}, r"\(1, 8\)"),
+    ({"observation": [("action", {})]}, "without 'actions'"),
+    ({"observation": [("error", {"error": "observation_failed: KeyError: 'images'"})]}, "'images'"),
+    ({"episode_start": [("error", {"error": "episode_start_failed: boom"})]}, "boom"),
+    ({"observation": hello()}, "answered an observation with 'hello'"),
+    ({"observation": 1.0}, r"more than 0\.3 s"),
+    ({"hello": 1.0}, r"within 0\.3 s"),
+]
+
+
+@pytest.mark.parametrize(
+    ("dialect", "answer", "named"),
+    [*(("openpi", *case) for case in WRONG), *(("vla_eval", *case) for case in WRONG_VLA_EVAL)],
+)
+def test_wrong_answers_are_named(dialect: str, answer: Any, named: str) -> None:
+    server: Any = PolicyServer(lambda question: answer) if dialect == "openpi" else ScriptedServer(**answer)
+    with server, pytest.raises(MemobenchError, match=named) as caught:
+        make(server.port, dialect=dialect, **IMPATIENT if dialect == "vla_eval" else {}).select_action(batch(0))
+    assert "\n" not in str(caught.value)
+    assert f"ws://127.0.0.1:{server.port}" in str(caught.value)
+
+
+def test_servers_of_another_kind_are_named() -> None:
+    with PolicyServer() as server, pytest.raises(MemobenchError, match="dialect="):
+        make(server, dialect="vla_eval")
+
+
+# --- servers that stop ---
+
+
+def test_missing_servers_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(MemobenchError, match=r"ws://127.0.0.1:\d+ within 0.3 s"):
         make(free_port(), **IMPATIENT)
+    out = tmp_path / "run"
+    assert evaluate(free_port(), out, "episodes=1", "policy.connect_timeout=0.2") == 2
+    assert "no policy server answered" in capsys.readouterr().err
+    assert not out.exists()
 
 
-def test_a_server_that_starts_late_is_waited_for() -> None:
-    port = free_port()
-    late = subprocess.Popen([sys.executable, policy_server.__file__, str(port)], stdout=subprocess.DEVNULL)
-    try:
-        assert not make(port, connect_timeout=60.0).select_action(batch(0)).any()
-    finally:
-        late.kill()
-        late.wait()
+@pytest.mark.parametrize("dialect", ["openpi", "vla_eval"])
+def test_lost_servers_end_the_evaluation_with_advice(dialect: str) -> None:
+    server: Any = PolicyServer() if dialect == "openpi" else ScriptedServer()
+    with server:
+        policy = make(server.port, dialect=dialect, n_action_steps=1)
+        policy.select_action(batch(0))
+        if dialect == "openpi":
+            server.answer = lambda question: server.connections[-1].socket.shutdown(socket.SHUT_RDWR)
+        else:
+            server.die = lambda: True
+        with pytest.raises(MemobenchError, match=rf"127.0.0.1:{server.port}.*resume=true"):
+            policy.select_action(batch(1))
 
 
-def test_an_answer_that_takes_too_long_is_told() -> None:
-    def slow(question: dict[str, Any]) -> dict[str, Any]:
-        time.sleep(1.0)
-        return zeros(question)
-
-    with PolicyServer(slow) as server:
-        policy = make(server, timeout=0.2)
-        with pytest.raises(MemobenchError, match=r"took more than 0.2 s for an answer; .*policy.timeout="):
+def test_each_episode_has_a_connection_of_its_own() -> None:
+    with PolicyServer(counting) as server:
+        policy = make(server, image_size=0)
+        for _ in range(3):
             policy.select_action(batch(0))
+            policy.reset()
+    assert [connection for connection, _ in server.heard] == [0, 1, 2]
 
 
-def _again(dying: PolicyServer) -> int:
-    """Let a server die now and return its port."""
-    dying.die()
-    return dying.port
+# --- malformed answers ---
 
 
-@pytest.mark.parametrize(("memory", "asked"), [(False, [4, 6]), (True, [0, 2, 4, 6])])
-def test_a_server_that_comes_back_goes_on_with_the_episode(memory: bool, asked: list[int]) -> None:
-    with PolicyServer(counting) as dying:
-        policy = make(dying, n_action_steps=2, image_size=0, memory=memory)
-        for step in range(4):
-            policy.select_action(batch(step))
-        with PolicyServer(counting, port=_again(dying)) as server:
-            actions = [policy.select_action(batch(step)) for step in range(4, 8)]
-    torch.testing.assert_close(torch.cat(actions)[:, 1], torch.tensor([0.04, 0.04, 0.06, 0.06]))
-    assert [int(question["observation/image"][0, 0, 0]) for question in server.questions] == asked
+class Raw(PolicyServer):
+    """Answer the first question with bytes that no packer writes."""
+
+    def __init__(self, answer: bytes) -> None:
+        super().__init__(lambda _: self.connections[-1].send(answer))
 
 
-def test_a_robomme_server_that_comes_back_gets_every_frame_again() -> None:
-    with PolicyServer(counting) as dying:
-        policy = make(dying, dialect="robomme", n_action_steps=2)
-        for step in range(5):
-            policy.select_action(batch(step, phase=int(step >= 2)))
-        with PolicyServer(counting, port=_again(dying)) as server:
-            for step in range(5, 8):
-                policy.select_action(batch(step))
-    order = [next(iter(question)) for question in server.questions]
-    assert order == ["reset", "images", "images", "images", "observation/image"]
-    assert [frames_of(question) for question in server.questions[1:4]] == [[0, 1, 2], [3, 4], [5, 6]]
-    assert {question["exec_start_idx"] for question in server.questions[1:4]} == {2}
+def actions(found: Any) -> bytes:
+    return msgpack.packb({"actions": found})
 
 
-def test_a_server_that_dies_over_every_question_is_told() -> None:
-    with PolicyServer() as server:
-        policy = make(server, retry=0.4)
-        server.answer = lambda question: server.connections[-1].socket.shutdown(socket.SHUT_RDWR)
-        with pytest.raises(MemobenchError, match=r"did not come back within 0\.4 s"):
-            policy.select_action(batch(0))
+def array(shape: Any, data: bytes = bytes(28)) -> bytes:
+    return actions({b"__ndarray__": True, b"data": data, b"dtype": "<f4", b"shape": shape})
 
 
-# --- the wire ---
+HALF = wire.LARGEST_ANSWER // 2
+MALFORMED: dict[str, bytes] = {
+    "deep": b"\x81\xa7actions" + b"\x91" * 100_000,
+    "huge shape": array([10**9, 7]),
+    "overflowing shape": array([2**64 - 1, 7]),
+    "no rows": array([0, 7], b""),
+    "objects": actions([[{}] * 7]),
+    "no action": actions([]),
+    "too many actions": actions([[0.0] * 7] * (MOST_ACTIONS + 1)),
+    "too large": bytes(wire.LARGEST_ANSWER + 1),
+    "empty": b"",
+    "lists that reserve memory": b"\x81\xa7actions" + (b"\xdd" + HALF.to_bytes(4)) * 500 + bytes(HALF),
+    "text that reserves memory": actions({b"__npgeneric__": True, b"data": "x", b"dtype": "<U900000000"}),
+}
+
+
+@pytest.mark.parametrize("kind", MALFORMED)
+def test_malformed_answers_are_refused_without_much_memory(kind: str) -> None:
+    with Raw(MALFORMED[kind]) as server:
+        policy = make(server, n_action_steps=1)
+        tracemalloc.start()
+        try:
+            with pytest.raises(MemobenchError, match=f"127.0.0.1:{server.port}") as caught:
+                policy.select_action(batch(0))
+            assert tracemalloc.get_traced_memory()[1] < 16 * wire.LARGEST_ANSWER
+        finally:
+            tracemalloc.stop()
+    assert len(str(caught.value)) < 500
+    assert str(caught.value).isprintable()
+
+
+def test_longest_answers_are_accepted() -> None:
+    with Raw(actions([[0.0] * 7] * MOST_ACTIONS)) as server:
+        assert make(server).select_action(batch(0)).shape == (1, 7)
+
+
+# --- the format ---
 
 #: Packed by openpi-client 0.1.2.
 OPENPI_FRAME = (
@@ -330,7 +423,7 @@ OPENPI_FRAME = (
 )
 
 
-def test_frames_are_those_of_openpis_client() -> None:
+def test_frames_equal_those_of_openpis_client() -> None:
     message = {
         "observation/state": np.arange(3, dtype=np.float32),
         "observation/image": np.arange(12, dtype=np.uint8).reshape(2, 2, 3),
@@ -339,28 +432,63 @@ def test_frames_are_those_of_openpis_client() -> None:
     }
     assert wire.pack(message).hex() == OPENPI_FRAME
     back = wire.unpack(bytes.fromhex(OPENPI_FRAME))
-    assert back["n"] == 1.5
-    assert back["n"].dtype == np.float32
+    assert (back["n"], back["n"].dtype) == (1.5, np.float32)
     assert back["observation/image"].dtype == np.uint8
     assert np.array_equal(back["observation/image"], message["observation/image"])
 
 
-def test_nothing_that_could_carry_code_is_packed_or_taken() -> None:
-    with pytest.raises(ValueError, match="cannot be sent"):
+def test_objects_are_neither_packed_nor_unpacked() -> None:
+    with pytest.raises(ValueError, match="object"):
         wire.pack({"x": np.array([object()])})
     foreign = wire.pack({"x": np.zeros(1)}).replace(b"<f8", b"|O8")
-    with pytest.raises(ValueError, match="not taken"):
+    with pytest.raises(ValueError, match="object"):
         wire.unpack(foreign)
-    with pytest.raises(ValueError, match="not msgpack"):
-        wire.unpack(b"\xc1")
 
 
 @pytest.mark.parametrize(
     ("height", "width", "digest"),
     [(256, 256, "6bc21716ac445bdb"), (120, 200, "a2d0d2674df3d7d5"), (200, 90, "65a85f1d1a04eee5")],
 )
-def test_images_are_resized_as_openpis_client_does(height: int, width: int, digest: str) -> None:
+def test_images_are_resized_as_by_openpis_client(height: int, width: int, digest: str) -> None:
     y, x = np.mgrid[:height, :width]
     image = np.stack([x * 255 // width, y * 255 // height, (x * y) % 256], -1).astype(np.uint8)
     assert hashlib.sha256(fit(image, 224).tobytes()).hexdigest()[:16] == digest
-    assert np.array_equal(fit(image, None, mirror=True), image[:, ::-1])
+
+
+# --- the command ---
+
+
+def evaluate(port: int, out: Path, *words: str) -> int:
+    policy = ("policy=memobench_remote", "host=127.0.0.1", f"port={port}", "replan=10")
+    usual = (f"tasks={TASK}", "horizon=20", "env.render=fast", "eval.use_async_envs=false", f"output_dir={out}")
+    return main(["eval", "env=memobench", *policy, *usual, *words])
+
+
+def test_evaluations_resume_after_their_server_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two episodes of two questions each; the server stops at the second question of the second episode."""
+    out = tmp_path / "run"
+    with PolicyServer(die_at=3) as server:
+        assert evaluate(server.port, out, "episodes=2", "batch_size=1") == 2
+    assert "resume=true" in capsys.readouterr().err
+    before = read_episodes(out)
+    assert [(record["episode"], record["steps"], record["replan_steps"]) for record in before] == [(0, 20, 10)]
+    with PolicyServer() as server:
+        assert evaluate(server.port, out, "episodes=2", "batch_size=1", "resume=true") == 0
+    assert len(server.heard) == 2
+    after = read_episodes(out)
+    assert [record["episode"] for record in after] == [0, 1]
+    assert after[0] == before[0]
+    assert json.loads((out / "report.json").read_text())["tasks"][TASK]["n"] == 2
+
+
+def test_server_of_the_guide_answers_and_is_waited_for() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "guides" / "remote.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    port = free_port()
+    server = subprocess.Popen([sys.executable, "-c", program.replace("8000", str(port))])
+    try:
+        policy = make(port, connect_timeout=60.0, n_action_steps=50)
+        assert not policy.select_action(batch(0)).any()
+    finally:
+        server.kill()
+        server.wait()

@@ -1,4 +1,4 @@
-"""What tests of the detector share: a small encoder, reset scenes, and labelled images without a simulator.
+"""Shared by tests of the detector: a small encoder, reset scenes, and labelled images without a simulator.
 
 Those show bright squares on a dark ground from straight above.
 """
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.perception.detector import GEOMETRY, READINGS, CellQuery, DetectorOutput
+from lerobot_memobench.perception.detector import GEOMETRY, CellQuery, DetectorOutput
 from lerobot_memobench.perception.geometry import rays
 from lerobot_memobench.perception.visual_encoder import SIDE, VisualEncoder
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
@@ -64,7 +64,7 @@ def _show(row: Rows, kind: int, kinds: int, rng: np.random.Generator) -> None:
 
 
 def perfect(wanted: Targets, side: int) -> DetectorOutput:
-    """Return what heads with so many coarse cells along a picture say that have learned all there is to learn."""
+    """Return the output of heads without any error, with so many coarse cells along an image."""
     pictures, kinds, _, _ = wanted.heat.shape
     geometry = torch.zeros(pictures, kinds, len(GEOMETRY), side, side)
     picture, kind, row, column = wanted.cells.T
@@ -76,7 +76,7 @@ def perfect(wanted: Targets, side: int) -> DetectorOutput:
 
 
 def laid_out(values: Tensor) -> CellQuery:
-    """Return what says of cells what stands there in (N, kinds, values, side, side)."""
+    """Return a query of values (N, kinds, values, side, side)."""
     return lambda picture, kind, row, column: values[picture, kind, :, row, column]
 
 
@@ -86,22 +86,14 @@ def everywhere(query: CellQuery, shape: tuple[int, ...]) -> Tensor:
 
 
 def trained_a_little(encoder: VisualEncoder) -> VisualEncoder:
-    """Give batch normalisation something to remember."""
+    """Fill the running statistics of batch normalisation."""
     encoder.train()
     for _ in range(3):
         encoder(torch.rand(4, 3, SIDE, SIDE))
     return encoder.eval()
 
 
-def all_outputs(readings: dict[str, DetectorOutput]) -> list[Tensor]:
-    """Return all output but uncertainty, as it is now: geometry is only computed when it is queried."""
-    assert set(readings) == set(READINGS)
-    return [
-        values
-        for output in readings.values()
-        for values in (
-            output.heatmap,
-            output.mask,
-            everywhere(output.geometry, (*output.heatmap.shape[:2], output.side)),
-        )
-    ]
+def all_outputs(output: DetectorOutput) -> list[Tensor]:
+    """Return the output except uncertainty and score; geometry is computed now."""
+    cells = (*output.heatmap.shape[:2], output.side)
+    return [output.heatmap, output.mask, everywhere(output.geometry, cells)]

@@ -1,15 +1,12 @@
-"""openpi's policy server for tests, written from the deployed ones and not from our client.
+"""openpi's policy server for tests, written after the deployed servers.
 
-The frames are packed here on their own, so that an error in the client's packing does not cancel out. Run as a script
-(``python policy_server.py PORT [question over which it dies]``) it is a server in a process of its own.
+It packs frames itself, so that an error in the client's packing does not cancel out.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
-import sys
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -103,10 +100,3 @@ class PolicyServer:
 
     def __exit__(self, *error: object) -> None:
         self.die()
-
-
-if __name__ == "__main__":
-    lone = PolicyServer(port=int(sys.argv[1]), die_at=int(sys.argv[2]) if len(sys.argv) > 2 else None)
-    lone.die = lambda: os._exit(1)  # type: ignore[method-assign]
-    print("listening", flush=True)
-    lone._thread.join()

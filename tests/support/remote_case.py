@@ -14,12 +14,12 @@ from tests.support.policy_server import PolicyServer, robomme
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 SIDE = 32
-PATIENT = {"connect_timeout": 5.0, "timeout": 5.0, "retry": 5.0}
-IMPATIENT = {"connect_timeout": 0.3, "timeout": 0.3, "retry": 0.3}
+PATIENT = {"connect_timeout": 5.0, "timeout": 5.0}
+IMPATIENT = {"connect_timeout": 0.3, "timeout": 0.3}
 
 
 def pictures(step: int, row: int = 0) -> np.ndarray:
-    """(SIDE, SIDE, 3) uint8 that tell step and row by their first pixel."""
+    """(SIDE, SIDE, 3) uint8 with step and row in their first pixel."""
     image = np.full((SIDE, SIDE, 3), 90, np.uint8)
     image[0, 0] = step, row, 255
     return image

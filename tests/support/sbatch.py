@@ -1,4 +1,4 @@
-"""A stand-in for Slurm's sbatch: it notes what it is given and answers with a job's number."""
+"""A replacement of Slurm's sbatch that records its options and prints a job's number."""
 
 from __future__ import annotations
 

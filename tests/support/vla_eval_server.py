@@ -76,7 +76,7 @@ def action(shape: tuple[int, ...] = (7,)) -> Frames:
 
 
 class ScriptedServer:
-    """Answers each kind of frame as it is told, in frames that are packed here.
+    """Answers each kind of frame by a script, in frames that it packs itself.
 
     Args:
         answers: type of a frame -> frames (type, payload) that are sent in answer, or bytes, or seconds to wait.
@@ -107,8 +107,8 @@ class ScriptedServer:
                     time.sleep(answer)
                 else:
                     for kind, payload in answer:
-                        told = {"type": kind, "payload": payload, "seq": found["seq"], "timestamp": 0.0}
-                        connection.send(msgpack.packb(told))
+                        answered = {"type": kind, "payload": payload, "seq": found["seq"], "timestamp": 0.0}
+                        connection.send(msgpack.packb(answered))
         except (ConnectionClosed, OSError):
             pass
 

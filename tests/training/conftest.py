@@ -1,4 +1,4 @@
-"""Datasets that policies are trained on, and trainings by the command's own way."""
+"""Datasets to train on, and trainings by the words of the command."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from torch import nn
 from lerobot_memobench.training.average import WeightAverage, states_of
 
 
-def test_the_average_follows_its_formula() -> None:
+def test_average_follows_its_formula() -> None:
     weight = nn.Parameter(torch.tensor([0.0]))
     average, expected = WeightAverage({"w": weight}, 0.9), 0.0
     for update in range(200):
@@ -23,7 +23,7 @@ def test_the_average_follows_its_formula() -> None:
     assert weight.item() == 200
 
 
-def test_a_bfloat16_weight_has_a_float32_average_that_is_saved() -> None:
+def test_bfloat16_weights_have_a_saved_float32_average() -> None:
     weight = nn.Parameter(torch.tensor([1.0], dtype=torch.bfloat16))
     average = WeightAverage({"w": weight}, 0.999)
     average.update()
@@ -36,7 +36,7 @@ def test_a_bfloat16_weight_has_a_float32_average_that_is_saved() -> None:
     assert torch.equal(again.parameters["w"].data, weight.data)
 
 
-def test_an_unknown_part_starts_at_its_weights() -> None:
+def test_average_of_a_new_part_starts_at_its_weights() -> None:
     old = WeightAverage({"a": nn.Parameter(torch.ones(1))}, 0.9)
     old.update()
     new = WeightAverage({"a": nn.Parameter(torch.zeros(1)), "b": nn.Parameter(torch.full((1,), 3.0))}, 0.9)
@@ -45,7 +45,7 @@ def test_an_unknown_part_starts_at_its_weights() -> None:
     assert states_of(*new.state())["b"].updates == 0
 
 
-def test_the_average_is_applied_in_another_precision() -> None:
+def test_average_is_applied_in_another_precision() -> None:
     weight = nn.Parameter(torch.tensor([0.3]))
     average = WeightAverage({"w": weight}, 0.9)
     with average.applied({weight: torch.bfloat16}):

@@ -1,4 +1,4 @@
-"""The feature cache: a file per episode, made once, found by what decides its content."""
+"""The feature cache: a file per episode, computed once; its name is a hash of its inputs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def root(synthetic: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("stride", [1, 4])
-def test_contents(root: Path, stride: int) -> None:
+def test_features_of_frames_and_slots(root: Path, stride: int) -> None:
     found = Encoder().made(root, stride=stride)
     for episode, length in enumerate(LENGTHS):
         slots = range(0, -(-length // stride))
@@ -59,7 +59,7 @@ def test_contents(root: Path, stride: int) -> None:
     assert len(found.all_frames()) == sum(-(-length // stride) for length in LENGTHS)
 
 
-def test_a_finished_cache_is_left_alone_and_moves_with_its_dataset(root: Path, tmp_path: Path) -> None:
+def test_complete_caches_move_with_their_dataset(root: Path, tmp_path: Path) -> None:
     Encoder().made(root)
     moved = Path(shutil.move(root, tmp_path / "elsewhere"))
     again = Encoder()
@@ -67,7 +67,7 @@ def test_a_finished_cache_is_left_alone_and_moves_with_its_dataset(root: Path, t
     assert again.calls == []
 
 
-def test_a_killed_build_makes_what_is_missing(root: Path) -> None:
+def test_missing_episodes_are_computed(root: Path) -> None:
     first = Encoder().made(root)
     episode_file(first.folder, 1).unlink()
     again, seen = Encoder(), list[tuple[int, int]]()
@@ -76,7 +76,7 @@ def test_a_killed_build_makes_what_is_missing(root: Path) -> None:
     assert seen == [(2, 3), (3, 3)]
 
 
-def test_what_decides_the_content_decides_the_name(root: Path) -> None:
+def test_name_depends_on_encoder_camera_stride_and_videos(root: Path) -> None:
     encoder = Encoder()
     names = {
         features_folder(root, "test", encoder.features(key), camera, stride).name
@@ -91,7 +91,7 @@ def test_what_decides_the_content_decides_the_name(root: Path) -> None:
     assert len(names) == 5
 
 
-def test_ranks_share_the_episodes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_share_the_episodes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second of two encodes every second episode, and waits for the first."""
     calls = {}
     for rank in (0, 1):
@@ -108,7 +108,7 @@ def test_ranks_share_the_episodes(root: Path, monkeypatch: pytest.MonkeyPatch) -
     assert calls[1] == {1}
 
 
-def test_a_disk_without_room_is_refused_before_anything_is_encoded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_refused_before_encoding(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "free_bytes", lambda _: 10)
     encoder = Encoder()
     with pytest.raises(MemobenchError, match="feature cache"):
@@ -118,7 +118,7 @@ def test_a_disk_without_room_is_refused_before_anything_is_encoded(root: Path, m
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_takes_nothing_is_named(root: Path) -> None:
+def test_read_only_folder_is_named(root: Path) -> None:
     root.chmod(0o500)
     try:
         with pytest.raises(MemobenchError, match="cannot be written"):
@@ -127,7 +127,7 @@ def test_a_folder_that_takes_nothing_is_named(root: Path) -> None:
         root.chmod(0o700)
 
 
-def test_a_damaged_file_is_named(root: Path) -> None:
+def test_damaged_file_is_named(root: Path) -> None:
     found = Encoder().made(root)
     path = episode_file(found.folder, 0)
     path.write_bytes(path.read_bytes()[:-4])
@@ -135,7 +135,7 @@ def test_a_damaged_file_is_named(root: Path) -> None:
         Encoder().made(root).tokens(0, [1])
 
 
-def test_uploads_leave_it_out(root: Path) -> None:
+def test_uploads_ignore_the_cache(root: Path) -> None:
     (root / ".gitignore").write_text("mine\n")
     for _ in range(2):
         Encoder().made(root)
@@ -143,13 +143,13 @@ def test_uploads_leave_it_out(root: Path) -> None:
 
 
 @pytest.mark.parametrize("case", ["no dataset", "no camera"])
-def test_a_wrong_folder_or_camera_is_refused(case: str, root: Path, tmp_path: Path) -> None:
+def test_missing_dataset_or_camera_is_refused(case: str, root: Path, tmp_path: Path) -> None:
     where, camera = (tmp_path, CAMERA) if case == "no dataset" else (root, "observation.images.front")
     with pytest.raises(MemobenchError):
         make_features(where, "test", Encoder().features(), camera=camera)
 
 
-def test_videos_are_read_by_default(root: Path) -> None:
+def test_videos_are_the_default_source(root: Path) -> None:
     bright = Features("mean", 1, 1, lambda images: images.mean(dim=(1, 2, 3)).view(-1, 1, 1))
     found = make_features(root, "test", bright, camera=CAMERA, stride=8, workers=2)
     assert set(load_file(episode_file(found.folder, 0))) == {"tokens"}

@@ -15,11 +15,11 @@ from lerobot_memobench.policies.memobench_mem.losses import counted_actions, mea
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
 from tests.support import rank_case
 from tests.support.fork_server import ForkServer
-from tests.support.small_policy import CHUNK, batch_of, made_for_training, small_config
+from tests.support.small_policy import CHUNK, batch_of, made_for_training, open_small_training, small_config
 
 
 @pytest.mark.parametrize("memory", ["none", "frames"])
-def test_lerobots_own_trainer_trains_without_a_memory(synthetic: Path, memory: str) -> None:
+def test_lerobots_batches_train_policies_without_memory(synthetic: Path, memory: str) -> None:
     """Frames as LeRobot draws them; actions of prompts do not count."""
     config = small_config(size="tiny", memory=memory)
     times = {"action": [step / 20 for step in range(CHUNK)]}
@@ -33,6 +33,18 @@ def test_lerobots_own_trainer_trains_without_a_memory(synthetic: Path, memory: s
         return
     per_sample, _ = policy.train().forward(batch, reduction="none")
     assert (per_sample > 0).tolist() == [True, False, True], "the second frame is of a prompt"
+
+
+def test_recorded_samples_equal_lerobots(objects: Path) -> None:
+    """Frames at the start and at the end of episodes, where chunks are padded."""
+    training = open_small_training(objects, small_config(size="tiny", perception="objects"))
+    times = {"action": [step / 20 for step in range(CHUNK)]}
+    theirs, ours = LeRobotDataset("local/data", root=objects, delta_timestamps=times), training.samples()
+    for index in (0, 33, 34, 35, 39, 40, 62, 93):
+        expected, found = theirs[index], ours[index]
+        for name in ("action", "action_is_pad", "observation.state", "episode_index", "task_index"):
+            assert torch.equal(found[name], expected[name]), (index, name)
+        assert found["task"] == expected["task"]
 
 
 def test_padded_actions_do_not_count(synthetic: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,18 +66,18 @@ def test_mean_losses_without_padding_is_the_mean() -> None:
     found = mean_losses(losses, counted_actions({}, losses))
     torch.testing.assert_close(found.mean, losses.mean())
     torch.testing.assert_close(found.per_sample, losses.mean(dim=(1, 2)))
-    nothing = mean_losses(losses, torch.zeros(4, 5))
-    assert nothing.mean == 0
-    assert nothing.per_sample.tolist() == [0] * 4
+    no_action = mean_losses(losses, torch.zeros(4, 5))
+    assert no_action.mean == 0
+    assert no_action.per_sample.tolist() == [0] * 4
 
 
 @pytest.mark.parametrize("memory", ["subgoal", "keyframes"])
-def test_a_loss_that_is_measured_follows_the_memorys_own_choice(objects: Path, memory: str) -> None:
+def test_evaluation_loss_uses_the_memorys_own_choice(objects: Path, memory: str) -> None:
     policy, before, _, dataset = made_for_training(
         objects, memory=memory, memory_frames=32, perception="objects", size="small"
     )
     if memory == "keyframes":
-        policy.model.fusion.open_gate()  # so that actions depend on what it reads
+        policy.model.fusion.open_gate()  # so that actions depend on the memory
     batch = before(batch_of(dataset, [10, 30, 50]))
     others = {name: (batch[name] + 1) % len(policy.config.subgoal_texts) for name in (SUBGOAL, SUBGOALS)}
     with torch.no_grad():
@@ -73,7 +85,7 @@ def test_a_loss_that_is_measured_follows_the_memorys_own_choice(objects: Path, m
             mine, other = (policy.train(learns).forward(one)[1] for one in (batch, {**batch, **others}))
             assert (mine["action_loss"] == other["action_loss"]) is not learns
             own = [name for name in mine if name.startswith("memory_")]
-            assert any(mine[name] != other[name] for name in own), "it is measured by the labels all the same"
+            assert any(mine[name] != other[name] for name in own), "the labels still measure it"
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Which frames are drawn, in which order, and where a resumed training continues."""
+"""The frames of a training and their order, also after a resume."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def sampler(**options: Any) -> Any:
     return frame_sampler(EPISODES, PHASE, options.pop("used", None), seed=5, **options)
 
 
-def test_an_execution_begins_behind_its_prompt() -> None:
+def test_execution_starts_after_the_prompt() -> None:
     phase = np.array([0, 0, 1, 1, 1, 1, 0, 0])
     assert execution_starts(np.array([0, 4, 6, 8]), phase).tolist() == [2, 4, 8]
 
 
 @pytest.mark.parametrize("used", [None, [2, 1]])
-def test_single_frames_come_in_lerobots_order(used: list[int] | None) -> None:
+def test_single_frames_have_lerobots_order(used: list[int] | None) -> None:
     theirs = EpisodeAwareSampler([0, 48, 63], [40, 63, 94], episode_indices_to_use=used, shuffle=True, seed=5)
     ours = sampler(used=used)
     assert len(ours) == len(theirs)
@@ -36,7 +36,7 @@ def test_single_frames_come_in_lerobots_order(used: list[int] | None) -> None:
 
 
 @pytest.mark.parametrize(("step", "batch_size", "processes"), [(3, 8, 1), (11, 8, 1), (25, 8, 1), (9, 4, 3)])
-def test_a_resumed_training_draws_the_rest(step: int, batch_size: int, processes: int) -> None:
+def test_resumed_training_draws_the_rest_of_the_epoch(step: int, batch_size: int, processes: int) -> None:
     ours, whole = sampler(), sampler()
     ours.go_on(step, batch_size, processes)
     state = compute_sampler_state(step, len(whole), batch_size, processes)
@@ -46,13 +46,13 @@ def test_a_resumed_training_draws_the_rest(step: int, batch_size: int, processes
     assert list(ours) == epochs[state["epoch"] + 1]
 
 
-def test_a_dataset_without_execution_is_refused() -> None:
+def test_dataset_without_execution_is_refused() -> None:
     with pytest.raises(MemobenchError, match="execution frame"):
         frame_sampler(EPISODES, np.zeros(94, int), None)
 
 
 @pytest.mark.parametrize("moments", [1, 3, 6])
-def test_every_place_once_in_groups_of_an_episode(moments: int) -> None:
+def test_grouped_order_draws_every_frame_once(moments: int) -> None:
     ends = np.cumsum([7, 30, 1, 12])
     order = grouped_order(ends, moments, torch.Generator().manual_seed(1))
     assert sorted(order.tolist()) == list(range(50))
@@ -68,7 +68,7 @@ def test_every_place_once_in_groups_of_an_episode(moments: int) -> None:
 
 
 @pytest.mark.parametrize("weights", [(1, 1, 1), (1, 3, 2)])
-def test_tasks_are_drawn_by_their_weights_however_long_their_episodes_are(weights: tuple[int, ...]) -> None:
+def test_tasks_are_drawn_by_weight_and_not_by_length(weights: tuple[int, ...]) -> None:
     ends, tasks = np.cumsum([600, 30, 1, 1200, 20]), np.array([2, 0, 1, 2, 0])
     chance = torch.Generator().manual_seed(1)
     order = weighted_order(ends, tasks, np.array(weights, float), 6, chance).numpy()

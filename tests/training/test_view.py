@@ -31,12 +31,12 @@ def opened(root: Path, **options: Any) -> LeRobotDataset:
 
 
 def inputs(root: Path) -> dict[str, FeatureType]:
-    """Return what LeRobot takes for inputs of a policy."""
+    """Return the columns that LeRobot uses as inputs of a policy."""
     found = dataset_to_policy_features(opened(root).meta.features).items()
     return {name: one.type for name, one in found if one.type is not FeatureType.ACTION}
 
 
-def test_its_frames_are_the_datasets_after_the_prompt(pictured: Path, tmp_path: Path) -> None:
+def test_view_holds_the_frames_after_the_prompt(pictured: Path, tmp_path: Path) -> None:
     """Pictures, state, action and time within the episode; chunks end with their episode."""
     write_view(pictured, tmp_path / "view", Choice(obs_type=BOTH))
     times = {"action": [0.0, 0.05, 0.1]}
@@ -70,7 +70,7 @@ def test_histories_do_not_reach_into_the_prompt(pictured: Path, tmp_path: Path) 
     ("obs_type", "seen"),
     [(PIXELS, {STATE, PICTURE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, PICTURE})],
 )
-def test_lerobot_takes_the_chosen_inputs(obs_type: str, seen: set[str], pictured: Path, tmp_path: Path) -> None:
+def test_lerobot_finds_the_chosen_inputs(obs_type: str, seen: set[str], pictured: Path, tmp_path: Path) -> None:
     write_view(pictured, tmp_path / "view", Choice(obs_type=obs_type))
     assert set(inputs(tmp_path / "view")) == seen
     stats = opened(tmp_path / "view").meta.stats
@@ -79,7 +79,7 @@ def test_lerobot_takes_the_chosen_inputs(obs_type: str, seen: set[str], pictured
     assert np.array_equal(stats[STATE]["mean"], theirs[STATE]["mean"])
 
 
-def test_language_is_as_old_as_its_frame(tmp_path: Path) -> None:
+def test_language_timestamps_move_with_their_frames(tmp_path: Path) -> None:
     root = write_streams(tmp_path / "streams", frames=9)
     write_view(root, tmp_path / "view", Choice(obs_type=PIXELS))
     whole, view = opened(root), opened(tmp_path / "view")
@@ -92,7 +92,7 @@ def test_language_is_as_old_as_its_frame(tmp_path: Path) -> None:
         assert float(here["timestamp"]) - float(new["timestamp"]) == pytest.approx(age, abs=1e-5)
 
 
-def test_who_is_trained_on_what(pictured: Path, synthetic: Path) -> None:
+def test_choice_depends_on_policy_and_dataset(pictured: Path, synthetic: Path) -> None:
     features = opened(pictured).meta.features
     plain = ACTConfig(**ACT)
     assert choice_for(plain, features, None, None) == Choice(False, PIXELS)
@@ -109,32 +109,30 @@ def test_who_is_trained_on_what(pictured: Path, synthetic: Path) -> None:
     assert needs_view(foreign | {SLOTS: {"dtype": "float32", "shape": (3,)}}, Choice(False, PIXELS))
 
 
-def test_observations_that_are_not_there_are_refused(synthetic: Path, objects: Path, tmp_path: Path) -> None:
+def test_missing_observations_are_refused(synthetic: Path, objects: Path, tmp_path: Path) -> None:
     for root, obs_type in ((synthetic, OBJECTS), (objects, PIXELS), (objects, BOTH)):
         with pytest.raises(MemobenchError, match=f"obs_type={obs_type}"):
             write_view(root, tmp_path / "view", Choice(obs_type=obs_type))
     assert not (tmp_path / "view").exists()
 
 
-def test_a_training_reads_one_view_however_often_it_starts(
-    pictured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_trainings_share_a_view(pictured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     given = read_arguments("train", split_arguments(["policy=act", "policy.device=cpu", f"dataset={pictured}"]))
-    told: list[str] = []
+    notes: list[str] = []
     for _ in range(2):
-        found = viewed(given, None, OBJECTS, told.append)
+        found = viewed(given, None, OBJECTS, notes.append)
     folder = Path(str(found.get("dataset.root")))
     assert set(inputs(folder)) == {STATE, SLOTS}
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
-    kept = viewed(given, True, None, told.append)
+    kept = viewed(given, True, None, notes.append)
     assert "observation.phase" not in str(kept.get("policy.input_features"))
     assert "observation.images.image" in str(kept.get("policy.input_features"))
     with pytest.raises(MemobenchError, match=r"episodes=\[7\]"):
-        viewed(given.default("dataset.episodes", "[7]"), None, None, told.append)
+        viewed(given.default("dataset.episodes", "[7]"), None, None, notes.append)
 
 
-def test_the_command_writes_one(pictured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_a_view(pictured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "view"
     assert memobench(["view", str(pictured), "--obs-type", OBJECTS, "--out", str(out)]) == 0
     assert set(inputs(out)) == {STATE, SLOTS}
@@ -143,7 +141,7 @@ def test_the_command_writes_one(pictured: Path, tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.slow
-def test_lerobots_trainer_trains_on_it(pictured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lerobots_trainer_reads_a_view(pictured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lerobot_memobench.cli.lerobot import main as lerobot
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

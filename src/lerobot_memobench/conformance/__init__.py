@@ -1,5 +1,5 @@
-"""Whether a policy remembers as it should: the same in training as in a rollout, each row by itself.
+"""Check the memory of a policy: equal in training and in rollouts, and separate for each row of a batch.
 
-`checks` says what is asked, `subject` drives a policy, `streams` makes what it observes, `pytest_class` asks within
-somebody's own tests. A policy is asked through LeRobot's interface alone, so any kind of memory can be.
+`checks` defines the checks, `subject` drives a policy, `streams` makes observations, `pytest_class` is a test class for
+other packages. A policy is driven through LeRobot's interface alone, so its memory may be of any kind.
 """

@@ -1,8 +1,8 @@
-"""What is asked of a memory policy, each check with one sentence on what is wrong and what to do.
+"""Checks of a memory policy; each returns a sentence with the problem and its solution.
 
-A check changes what the policy observes and compares its actions: those that may not change, and those that must. What
-a frame does is seen by showing another episode's frame in its place. A call at which the present frame decides the
-action is one at which the policy plans; a frame that decides actions of later plans is remembered.
+A check changes the policy's observations and compares its actions: some may not change, others must. The effect of a
+frame is measured by replacing it with a frame of another episode. If the present frame changes the action of its own
+call, the policy plans at that call; if a frame changes actions of later plans, it is remembered.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from lerobot_memobench.conformance.subject import Actions, Subject
 from lerobot_memobench.errors import MemobenchError
 
 PROBED = 12
-"""Execution frames that are replaced, one at a time, to see what each of them decides."""
+"""Execution frames that are replaced, one at a time, to measure their effects."""
 SHARE, LEAST = 0.01, {"float32": 2e-6, "other": 1e-2}
-"""Actions are equal that differ by less than this share of what a memory changes in them, or by rounding, which depends
-on how many rows are computed at once and on the precision of the weights."""
-RESETS = "reset() is to forget the history and the action queue of every row"
-BY_ROW = "keep history and action queue by row, and let each row's phase and step alone say when it begins and plans"
+"""Actions are equal if they differ by less than this share of a memory's effect, or by rounding, which depends on the
+number of rows in a batch and on the precision of the weights."""
+RESETS = "let reset() clear the history and the action queue of every row"
+BY_ROW = "keep a history and an action queue for each row, and begin and plan by that row's phase and step alone"
 
 
 class Outcome(StrEnum):
@@ -38,7 +38,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Result:
-    """What a check found: its name, its outcome, and a sentence."""
+    """Result of a check: its name, its outcome, and a sentence."""
 
     check: str
     outcome: Outcome
@@ -46,11 +46,11 @@ class Result:
 
 
 class Refuted(Exception):
-    """A check's sentence, where it does not hold."""
+    """A check failed; the message is its sentence."""
 
 
 class NotAsked(Exception):
-    """Why a check does not apply."""
+    """A check does not apply; the message is the reason."""
 
     def __init__(self, sentence: str, outcome: Outcome = Outcome.NOT_CHECKED) -> None:
         super().__init__(sentence)
@@ -58,7 +58,7 @@ class NotAsked(Exception):
 
 
 class Behaviour:
-    """What a policy did when frames were replaced, measured once for all checks.
+    """Actions of a policy when frames are replaced, measured once for all checks.
 
     Attributes:
         one, two, three: the streams. A check looks at the row of ``one``.
@@ -76,30 +76,29 @@ class Behaviour:
         except MemobenchError:
             raise
         except Exception as error:
-            told = f"{type(error).__name__}: {error}"
             raise MemobenchError(
-                f"{subject.name} does not act on this benchmark's observations: it raised {told}"
+                f"{subject.name} does not act on this benchmark's observations: {type(error).__name__}: {error}"
             ) from error
 
     def changes(self, calls: Iterable[int]) -> Actions:
-        """Return by how much each call's action changes, where the second stream's frames are shown at some calls."""
+        """Return the change of each call's action if the second stream's frames are shown at some calls."""
         found = self.subject.roll([self.one.showing(self.two, [*calls])])[:, 0]
         return np.abs(found - self.alone).max(axis=1)
 
     @cached_property
     def by_frame(self) -> dict[int, Actions]:
-        """Execution frame -> by how much each call's action changes when that frame alone is another."""
+        """Execution frame -> change of each call's action if that frame alone is replaced."""
         frames = range(self.one.start, min(self.one.start + PROBED, len(self.one)))
         return {frame: self.changes([frame]) for frame in frames}
 
     @cached_property
     def plans(self) -> list[int]:
-        """The frames, of those that were replaced, at which the policy plans: they decide their own call's action."""
+        """The replaced frames at which the policy plans: they change their own call's action."""
         return [frame for frame, change in self.by_frame.items() if change[frame] > 0]
 
     @cached_property
     def all_plans(self) -> list[int]:
-        """The frames of the whole stream at which it plans, where it does so at equal intervals; else `plans`."""
+        """The frames of the whole stream at which it plans, if the intervals are equal; else `plans`."""
         steps = set(np.diff(self.plans).tolist())
         if len(steps) != 1:
             return self.plans
@@ -107,42 +106,42 @@ class Behaviour:
         return frames if self.changes(frames[-1:])[frames[-1]] > 0 else self.plans
 
     @cached_property
-    def beside_two(self) -> Actions:
+    def after_two(self) -> Actions:
         """The actions (calls, A) of the first stream in the row after the second one."""
         return self.subject.roll([self.two, self.one])[:, 1]
 
     def later(self, frame: int) -> float:
-        """Return by how much a frame changes actions of plans after it."""
+        """Return the effect of a frame on actions of later plans."""
         plan = next((plan for plan in self.plans if plan > frame), None)
         return 0.0 if plan is None else float(self.by_frame[frame][plan:].max())
 
     @cached_property
     def prompt(self) -> float:
-        """By how much another prompt changes actions of the execution."""
+        """Effect of another prompt on actions of the execution."""
         start = self.one.start
         return float(self.changes(range(start))[start:].max()) if start else 0.0
 
     @cached_property
     def memory(self) -> float:
-        """By how much frames of the past change actions; 0 where none does."""
+        """Effect of past frames on actions, 0 without a memory."""
         return max([self.prompt, *(self.later(frame) for frame in self.by_frame)])
 
     @cached_property
     def tolerance(self) -> float:
-        """By how much actions may differ and be equal."""
+        """Largest difference of equal actions."""
         weights = next(self.subject.policy.parameters(), None)
         precise = weights is None or str(weights.dtype) == "torch.float32"
         effect = self.memory or float(np.abs(self.alone - np.roll(self.alone, 1, axis=0)).max())
         return max(SHARE * effect, LEAST["float32" if precise else "other"])
 
     def differ(self, one: Actions, other: Actions) -> int | None:
-        """Return the first call at which actions differ; None where they are equal."""
+        """Return the first call at which actions differ, None if they are equal."""
         length = min(len(one), len(other))
         calls = np.flatnonzero(~(np.abs(one[:length] - other[:length]) <= self.tolerance).all(axis=-1))
         return int(calls[0]) if len(calls) else None
 
     def require_memory(self) -> None:
-        """Leave a check out where there is no memory."""
+        """Skip a check without a memory."""
         if not self.memory:
             raise NotAsked("it has no memory", Outcome.NO_MEMORY)
 
@@ -152,7 +151,7 @@ def remembers(found: Behaviour) -> str:
     if found.memory:
         return f"frames of the past change actions by up to {found.memory:.2g}"
     raise Refuted(
-        "it has no memory: no earlier frame changes a later action; a policy that is to have none has nothing to mend"
+        "it has no memory: no earlier frame changes a later action; this is correct for a policy without memory"
     )
 
 
@@ -161,24 +160,24 @@ def reads_the_prompt(found: Behaviour) -> str:
     found.require_memory()
     if not found.subject.reads_prompt:
         raise Refuted(
-            "prompts play within reset and it observes none of them: declare reads_prompt: ClassVar[bool] = True on "
-            "the class of its configuration"
+            "it observes no prompt, because prompts are played inside reset: declare reads_prompt: ClassVar[bool] = "
+            "True on the class of its configuration"
         )
     if not found.prompt:
         raise Refuted(
-            "another prompt changes no action: take frames in while observation.phase is 0, and keep them when it "
+            "another prompt changes no action: remember frames while observation.phase is 0, and keep them when it "
             "becomes 1"
         )
     return f"another prompt changes actions by up to {found.prompt:.2g}"
 
 
-def plans_anew(found: Behaviour) -> str:
-    """The execution begins with a plan of its own first frame."""
+def plans_after_prompt(found: Behaviour) -> str:
+    """The first execution frame is planned from."""
     if found.one.start in found.plans:
         return "the first execution frame decides the first action"
     raise Refuted(
-        "the first execution frame does not decide the first action, which is left over from the prompt: empty a row's "
-        "action queue where observation.phase becomes 1"
+        "the first action of the execution does not depend on its first frame, but was planned in the prompt: clear a "
+        "row's action queue when observation.phase becomes 1"
     )
 
 
@@ -193,35 +192,35 @@ def remembers_every_step(found: Behaviour) -> str:
     if any(found.later(frame) for frame in found.plans):
         raise Refuted(
             "frames at which it plans are remembered, those between two plans are not, so its history depends on "
-            "n_action_steps: take the frame in at every call of select_action, also while a chunk is left"
+            "n_action_steps: remember the frame at every call of select_action, also while actions are queued"
         )
     raise NotAsked(
-        f"in {len(found.one) - found.one.start} frames of an execution none changes a later plan: it remembers the "
-        "prompt alone, or a frame each so many steps; set a smaller stride, as by policy.memory_stride=2"
+        f"none of {len(found.one) - found.one.start} execution frames changes a later plan: it remembers the prompt "
+        "alone, or has a long stride; set a smaller one, for example policy.memory_stride=2"
     )
 
 
 def rows_are_independent(found: Behaviour) -> str:
-    """A row's actions do not depend on the rows beside it, which begin at other steps."""
+    """A row's actions do not depend on the other rows of the batch, which begin at other steps."""
     roll, one = found.subject.roll, found.one
-    beside = roll([found.two, one, found.three])[:, 1]
+    between = roll([found.two, one, found.three])[:, 1]
     others = roll([found.three, one, found.two])[:, 1]
-    for other, of in ((others, "other rows beside it"), (found.alone, "none beside it")):
-        call = found.differ(beside, other)
+    for other, batch in ((others, "with other rows in its batch"), (found.alone, "alone in its batch")):
+        call = found.differ(between, other)
         if call is not None:
-            raise Refuted(f"at call {call} a row acts otherwise with {of}: {BY_ROW}")
-    return "a row acts alike alone and beside others"
+            raise Refuted(f"at call {call} a row acts differently {batch}: {BY_ROW}")
+    return "a row acts alike alone and with other rows"
 
 
 def frozen_rows_are_left_alone(found: Behaviour) -> str:
-    """A row that is over repeats its last frame, and changes nothing in the others."""
+    """A finished row, which repeats its last frame, does not change the other rows."""
     over = found.two.until(found.two.start + 4)
-    call = found.differ(found.subject.roll([over, found.one])[:, 1], found.beside_two)
+    call = found.differ(found.subject.roll([over, found.one])[:, 1], found.after_two)
     if call is not None:
         raise Refuted(
-            f"at call {call} a row acts otherwise beside one that is over, whose last frame is repeated: {BY_ROW}"
+            f"at call {call} a row acts differently in a batch with a finished row, which repeats its frame: {BY_ROW}"
         )
-    return "rows that are over change no other row"
+    return "finished rows change no other row"
 
 
 def reset_forgets(found: Behaviour) -> str:
@@ -232,40 +231,40 @@ def reset_forgets(found: Behaviour) -> str:
         before.append(found.subject.roll([found.one])[:, 0])
     call = found.differ(*before)
     if call is not None:
-        raise Refuted(f"at call {call} it acts otherwise after another episode: {RESETS}")
+        raise Refuted(f"at call {call} it acts differently after another episode: {RESETS}")
     found.subject.roll([found.three, found.two])
     call = found.differ(before[0], found.subject.roll([found.one])[:, 0])
     if call is not None:
-        raise Refuted(f"at call {call} it acts otherwise after a batch of more rows: {RESETS}")
+        raise Refuted(f"at call {call} it acts differently after a batch of more rows: {RESETS}")
     return "an episode is the same after any other"
 
 
 def same_history_in_training(found: Behaviour) -> str:
-    """A training sample's chunk begins as the chunk that is planned at its frame of a rollout."""
+    """The first action for a training sample equals the action that a rollout plans at its frame."""
     plans = found.all_plans
     if not plans:
-        raise NotAsked("no frame decides the action at its own call, so it is not known where a chunk begins")
+        raise NotAsked("no frame changes the action of its own call, so the beginning of a chunk is unknown")
     try:
         predicted = found.subject.predict(found.one, plans)
     except Exception as error:
-        told = str(error).splitlines()[0][:80] if str(error) else ""
+        reason = str(error).splitlines()[0][:80] if str(error) else ""
         raise NotAsked(
-            f"predict_action_chunk takes no training batch ({type(error).__name__}: {told}); let it read the history "
-            "that the batch brings, as forward does"
+            f"predict_action_chunk does not accept a training batch ({type(error).__name__}: {reason}); let it read "
+            "the history in the batch, as forward does"
         ) from None
     acted = found.alone[plans]
     call = found.differ(predicted, acted)
     if call is None:
-        return f"{len(plans)} training samples are answered as the rollout answered their frames"
+        return f"{len(plans)} training samples have the actions of the rollout"
     present = np.stack([found.subject.roll([_only(found.one, plan)])[0, 0] for plan in plans])
     if found.memory and found.differ(predicted, present) is None:
         raise NotAsked(
-            "predict_action_chunk answers a training batch by its present frames alone; let it read the history that "
-            "the batch brings, as forward does"
+            "predict_action_chunk reads only the present frames of a training batch; let it read the history in the "
+            "batch, as forward does"
         )
     raise Refuted(
-        f"for frame {plans[call]} a training sample is answered otherwise than the rollout: which frames are in the "
-        "history, their padding at the episode's begin, or a normalisation differ between the dataset and the rollout"
+        f"for frame {plans[call]} the action of a training sample differs from the rollout's: compare the frames of "
+        "the history, the padding at the start of the episode, and the normalisation"
     )
 
 
@@ -284,21 +283,21 @@ def is_deterministic(found: Behaviour) -> str:
     call = found.differ(*rolled)
     if call is not None:
         raise Refuted(
-            f"at call {call} it acts otherwise a second time, by the same seed: draw noise with torch alone, and let "
-            "reset() forget everything"
+            f"at call {call} it acts differently with the same seed: draw random numbers with torch alone, and let "
+            "reset() clear all state"
         )
     return "the same seed gives the same actions"
 
 
-def says_what_it_needs(found: Behaviour) -> str:
-    """Frames that it says it does not need are not read."""
-    call = found.differ(found.subject.roll([found.two, found.one], sparing=True)[:, 1], found.beside_two)
+def declares_needed_frames(found: Behaviour) -> str:
+    """Frames that `needs_observation` declares unnecessary are not read."""
+    call = found.differ(found.subject.roll([found.two, found.one], sparing=True)[:, 1], found.after_two)
     if call is not None:
         raise Refuted(
-            f"at call {call} it acts otherwise where frames are left out that it did not need: needs_observation() is "
-            "to be true before every frame that is remembered or planned from"
+            f"at call {call} it acts differently without frames that needs_observation() declared unnecessary: return "
+            "True before every frame that is remembered or planned from"
         )
-    return "frames that it says it does not need change nothing"
+    return "unnecessary frames have no effect"
 
 
 CHECKS: dict[str, Callable[[Behaviour], str]] = {
@@ -306,30 +305,30 @@ CHECKS: dict[str, Callable[[Behaviour], str]] = {
     "reset forgets": reset_forgets,
     "remembers": remembers,
     "reads the prompt": reads_the_prompt,
-    "plans anew after the prompt": plans_anew,
+    "plans after the prompt": plans_after_prompt,
     "remembers every control step": remembers_every_step,
     "rows are independent": rows_are_independent,
     "finished rows change no other": frozen_rows_are_left_alone,
     "same history in training": same_history_in_training,
-    "needs_observation is true": says_what_it_needs,
+    "needs_observation is true": declares_needed_frames,
 }
-"""Name -> check, what others build on first. It returns a sentence where it holds, and raises `Refuted` or `NotAsked`
-with one where it does not."""
+"""Name -> check, in an order in which later checks rely on earlier ones. A check returns a sentence if it passes, and
+raises `Refuted` or `NotAsked` otherwise."""
 
 
 def run_check(name: str, found: Behaviour) -> Result:
-    """Return what one check finds."""
+    """Run one check."""
     try:
         return Result(name, Outcome.PASSED, CHECKS[name](found))
     except Refuted as error:
         return Result(name, Outcome.FAILED, str(error))
     except NotAsked as error:
         return Result(name, error.outcome, str(error))
-    except Exception as error:  # of anybody's policy
+    except Exception as error:  # any policy may raise anything
         return Result(name, Outcome.FAILED, f"the policy raised {type(error).__name__}: {error}")
 
 
 def run_checks(subject: Subject) -> list[Result]:
-    """Return what all checks find, in their order."""
+    """Run all checks in their order."""
     found = Behaviour(subject)
     return [run_check(name, found) for name in CHECKS]

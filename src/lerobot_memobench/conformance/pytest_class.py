@@ -1,4 +1,4 @@
-"""The checks as tests of pytest: a class to be subclassed in somebody's own tests, one test for each check."""
+"""The checks as tests of pytest: subclass `MemoryConformance` in the tests of a policy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lerobot_memobench.conformance.subject import load_subject
 
 
 class MemoryConformance:
-    """Check a policy. A check that does not apply is skipped, with its reason.
+    """One test for each check of a policy; a check that does not apply is skipped with its reason.
 
     Attributes:
         arguments: as `memobench conformance` takes them, ``("policy=mine", "policy.width=32")``.
@@ -25,7 +25,7 @@ class MemoryConformance:
     @pytest.fixture(scope="class")
     @classmethod
     def behaviour(cls) -> Iterator[Behaviour]:
-        """The policy, and what it did; measured once for the class."""
+        """The actions of the policy, measured once for the class."""
         with TemporaryDirectory() as folder:
             yield Behaviour(load_subject(cls.arguments, Path(folder)))
 

@@ -1,4 +1,4 @@
-"""Observations to drive a policy with: a small dataset in the form of `memobench generate`, and episodes out of one."""
+"""Observations for a policy: a small dataset like those of `memobench generate`, and the episodes of a dataset."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import Task
 
 TASK = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"
-"""It has three checkpoints, among which a memory that is privileged in training can choose."""
+"""A task with three checkpoints, for memories that choose among subgoals."""
 PROMPTS = (8, 11, 14)
-"""Frames of the episodes' prompts: they differ, so rows of a batch begin to act at different calls."""
+"""Frames of each episode's prompt. They differ, so that the rows of a batch begin to act at different calls."""
 EXECUTION_FRAMES = 27
 THINGS = 4
-"""Objects of the made-up scenes."""
+"""Objects of a synthetic scene."""
 
 
 def write_streams(folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK) -> Path:
-    """Write a dataset of three short episodes: real columns and shapes, made-up pictures, states and objects.
+    """Write a dataset of three short episodes with the real columns and shapes and with synthetic values.
 
     Args:
-        frames: of each execution. task: whose instruction and checkpoints they have.
+        frames: of each execution. task: gives instruction and checkpoints.
     """
     return write_dataset(
         (_episode(get_task(task), seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS)), folder
@@ -40,10 +40,10 @@ def write_streams(folder: Path, pictures: bool = True, frames: int = EXECUTION_F
 
 
 def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
-    """Return a task of the catalogue whose checkpoints a memory can say, best one with a prompt and many of them.
+    """Return a task with checkpoints that a memory knows, preferably with a prompt and many checkpoints.
 
     Args:
-        subgoals: instruction -> texts, of a memory that is privileged in training. Of none that is known: `TASK`.
+        subgoals: instruction -> texts that the memory was trained with. If no task fits, `TASK` is returned.
     """
     known = {text for own in subgoals.values() for text in own}
     found = [
@@ -60,7 +60,7 @@ def _texts_of_levels(task: Task) -> Iterator[tuple[str, ...]]:
 
 
 def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) -> Demonstration:
-    """An episode in which an arm and some things move smoothly, by numbers that the seed decides."""
+    """Return an episode with smooth random motions of an arm and some objects."""
     rng, length = np.random.default_rng(seed), prompt + frames
     count = len(task.checkpoints)
     completed = prompt + frames * np.arange(1, count + 1) // (count + 1)
@@ -104,7 +104,7 @@ def _pictures(rng: np.random.Generator, places: NDArray[np.float32]) -> NDArray[
 
 @dataclass(frozen=True)
 class Stream:
-    """What one environment shows, call by call; when it is over it repeats its last frame, as LeRobot's do.
+    """Observations of one environment, call by call; a finished one repeats its last frame, as LeRobot's do.
 
     Attributes:
         frames: observations by their names at the policy, without a batch dimension.
@@ -120,7 +120,7 @@ class Stream:
         return len(self.frames)
 
     def at(self, call: int) -> dict[str, Tensor]:
-        """Return what is shown at a call."""
+        """Return the observation at a call."""
         return self.frames[min(call, len(self) - 1)]
 
     @property
@@ -129,23 +129,23 @@ class Stream:
         return next(call for call, frame in enumerate(self.frames) if float(frame[OBS_PHASE]) == EXECUTION)
 
     def until(self, call: int) -> Stream:
-        """Return the stream that is over after a call."""
+        """Return the stream that ends after a call."""
         return replace(self, frames=self.frames[: call + 1])
 
     def showing(self, other: Stream, calls: Sequence[int]) -> Stream:
-        """Return the stream that shows at some calls what another one does, at its own phase and step."""
+        """Return the stream with another one's observations at some calls; phase and step stay its own."""
         shown = {call: {**other.at(call), **{name: self.at(call)[name] for name in CLOCK}} for call in calls}
         return replace(self, frames=tuple(shown.get(call, frame) for call, frame in enumerate(self.frames)))
 
 
 def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: bool, frames: int) -> Iterator[Stream]:
-    """Yield the beginning of each episode of a LeRobotDataset as a rollout would show it.
+    """Yield the beginning of each episode of a LeRobotDataset as a rollout observes it.
 
     Args:
         dataset: without delta timestamps.
-        pictures: whether cameras are observed. objects: the column of object state that is; None where none is.
-        prompts: whether the prompt is; else the stream begins with the execution.
-        frames: so many of the execution.
+        pictures: whether cameras are observed. objects: the observed column of object state, or None.
+        prompts: whether the prompt is observed; else the stream begins with the execution.
+        frames: number of execution frames.
     """
     from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
@@ -159,12 +159,12 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
         for index in range(first if prompts else first + start, min(first + start + frames, end)):
             item = dataset[index] if pictures else dataset.hf_dataset[index]
             frame = {key: item[key] for key in (OBS_STATE, *CLOCK)}
-            frame |= {key: _real(item[key]) for key in item if pictures and key.startswith(f"{OBS_IMAGES}.")}
+            frame |= {key: _as_float(item[key]) for key in item if pictures and key.startswith(f"{OBS_IMAGES}.")}
             frame |= {} if objects is None else {OBS_ENV_STATE: item[objects]}
             shown.append(frame)
         yield Stream(tuple(shown), episode["tasks"][0], first if prompts else first + start)
 
 
-def _real(picture: Tensor) -> Tensor:
+def _as_float(picture: Tensor) -> Tensor:
     """Return a picture in [0, 1], as LeRobot's training loop gives it to a policy."""
     return picture.to(torch.float32) / 255 if picture.dtype == torch.uint8 else picture

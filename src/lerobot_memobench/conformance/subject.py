@@ -1,4 +1,4 @@
-"""A policy that is asked: made or loaded as ``lerobot train`` does, driven as ``lerobot eval`` does."""
+"""The checked policy: made or loaded as by ``lerobot train``, driven as by ``lerobot eval``."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from lerobot_memobench.run.rollout import has_planned_action, needs_observation
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 
 REPLAN = 3
-"""Actions per chunk where none are asked for: several chunks begin within a short stream."""
+"""Default actions per chunk, so that a short stream has several chunks."""
 STREAMS = 3
-"""Episodes that are needed: a row, and two others beside it."""
+"""Number of episodes: a row, and two others in its batch."""
 KEYS = ("policy", "dataset", "obs_type")
 
 Actions = NDArray[np.float32]
-"""What a policy answers: (calls, rows, A)."""
+"""Actions (calls, rows, A) of a policy."""
 
 
 @dataclass
 class Subject:
-    """A policy with its processors, a dataset, and what its episodes show in a rollout.
+    """A policy with its processors, a dataset, and the observations of its episodes in a rollout.
 
     Attributes:
-        dataset: as it is trained on: with the policy's own delta timestamps.
+        dataset: samples as in training, with the policy's delta timestamps.
         streams: `STREAMS` episodes.
         cameras: of the dataset.
-        numbers: (N,) index in ``dataset`` of each frame, by its global index in the dataset that was named.
+        numbers: (N,) index in ``dataset`` of each frame of the named dataset.
     """
 
     name: str
@@ -65,12 +65,12 @@ class Subject:
         return reads_prompt(self.policy.config)
 
     def roll(self, streams: Sequence[Stream], *, equal_noise: bool = True, sparing: bool = False) -> Actions:
-        """Reset the policy and let it act on streams, a row each, until the longest is over.
+        """Reset the policy and let it act on streams, one row each, until the longest ends.
 
         Args:
-            equal_noise: let every row and every call draw the same noise, so that actions can be compared.
-            sparing: give it earlier pictures and objects again where it does not need those of the present, and all
-                but the clock where its next action is planned, as evaluations do.
+            equal_noise: let every row and call draw the same noise, so that actions can be compared.
+            sparing: repeat earlier pictures and objects if the policy does not need new ones, and everything except
+                the clock if its next action is planned already, as evaluations do.
         """
         needed, planned = needs_observation(self.policy), has_planned_action(self.policy)
         last: dict[str, Any] = {}
@@ -96,10 +96,10 @@ class Subject:
         return batch | {"task": [stream.task for stream in streams]}
 
     def predict(self, stream: Stream, calls: Sequence[int]) -> Actions:
-        """Return the first actions (calls, A) of the chunks that it predicts for samples of a training batch.
+        """Return the first actions (calls, A) of the chunks predicted for a training batch.
 
         Args:
-            stream: an episode. calls: frames of it, which become the samples.
+            stream: an episode. calls: its frames that are the samples.
         """
         from lerobot.utils.collate import lerobot_collate_fn
 
@@ -115,9 +115,9 @@ class Subject:
 
 
 class EqualNoise(TorchFunctionMode):
-    """While it lasts, random tensors are the same at every call, and along every axis but the last one.
+    """Make random tensors equal at every call, and along every axis except the last one.
 
-    What a row draws then depends neither on the number of rows nor on what was drawn before.
+    The noise of a row then depends neither on the number of rows nor on earlier draws.
     """
 
     RANDOM = (
@@ -126,7 +126,7 @@ class EqualNoise(TorchFunctionMode):
     )
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call a function of torch's; level what it drew."""
+        """Call a function of torch, and replace the values that it drew."""
         found = function(*args, **(kwargs or {}))
         if function in self.RANDOM:
             width = found.shape[-1] if found.dim() > 1 else 1
@@ -135,11 +135,11 @@ class EqualNoise(TorchFunctionMode):
 
 
 def load_subject(words: Sequence[str], folder: Path) -> Subject:
-    """Make or load the policy that is asked, and what it observes.
+    """Make or load a policy and its observations.
 
     Args:
         words: ``policy=…``, settings of it, ``dataset=…``, ``obs_type=…``, as ``lerobot train`` takes them.
-        folder: empty; a dataset is made in it where none is named.
+        folder: empty, for a dataset if none is named.
 
     Raises:
         MemobenchError: no policy is named, it cannot be built, or the dataset has too few episodes.
@@ -201,7 +201,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
         loaded = {} if path is None else {"preprocessor_overrides": {"device_processor": {"device": config.device}}}
         before, after = make_pre_post_processors(config, path, dataset_stats=dataset.meta.stats, **loaded)
     if path is None:
-        _begin_somewhere(policy)
+        _draw_zero_weights(policy)
     policy.eval()
     shown = obs_type_of(config) or PIXELS
     objects = objects_column(raw.meta.features) if shown in (OBJECTS, BOTH) else None
@@ -212,8 +212,8 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     return Subject(config.type, policy, before, after, dataset, streams, raw.meta.camera_keys, numbers)
 
 
-def _begin_somewhere(policy: Any) -> None:
-    """Draw the weights that begin at zero: a memory behind them would have no effect yet."""
+def _draw_zero_weights(policy: Any) -> None:
+    """Draw the weights that are initialised to zero, behind which a memory would have no effect."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for weights in policy.parameters():

@@ -1,4 +1,4 @@
-"""Jobs, the processes of this machine that run them, their end by a signal, and locks on folders and files."""
+"""Jobs, the processes of this machine that run them, termination by a signal, and locks on folders and files."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 
 class Job(Protocol):
-    """A piece of work. Pickled to other processes and machines, so ``folder`` is on a disk they share."""
+    """A piece of work. It is pickled to other processes and machines, so ``folder`` is on a disk that they share."""
 
     @property
     def folder(self) -> Path:
-        """Where the result goes; no two jobs have the same."""
+        """Folder of the result, unique to the job."""
 
     @property
     def task_name(self) -> str:
@@ -38,21 +38,21 @@ class Job(Protocol):
 
     @property
     def seed(self) -> int:
-        """Its number among those of that name."""
+        """Number among the jobs of that name."""
 
     def run(self) -> None:
-        """Leave the result, or the reason why there is none, in ``folder``."""
+        """Write the result, or the reason for its absence, to ``folder``."""
 
     def finished(self) -> bool:
-        """Whether ``folder`` holds everything that the job had to leave there."""
+        """Return whether ``folder`` is complete."""
 
     def failure(self) -> str | None:
-        """Why a finished job has no result, or None."""
+        """Return why a finished job has no result, or None."""
 
 
 @dataclass(frozen=True)
 class Advance:
-    """Progress after a job: how many of ``total`` are done, ``found`` of them before this run, and the newest job."""
+    """Progress after a job: ``done`` of ``total`` jobs, ``found`` of them before this run, and the newest job."""
 
     done: int
     total: int
@@ -69,10 +69,10 @@ MOST_NAMED = 5
 
 
 def check_finished(jobs: Sequence[Job], logs: Path) -> None:
-    """Refuse to go on with jobs that ended without a result, as a killed one does.
+    """Refuse jobs that ended without a result, for example because they were killed.
 
     Raises:
-        MemobenchError: naming them, and how to go on.
+        MemobenchError: names the jobs.
     """
     failed = [job.folder.name for job in jobs if not job.finished()]
     if not failed:
@@ -80,12 +80,12 @@ def check_finished(jobs: Sequence[Job], logs: Path) -> None:
     names = ", ".join(failed[:MOST_NAMED]) + (f" and {len(failed) - MOST_NAMED} more" if failed[MOST_NAMED:] else "")
     raise MemobenchError(
         f"{len(failed)} of {len(jobs)} jobs ended without a result ({names}); "
-        f"see {logs}, then run the same command again (an evaluation's with resume=true), which runs these alone"
+        f"see {logs}, then run the same command again (an evaluation with resume=true) for the missing jobs"
     )
 
 
 def run_in_processes(jobs: Sequence[Job], workers: int, done: Callable[[Job], None]) -> None:
-    """Run the jobs, ``workers`` at a time; call ``done`` with each in the order in which they end."""
+    """Run the jobs, ``workers`` at a time; call ``done`` with each job when it ends."""
     with process_pool(min(workers, len(jobs))) as pool:
         futures: dict[Future[None], Job] = {pool.submit(job.run): job for job in jobs}
         for future in as_completed(futures):
@@ -94,13 +94,13 @@ def run_in_processes(jobs: Sequence[Job], workers: int, done: Callable[[Job], No
 
 
 class WorkerKilledError(MemobenchError):
-    """A process that this one had started was killed; commands end with status 1."""
+    """A worker process was killed; commands end with status 1."""
 
     exit_code = 1
 
 
 def _is_dead_worker(error: BaseException) -> bool:
-    """Return whether an error is how multiprocessing, or a loader of torch, reports a process that is gone."""
+    """Return whether multiprocessing or a data loader of torch raised an error because a process was killed."""
     if isinstance(error, RuntimeError):
         return str(error).startswith("DataLoader worker (pid")
     frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
@@ -109,29 +109,29 @@ def _is_dead_worker(error: BaseException) -> bool:
 
 @contextlib.contextmanager
 def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that end with the one that started them; what still waits when the context ends is dropped."""
-    # Processes are spawned: a forked child would have locks of its parent's threads, but not the threads.
+    """Yield a pool of processes that end with this process; waiting jobs are cancelled at the end of the context."""
+    # Processes are spawned, because a forked child has the locks of its parent's threads without the threads.
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker)
     try:
         yield pool
     except BrokenProcessPool:
         raise WorkerKilledError(
             f"one of {workers} worker processes was killed, usually because memory ran out; run the same command "
-            "again to go on from here, with fewer workers"
+            "again with fewer workers to continue"
         ) from None
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _begin_worker() -> None:
-    """End this worker when the process that started it is gone, however it went; else it would wait on.
+    """Prepare a worker process: it ends when its parent ends, even if the parent is killed.
 
-    Ctrl-C is the parent's to handle: the job at hand is finished, so that nothing is lost.
+    The worker ignores Ctrl-C, which the parent handles, and finishes its job.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    use_threads(ACTING)  # one of as many as there are cores
+    use_threads(ACTING)  # there are as many workers as cores
     name = multiprocessing.current_process().name  # SpawnProcess-3
-    os.environ["MEMOBENCH_WORKER"] = name.rpartition("-")[2]  # workers draw on several GPUs in turn, where there are
+    os.environ["MEMOBENCH_WORKER"] = name.rpartition("-")[2]  # workers render on several GPUs in turn
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -144,14 +144,13 @@ def _begin_worker() -> None:
 
 @contextlib.contextmanager
 def saying_how_to_go_on(program: str, how: Callable[[], str]) -> Iterator[None]:
-    """Print how to go on where SIGTERM ends the process in this block, or a worker of it is killed.
+    """Print advice on continuing if SIGTERM terminates this process in the block, or if a worker is killed.
 
-    SIGTERM (a job is preempted, its time is up) ends this process and all that it has started. Nothing is waited for:
-    the files on the disk are whole, as after any kill. In another thread than the main one, and where the signal has
-    another handler, the signal is left alone.
+    SIGTERM (a job is preempted, its time is up) ends this process and its descendants at once: all files on the disk
+    are complete. The signal keeps its handler in other threads than the main one, and if it has another handler.
 
     Args:
-        program: name of the command. how: returns how to go on. An inner block replaces an outer one.
+        program: name of the command. how: returns the advice. An inner block replaces an outer one.
 
     Raises:
         WorkerKilledError: a worker process was killed.
@@ -163,7 +162,7 @@ def saying_how_to_go_on(program: str, how: Callable[[], str]) -> Iterator[None]:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return
-        try:  # no stream: the signal may have come while one was being written to
+        try:  # not sys.stderr: the signal may interrupt a write to it
             os.write(2, f"{program}: ended by SIGTERM; {how()}\n".encode())
         finally:
             _kill_descendants()
@@ -189,7 +188,7 @@ def saying_how_to_go_on(program: str, how: Callable[[], str]) -> Iterator[None]:
 
 
 def _kill_descendants() -> None:
-    """Kill every process that descends from this one; each is stopped first, so that none starts another meanwhile."""
+    """Kill the descendants of this process; each is suspended first, so that it starts no other process."""
     stopped: set[psutil.Process] = set()
     while new := _descendants() - stopped:
         for process in new:
@@ -202,7 +201,7 @@ def _kill_descendants() -> None:
 
 
 def _descendants() -> set[psutil.Process]:
-    """Return the descendants of this process, but for multiprocessing's resource tracker, which tidies up."""
+    """Return the descendants of this process, except multiprocessing's resource tracker, which cleans up."""
     found = set()
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error):
@@ -217,14 +216,14 @@ class HeldError(MemobenchError):
 
 @contextlib.contextmanager
 def locked(staging: Path, out: Path) -> Iterator[None]:
-    """Let one run at a time write to ``out``.
+    """Lock ``out`` for one run at a time.
 
-    The lock is held on the folder, or file, ``staging`` itself and leaves nothing behind. Take it before anything in
-    ``out`` is written or removed.
+    The lock is on the folder or file ``staging`` itself, so no lock file remains. Take it before anything in ``out`` is
+    written or removed.
 
     Raises:
-        HeldError: another run holds it.
-        MemobenchError: the system is Windows, which locks no folders.
+        HeldError: another run holds the lock.
+        MemobenchError: the system is Windows, which cannot lock folders.
     """
     if sys.platform == "win32" and staging.is_dir():
         raise MemobenchError(unsupported_system())
@@ -238,7 +237,7 @@ def locked(staging: Path, out: Path) -> Iterator[None]:
 
 
 def _is_at(folder: Path, descriptor: int) -> bool:
-    """Return whether an open folder has not been removed, or replaced, by the run that held it until now."""
+    """Return whether an open folder was neither removed nor replaced by the run that held the lock."""
     try:
         return os.path.samestat(os.fstat(descriptor), folder.stat())
     except FileNotFoundError:
@@ -247,9 +246,9 @@ def _is_at(folder: Path, descriptor: int) -> bool:
 
 @contextlib.contextmanager
 def taking_turns(path: Path, wait: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Hold a lock file, which stays; whoever comes next, on this machine, calls ``wait``, then waits.
+    """Hold the lock of a file; if another process of this machine holds it, call ``wait`` and wait.
 
-    A kill releases it.
+    The file stays; a killed process releases its lock.
     """
     with path.open("w") as file:
         if not lock_descriptor(file.fileno(), blocking=False):

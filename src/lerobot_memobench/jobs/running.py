@@ -1,7 +1,7 @@
-"""Run many independent jobs, such as the making of one episode, in processes here or on Slurm.
+"""Run many independent jobs, such as episodes to generate, in processes here or on Slurm.
 
-The result is the same, because a job depends on itself alone. From the disk it knows whether it is finished, so the
-same jobs given again continue a killed run.
+The result is the same, because jobs do not depend on each other. Finished jobs are found on the disk, so running the
+same jobs again continues a killed run.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ def run_jobs(
 
     Args:
         jobs: the work.
-        workers: how many run at a time.
-        progress: called after each job; first for those that were finished before.
-        slurm: submit the jobs; None: run them here.
-        finish: called on Slurm, in a job of its own, when all jobs have ended. It is pickled.
+        workers: number of jobs at a time.
+        progress: called after each job; first for jobs that were finished before.
+        slurm: how to submit the jobs; None: run them here.
+        finish: called on Slurm, in a job of its own, after all jobs. It is pickled.
 
     Returns:
-        Whether all jobs are finished; False when they have been submitted.
+        Whether all jobs are finished; False if they were submitted.
 
     Raises:
         MemobenchError: a worker was killed, or Slurm refuses the jobs.

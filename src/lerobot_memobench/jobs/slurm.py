@@ -1,7 +1,7 @@
-"""Submit jobs to Slurm: an array that shares them out, and a last job that completes the result.
+"""Submit jobs to Slurm: an array that runs them, and a last job that completes the result.
 
 Both run ``python -m lerobot_memobench.jobs.slurm PART LOGS``, which reads the pickled jobs from the folder ``LOGS``. A
-member of the array that was preempted is requeued and skips the jobs that are finished.
+preempted member of the array is requeued and skips finished jobs.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ MAKE, FINISH = "make", "finish"
 """Parts of a submission: the array, and the last job."""
 JOBS_FILE = "jobs.pickle"
 JOBS_PER_MEMBER = 10
-"""Jobs that a member of the array runs, one after another: neighbours share a compiled scene."""
+"""Jobs of a member of the array; consecutive jobs share a compiled scene."""
 OPTION = re.compile(r"--[a-z][a-z0-9-]*(=.+)?")
-PREEMPTED = "finished work stays; the job goes on when Slurm requeues it or when the same command is given again"
+PREEMPTED = "finished jobs are kept; the others run when Slurm requeues this job, or run the same command again"
 GPU_OPTIONS = ("--gres", "--gpus")
-"""Beginnings of the options by which a user asks for GPUs."""
+"""Prefixes of the options that request GPUs."""
 
 
 def read_options(text: str) -> tuple[str, ...]:
     """Return the options of sbatch in a text such as ``--partition=gpu --time=8:00:00``.
 
     Raises:
-        MemobenchError: a word is no long option.
+        MemobenchError: a word is not a long option.
     """
     words = tuple(shlex.split(text))
     wrong = next((word for word in words if not OPTION.fullmatch(word)), None)
     if wrong is not None or not words:
         raise MemobenchError(
-            f"found {wrong or text!r} among the options of sbatch, expected long options with their values, such as "
+            f"found {wrong or text!r} in the options of sbatch; expected long options with their values, such as "
             "--partition=gpu --time=8:00:00"
         )
     return words
@@ -50,7 +50,7 @@ def read_options(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Needs:
-    """Resources of one job, unless its user's options name others: cores, memory (GB) and GPUs."""
+    """Default resources of a job: cores, memory (GB) and GPUs."""
 
     cores: int = 2
     memory_gb: int = 8
@@ -63,9 +63,9 @@ class Slurm:
 
     Attributes:
         options: of sbatch, from the user (`read_options`).
-        needs: resources of one job.
-        logs: folder for the pickled jobs and for what they print; on a disk that all machines share.
-        jobs_per_member: jobs that a member of the array runs, one after another.
+        needs: default resources of a job.
+        logs: folder for the pickled jobs and their output, on a disk that all machines share.
+        jobs_per_member: jobs of a member of the array.
     """
 
     options: tuple[str, ...]
@@ -75,8 +75,8 @@ class Slurm:
 
     @property
     def requested(self) -> tuple[str, ...]:
-        """Options of sbatch for one job: the needs, where the user's options leave them open, and those options."""
-        needs = [f"--cpus-per-task={self.needs.cores}"]  # of an option given twice sbatch takes the last
+        """Options of sbatch for a job: the user's options, and the default resources for the rest."""
+        needs = [f"--cpus-per-task={self.needs.cores}"]  # sbatch uses the last one of equal options
         if not any(option.startswith("--mem") for option in self.options):
             needs.append(f"--mem={self.needs.memory_gb}G")
         if self.needs.gpus and not any(option.startswith(GPU_OPTIONS) for option in self.options):
@@ -85,26 +85,26 @@ class Slurm:
 
     @property
     def summary(self) -> str:
-        """A sentence on what each job requests."""
+        """A sentence with the requested resources."""
         return f"each job requests {' '.join(self.requested)}; slurm= takes other options of sbatch"
 
     def submit(self, jobs: Sequence[Job], workers: int, finish: Callable[[], Any] | None) -> None:
-        """Submit the jobs, ``workers`` members at a time, and after them a job that calls ``finish``.
+        """Submit the jobs, ``workers`` members at a time, and a last job that calls ``finish``.
 
         Raises:
-            MemobenchError: sbatch is missing or refuses them.
+            MemobenchError: sbatch is missing or refuses the jobs.
         """
         members = max(min(workers, len(jobs)), -(-len(jobs) // self.jobs_per_member))
         self.logs.mkdir(parents=True, exist_ok=True)
         (self.logs / JOBS_FILE).write_bytes(pickle.dumps((list(jobs), members, finish)))
         array = self._sbatch(MAKE, f"--array=0-{members - 1}%{workers}", *self.requested)
         if finish is not None:
-            # afterany: the last job names the members that have failed, instead of waiting for them for ever.
+            # afterany: the last job reports failed members instead of waiting forever.
             without_gpu = [option for option in self.requested if not option.startswith(GPU_OPTIONS)]
             self._sbatch(FINISH, f"--dependency=afterany:{array}", *without_gpu)
 
     def _sbatch(self, part: str, *options: str) -> str:
-        """Submit a part of the work and return Slurm's number of it."""
+        """Submit a part of the work and return its number."""
         logs = self.logs.absolute()
         command = shlex.join([sys.executable, "-m", __name__, part, str(logs)])
         own = [f"--job-name=memobench-{part}", f"--output={logs}/{part}-%j.log", "--open-mode=append", "--requeue"]
@@ -114,16 +114,16 @@ class Slurm:
         except FileNotFoundError:
             raise MemobenchError("this machine has no sbatch; run the command on a login node of the cluster") from None
         except subprocess.CalledProcessError as error:
-            said = " ".join(error.stderr.split())
-            raise MemobenchError(f"sbatch refused the jobs ({said}); correct its options") from None
+            reason = " ".join(error.stderr.split())
+            raise MemobenchError(f"sbatch refused the jobs ({reason}); correct its options") from None
         return done.stdout.strip().partition(";")[0]
 
 
 def run_part(part: str, logs: Path) -> None:
-    """Run one member's jobs, or complete the result.
+    """Run the jobs of a member of the array, or complete the result.
 
     Raises:
-        MemobenchError: a job failed, or, in the last part, jobs ended without a result.
+        MemobenchError: a job failed; in the last part, jobs ended without a result.
     """
     jobs, members, finish = pickle.loads((logs / JOBS_FILE).read_bytes())  # noqa: S301 - `Slurm.submit` wrote it
     if part == FINISH:

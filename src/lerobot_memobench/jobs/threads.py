@@ -1,12 +1,12 @@
-"""Number of threads: one rule for every process of ours, and for the libraries in it.
+"""Set the number of threads of this package's processes and their libraries.
 
-A rollout is one step after another: a small policy, physics and both pictures take one core, and a second thread of
-torch or of the renderer only waits busily for the next step. So a process that simulates has one thread of each, and
-more cores mean more processes. Training, and a large policy that acts, multiply large matrices: they take all cores of
-their process, shared among our processes on the same machine.
+A rollout is sequential: a small policy, physics and both pictures use one core, and a second thread of torch or of the
+renderer only spins until the next step. So a process that simulates has one thread of each, and more cores mean more
+processes. Training and large policies multiply large matrices: they use all cores of their process, shared among this
+package's processes on the machine.
 
-`use_threads` sets the environment before the libraries load; processes that are started later inherit it.
-`limit_torch` sets torch's threads once a policy's size is known. Variables that a user has set stay.
+`use_threads` sets environment variables before the libraries load; child processes inherit them. `limit_torch` sets
+torch's threads when a policy's size is known. Variables of the user are kept.
 """
 
 from __future__ import annotations
@@ -15,54 +15,55 @@ import os
 import platform
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 ACTING, LEARNING = "acting", "learning"
-"""Roles of a process: simulate, draw and let a policy act; or train and encode."""
+"""Roles of a process: run rollouts, or train and encode."""
 LARGE = 20_000_000
-"""Parameters from which on a policy that acts is large: an action chunk of a smaller one takes a core some 50 ms."""
+"""Number of parameters of a large policy. A smaller one computes an action chunk in some 50 ms on one core."""
 
 TORCH = "OMP_NUM_THREADS"
 ONE_EACH = {"OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
-"""Threads of numpy, for small matrices, and of llvmpipe, which draws without a GPU."""
+"""Threads of numpy, for small matrices, and of llvmpipe, which renders without a GPU."""
 SPINNING = {"GOMP_SPINCOUNT": "2000"}
-"""How long torch's idle threads keep their core: milliseconds by default."""
+"""How long idle threads of torch spin; the default is milliseconds."""
 CHOSEN_HERE = "MEMOBENCH_THREADS"
-"""Variable with the names of those set by this rule: a child process may set them again, a user's own stay."""
-BESIDE = "MEMOBENCH_PROCESSES"
-"""Variable with the number of our processes, this one included, that share the cores."""
+"""Variable with the names of the variables set here; child processes may change those, but not the user's."""
+PROCESSES = "MEMOBENCH_PROCESSES"
+"""Variable with the number of processes of this package that share the cores, including this one."""
 
 _CGROUPS = Path("/sys/fs/cgroup")
 
 
 def cores() -> int:
-    """Return how many cores this process may use: by affinity and by its container's quota, not by machine."""
+    """Return the number of cores that this process may use, by affinity and by its container's quota."""
     return max(1, min(len(_affinity()), _quota() or sys.maxsize))
 
 
 def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int | None:
-    """Return the threads of torch in each of so many processes on these cores; None: as torch itself chooses.
+    """Return the number of torch's threads in each of so many processes; None: torch's default.
 
     Args:
         role: `ACTING` or `LEARNING`.
-        processes: those of ours that share the cores.
-        large: whether the policy that acts has `LARGE` parameters or more.
+        processes: number of processes that share the cores.
+        large: whether the acting policy has `LARGE` parameters or more.
     """
     if role == ACTING and not large:
         return 1
     if role == LEARNING and processes == 1 and cores() == len(_affinity()):
-        return None  # by affinity torch counts, too, and it leaves hyperthreads out
+        return None  # torch's default uses affinity too, without hyperthreads
     return max(1, min(cores(), physical_cores()) // processes)
 
 
 def use_threads(role: str) -> None:
-    """Set this process's environment by the rule. Call it before numpy, torch or a renderer is loaded."""
+    """Set this process's environment variables. Call it before numpy, torch or a renderer is loaded."""
     given = os.environ
     ours = set(filter(None, given.get(CHOSEN_HERE, "").split(",")))
     wanted = dict(ONE_EACH)
     if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & (given.keys() - ours) and role == ACTING:
         wanted |= SPINNING
-    threads = torch_threads(role, processes_beside())
+    threads = torch_threads(role, sharing_processes())
     if threads is not None:
         wanted[TORCH] = str(threads)
     chosen = {key: value for key, value in wanted.items() if key in ours or key not in given}
@@ -73,30 +74,30 @@ def use_threads(role: str) -> None:
 
 
 def limit_torch(parameters: int) -> None:
-    """Let torch, in a process where a policy of so many parameters acts, use the threads that the rule gives it."""
+    """Set torch's threads in a process in which a policy of so many parameters acts."""
     if is_users_own(TORCH):
         return
     import torch
 
-    threads = torch_threads(ACTING, processes_beside(), large=parameters >= LARGE)
+    threads = torch_threads(ACTING, sharing_processes(), large=parameters >= LARGE)
     if threads is not None and threads != torch.get_num_threads():
         torch.set_num_threads(threads)
 
 
 def is_users_own(variable: str) -> bool:
-    """Return whether a user has set a variable of the environment, rather than this rule."""
+    """Return whether the user has set a variable of the environment."""
     return variable in os.environ and variable not in os.environ.get(CHOSEN_HERE, "").split(",")
 
 
-def processes_beside() -> int:
-    """Return how many processes of ours share the cores of this one, itself included."""
-    text = os.environ.get(BESIDE, "")
+def sharing_processes() -> int:
+    """Return the number of processes that share the cores of this one, including itself."""
+    text = os.environ.get(PROCESSES, "")
     return int(text) if text.isdecimal() and int(text) else 1
 
 
 def sharing(processes: int, environment: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return the environment of one of so many processes of ours that are started at once."""
-    return {**(os.environ if environment is None else environment), BESIDE: str(processes)}
+    """Return the environment of one of so many processes that share the cores."""
+    return {**(os.environ if environment is None else environment), PROCESSES: str(processes)}
 
 
 def _affinity() -> set[int]:
@@ -107,7 +108,7 @@ def _affinity() -> set[int]:
 
 
 def physical_cores() -> int:
-    """Return how many cores the processors of this process belong to."""
+    """Return the number of physical cores of this process."""
     found = set()
     for number in _affinity():
         path = Path(f"/sys/devices/system/cpu/cpu{number}/topology/thread_siblings_list")
@@ -129,32 +130,17 @@ def cpu_model() -> str:
 
 
 def _quota() -> int | None:
-    """Return the whole cores that the container of this process may use, None where nothing limits it."""
-    quotas = []
+    """Return the whole cores that the container of this process may use, None without a limit."""
     try:
-        own = [line.split(":", 2) for line in Path("/proc/self/cgroup").read_text().splitlines()]
+        place = Path("/proc/self/cgroup").read_text().rpartition("::")[2].strip()  # of control groups, version 2
     except OSError:
         return None
-    for _, controllers, place in own:
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        base = _CGROUPS / "cpu" if controllers else _CGROUPS
-        folder = base / place.strip("/")
-        # A limit above counts as well; in a container the place may be the host's, and its own limit lies at the top.
-        for here in (folder, *folder.parents) if folder.is_relative_to(base) else (base,):
-            quotas += _quota_in(here)
-            if here == base:
-                break
+    quotas, folder = [], _CGROUPS / place.strip("/")
+    # Limits of outer groups count too. In a container the place may be the host's, with the limit at the top.
+    for group in (folder, *folder.parents) if folder.is_relative_to(_CGROUPS) else (_CGROUPS,):
+        with suppress(OSError, ValueError):
+            quota, period = (group / "cpu.max").read_text().split()
+            quotas += [int(quota) / int(period)] if quota.isdecimal() else []
+        if group == _CGROUPS:
+            break
     return max(1, int(min(quotas))) if quotas else None
-
-
-def _quota_in(folder: Path) -> list[float]:
-    """Return the limit that one control group sets, cores; [] where it sets none."""
-    try:
-        if (folder / "cpu.max").is_file():
-            quota, period = (folder / "cpu.max").read_text().split()
-        else:
-            quota, period = ((folder / f"cpu.cfs_{name}_us").read_text().strip() for name in ("quota", "period"))
-        return [int(quota) / int(period)] if quota.isdecimal() and int(period) else []
-    except (OSError, ValueError):
-        return []

@@ -1,5 +1,5 @@
-"""Perception: a visual encoder, and an object detector on top of it; what is needed to act.
+"""Perception for acting policies: a visual encoder and an object detector.
 
-`visual_encoder` makes tokens of images. `detector` finds objects in them, `weights` keeps both in one file, `objects`
-places the detections of both cameras in the world by `geometry`. `research.detector` trains and tests them.
+`visual_encoder` maps images to tokens, `detector` finds objects, `weights` saves both in one file, `objects` places the
+detections of both cameras in the world by `geometry`. `research.detector` trains and measures them.
 """

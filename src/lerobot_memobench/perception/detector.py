@@ -1,10 +1,10 @@
 """Detect objects in images: a feature pyramid, linear heads and a refinement head on the tokens of a visual encoder.
 
-One token of 192 numbers covers a square in which four objects can hardly be told apart. So objects are detected on a
-map four times as fine, which a feature pyramid (Lin et al. 2017) makes of the tokens and the encoder's feature maps.
-Heads are linear: a heat map of the objects' visible centres (CenterNet, Zhou et al. 2019), their geometry and a mask.
-A linear head confuses kinds where little of an object shows. The few peaks of the heat map are therefore scored once
-more by a small network that sees their surroundings, the second stage of a detector (Faster R-CNN, Ren et al. 2015).
+One token of 192 numbers covers a square that may show four objects, which is too coarse to separate them. Objects are
+detected on a map four times as fine, which a feature pyramid (Lin et al. 2017) computes from the tokens and the
+encoder's feature maps. Linear heads predict a heat map of the objects' visible centres (CenterNet, Zhou et al. 2019),
+their geometry and a mask. Linear heads confuse kinds if little of an object is visible, so a small network scores each
+peak of the heat map again by its surroundings, like the second stage of Faster R-CNN (Ren et al. 2015).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.special import expit
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d, pad, relu
 
-from lerobot_memobench.perception.visual_encoder import GRID, POOLED, ResidualBlock, VisualEncoder, fold_norms
+from lerobot_memobench.perception.visual_encoder import GRID, ResidualBlock, VisualEncoder, fold_norms
 
 LEVELS = 2
 """Levels of the feature pyramid, each twice as fine as the one before."""
@@ -32,23 +32,22 @@ FINE, COARSE = 4, 2
 GEOMETRY = ("across", "down", "depth", "height", "joint", "lit", "turn cosine", "turn sine")
 """Values predicted for an object of each kind in each coarse cell. ``across``, ``down``: from the cell's centre to the
 object's origin, in cells. ``depth``: of its origin along the camera's view, m. ``height``: of its origin over the
-table, m. ``joint``: of a moving part, m or rad. ``lit``: logit that it stands in a highlight. ``turn``: of twice the
+table, m. ``joint``: of a moving part, m or rad. ``lit``: logit of a highlight around it. ``turn``: of twice the
 angle of its x axis in the image, which a half turn leaves as it is."""
 UNCERTAINTIES = ("place", "depth", "height")
-"""Expected errors that may be predicted too: of ``across`` and ``down`` together in cells, of the others in m."""
+"""Predicted expected errors: of ``across`` and ``down`` together in cells, of the others in m."""
 FIRST_UNCERTAINTIES = (0.3, 0.01, 0.01)
 """Their values before training."""
 PRIOR = 0.01
 """Probability of an object in a cell before training."""
-READINGS = ("fine", "tokens", "pooled")
-"""What heads read: the finest map, to detect; the 64 tokens and the 16 pooled ones, to measure what those hold."""
 
-HIDDEN, REDUCED = 96, 24
+REFINEMENT_WIDTH, REDUCED_CHANNELS = 96, 24
 """Width of the refinement head, and channels to which it reduces the encoder's feature map."""
-AROUND, NEAR = 5, 13
-"""Side of the square around a peak that it sees: in cells of the finest map, and of the encoder's, half as wide."""
+MAP_WINDOW, FEATURE_WINDOW = 5, 13
+"""Side of the square around a peak that the refinement head reads: in cells of the finest map, and in cells of the
+encoder's feature map, which are half as wide."""
 LOGIT_SCALE = 4.0
-"""Divisor of heat map logits: about their standard deviation."""
+"""Divisor of heat map logits, about their standard deviation."""
 
 DETECTION = np.dtype(
     [
@@ -63,19 +62,19 @@ DETECTION = np.dtype(
         ("uncertainty", "<f4", len(UNCERTAINTIES)),
     ]
 )
-"""A detected object. ``score``: probability. ``place``: of its origin in the image, a fraction of the side from the
+"""A detected object. ``score``: probability. ``place``: of its origin in the image, fractions of the side from the
 upper left corner. ``lit``: probability. ``uncertainty``: expected error of its place, a fraction of the image's side,
-of its depth and its height, m; 0 where none is predicted. The others as in `GEOMETRY`."""
+of its depth and of its height, m; 0 if it is not predicted. The others as in `GEOMETRY`."""
 Detections = NDArray[np.void]
 """Detections (n,) of one image, of dtype `DETECTION`."""
 MIN_SCORE, MIN_HEAT = 0.03, 0.3
-"""Probability from which on an object is detected: refined, and by the heat map alone, which is overconfident."""
-MOST = 64
+"""Smallest score of a detection: with refinement, and without, because the heat map alone is overconfident."""
+MAX_DETECTIONS = 64
 """Largest number of detections in an image."""
 
 CellQuery = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-"""From image, kind, row and column of coarse cells, (n,) each, to (n, values), float32: predictions for an object of
-that kind in that cell. Asking for few cells is much less work than predicting all kinds in all cells."""
+"""Maps image, kind, row and column of coarse cells, (n,) each, to (n, values), float32: predictions for an object of
+that kind in that cell. Querying few cells is much faster than predicting all kinds in all cells."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +84,8 @@ class DetectorOutput:
     Attributes:
         heatmap: (N, kinds, cells, cells), logits of an object's visible centre.
         geometry: len(GEOMETRY) values. side: coarse cells along the image's side.
-        mask: (N, kinds + 1, cells, cells), logits of what is shown; the first is background.
-        uncertainty: len(UNCERTAINTIES) values, logarithms of the expected errors of the geometry; None: not predicted.
+        mask: (N, kinds + 1, cells, cells), logits of the visible kind; the first is background.
+        uncertainty: len(UNCERTAINTIES) values, logarithms of the geometry's expected errors; None: not predicted.
         score: a logit per kind of an object at a peak of the heat map; None: not refined.
     """
 
@@ -105,29 +104,17 @@ class Detector(nn.Module):
         encoder: makes the tokens. kinds: names of the kinds of objects.
 
     Attributes:
-        fine_heads, token_heads, pooled_heads: of each of `READINGS`.
-        refinement_head: scores the peaks of the finest map's heat map.
+        fine_heads: read the finest map of the pyramid. refinement_head: scores the peaks of its heat map.
     """
 
     def __init__(self, encoder: VisualEncoder, kinds: tuple[str, ...]) -> None:
         super().__init__()
         self.encoder, self.fpn, self.kinds = encoder, FeaturePyramid(encoder), kinds
         self.fine_heads = Heads(self.fpn.width, len(kinds), FINER * GRID, FINE // FINER, 1, uncertain=True)
-        self.token_heads = Heads(encoder.width, len(kinds), GRID)
-        self.pooled_heads = Heads(encoder.width, len(kinds), POOLED)
         self.refinement_head = RefinementHead(self.fpn.width, encoder.widths[-2 - LEVELS], len(kinds))
 
-    def forward(self, images: Tensor) -> dict[str, DetectorOutput]:
-        """Return the output of each of `READINGS` for images (N, 3, SIDE, SIDE) in [0, 1]."""
-        tokens, maps = self.encoder.tokens_and_maps(images)
-        return {
-            "fine": self.read(self.fpn(tokens, maps), maps),
-            "tokens": self.token_heads(tokens),
-            "pooled": self.pooled_heads(self.encoder.pooled(tokens)),
-        }
-
-    def detect(self, images: Tensor) -> DetectorOutput:
-        """Return the output of the finest map alone for images (N, 3, SIDE, SIDE) in [0, 1]."""
+    def forward(self, images: Tensor) -> DetectorOutput:
+        """Return the refined output for images (N, 3, SIDE, SIDE) in [0, 1]."""
         tokens, maps = self.encoder.tokens_and_maps(images)
         return self.read(self.fpn(tokens, maps), maps)
 
@@ -143,7 +130,7 @@ class Detector(nn.Module):
 
 
 class FeaturePyramid(nn.Module):
-    """From tokens and the encoder's feature maps to a finer map, as wide as the encoder's of that resolution."""
+    """Map tokens and the encoder's feature maps to a finer map, as wide as the encoder's at that resolution."""
 
     def __init__(self, encoder: VisualEncoder) -> None:
         super().__init__()
@@ -160,7 +147,7 @@ class FeaturePyramid(nn.Module):
 
 
 class PyramidLevel(nn.Module):
-    """From a coarse map and the encoder's feature map, twice as fine, to another one as fine.
+    """Map a coarse map and the encoder's feature map, twice as fine, to a finer map.
 
     Args:
         coarse, lateral: channels of the two.
@@ -232,7 +219,7 @@ class Heads(nn.Module):
 
 
 class RefinementHead(nn.Module):
-    """From the surroundings of a heat map's peaks to their scores.
+    """Score the peaks of a heat map by their surroundings.
 
     Args:
         width: of the finest map. channels: of the encoder's feature map, twice as fine. kinds: number of kinds.
@@ -240,12 +227,12 @@ class RefinementHead(nn.Module):
 
     def __init__(self, width: int, channels: int, kinds: int) -> None:
         super().__init__()
-        self.around = nn.Linear(width * AROUND**2, HIDDEN)
-        self.reduce = nn.Conv2d(channels, REDUCED, 3, stride=2)
-        self.near = nn.Linear(REDUCED * (NEAR // 2) ** 2, HIDDEN, bias=False)
-        self.heat = nn.Linear(kinds, HIDDEN, bias=False)
-        self.hidden = nn.Linear(HIDDEN, HIDDEN)
-        self.score = nn.Linear(HIDDEN, kinds)
+        self.around = nn.Linear(width * MAP_WINDOW**2, REFINEMENT_WIDTH)
+        self.reduce = nn.Conv2d(channels, REDUCED_CHANNELS, 3, stride=2)
+        self.near = nn.Linear(REDUCED_CHANNELS * (FEATURE_WINDOW // 2) ** 2, REFINEMENT_WIDTH, bias=False)
+        self.heat = nn.Linear(kinds, REFINEMENT_WIDTH, bias=False)
+        self.hidden = nn.Linear(REFINEMENT_WIDTH, REFINEMENT_WIDTH)
+        self.score = nn.Linear(REFINEMENT_WIDTH, kinds)
 
     def forward(self, fine: Tensor, maps: Tensor, heatmap: Tensor) -> CellQuery:
         """Return a query of scores: a logit per kind of an object in a cell of the finest map.
@@ -258,8 +245,8 @@ class RefinementHead(nn.Module):
 
         def query(image: Tensor, _: Tensor, row: Tensor, column: Tensor) -> Tensor:
             where = (image, slice(None), row, column)
-            around = _squares(grid, AROUND, 1)[where]
-            near = relu(self.reduce(_squares(maps, NEAR, 2)[where]))
+            around = _squares(grid, MAP_WINDOW, 1)[where]
+            near = relu(self.reduce(_squares(maps, FEATURE_WINDOW, 2)[where]))
             heat = max_pool2d(heatmap, 3, 1, 1)[where] / LOGIT_SCALE
             hidden = relu(self.around(around.flatten(1)) + self.near(near.flatten(1)) + self.heat(heat))
             score: Tensor = self.score(hidden + relu(self.hidden(hidden)))
@@ -280,7 +267,7 @@ def _squares(maps: Tensor, side: int, step: int) -> Tensor:
 def detections(output: DetectorOutput) -> list[Detections]:
     """Return the detections of each image, highest score first.
 
-    They score more than `MIN_SCORE`, or `MIN_HEAT` where they are not refined.
+    Their scores are above `MIN_SCORE`, or above `MIN_HEAT` without refinement.
     """
     scores, cells = peaks(output)
     scores, order = scores.sort(dim=1, descending=True, stable=True)
@@ -303,12 +290,14 @@ def detections(output: DetectorOutput) -> list[Detections]:
 
 
 def peaks(output: DetectorOutput) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """Return the local maxima of heat maps: scores (N, MOST), 0 where there are fewer, and the cells they are in.
+    """Return the local maxima of heat maps: scores (N, MAX_DETECTIONS), 0 if there are fewer, and their cells.
 
-    A cell is image, kind, row and column, (N, MOST) each.
+    A cell is image, kind, row and column, (N, MAX_DETECTIONS) each.
     """
     heat, side = torch.sigmoid(output.heatmap), output.heatmap.shape[-1]
-    scores, places = torch.where(heat == max_pool2d(heat, 3, 1, 1), heat, torch.zeros(())).flatten(1).topk(MOST, dim=1)
+    scores, places = (
+        torch.where(heat == max_pool2d(heat, 3, 1, 1), heat, torch.zeros(())).flatten(1).topk(MAX_DETECTIONS, dim=1)
+    )
     images = torch.arange(len(heat))[:, None].expand_as(places)
     cells = (images, places // side**2, places // side % side, places % side)
     if output.score is not None:

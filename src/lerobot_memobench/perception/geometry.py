@@ -1,4 +1,4 @@
-"""Camera geometry: poses of both cameras by the robot's state, projection, and lines of sight."""
+"""Camera geometry: poses of both cameras from the robot's state, projection, and lines of sight."""
 
 from __future__ import annotations
 
@@ -62,5 +62,5 @@ def rays(places: Array, view: View) -> Array:
 
 
 def depth_at_height(sight: Array, height: Array, view: View) -> Array:
-    """Return the depth (...) at which lines of sight (..., 3) meet a height; far away where they point up."""
+    """Return the depth (...) at which lines of sight (..., 3) meet a height; very large if they point up."""
     return np.asarray((height - view["eye"][2]) / np.minimum(sight[..., 2], -1e-3))

@@ -1,7 +1,7 @@
 """Place detections of both cameras in the world, as the object slots of `sim.object_slots`, without a simulator.
 
-Only the present images and the robot's state are read, and slots hold what was detected, right or wrong. Tilt is not
-detected, nor which side is an object's front: objects are taken to stand upright and to face the way tasks place them.
+The inputs are the present images and the robot's state; the slots include detection errors. Tilt and the front of an
+object are not detected: objects are assumed to be upright and to face the direction in which tasks place them.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 Array = NDArray[np.float64]
 
 DRAWERS = ("top_drawer", "middle_drawer", "bottom_drawer")
-"""Drawers are a kind each: they stand above one another, nearer than two objects of a kind can be told apart."""
+"""Each drawer is a kind of its own: drawers are closer together than two objects of one kind that can be separated."""
 PARTS = (*DRAWERS, "door", "knob")
-"""Kinds that have a joint; they come first."""
+"""Kinds that have a joint; their indices come first."""
 ONE = frozenset({*PARTS, "flat_stove", "kitchen_table", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"})
-"""Kinds of which a scene has one."""
+"""Kinds with one object per scene."""
 TURNED = ONE - {"flat_stove", "kitchen_table", "knob"} | {"drawer"}
-"""Kinds, and the class of drawers, whose x axis points to the robot; that of others points away from it, as near as
-half a turn allows."""
+"""Kinds, and the class of drawers, with an x axis towards the robot. The x axis of the others points away from it; the
+detected axis is turned by half a turn if needed."""
 # fmt: off
 ROUND = frozenset({
     "akita_black_bowl", "artichoke", "beefsteak_tomato", "biscuit", "bottle_of_coffee",
@@ -42,15 +42,15 @@ ROUND = frozenset({
     "cork", "plate", "white_bowl",
 })
 # fmt: on
-"""Kinds that look alike from all sides: their x axis is taken to be the world's, as tasks place them."""
+"""Kinds that look the same from all sides: their x axis is the world's, as tasks place them."""
 MIN_SCORE_ALONE = 0.1
-"""Score from which on a detection of one camera alone counts."""
+"""Smallest score of a detection by one camera alone."""
 APART, SAME = 0.03, 0.04
-"""Least distance of two objects of a kind, and largest one of two cameras' detections of one object, m."""
+"""Smallest distance of two objects of a kind, and largest distance of two cameras' detections of one object, m."""
 LIT = 0.5
-"""Probability from which on an object counts as highlighted."""
-NEAR = 0.2
-"""Depth up to which the wrist camera may tell an object's rotation better than the other, m."""
+"""Smallest probability of a highlighted object."""
+WRIST_RANGE = 0.2
+"""Depth up to which the wrist camera may give an object's rotation more precisely than the other camera, m."""
 LEAST_ERROR = 0.0005
 """Lower bound of expected errors of positions, m."""
 
@@ -60,10 +60,10 @@ class DetectedObject:
     """An object, by the detections of one camera or of both.
 
     Attributes:
-        cameras: that detected it. depth: from the one by which it was placed, m.
-        position: of its origin in the world, m. precision: (3, 3) inverse covariance of that, 1/m².
+        cameras: that detected it. depth: from the camera that placed it, m.
+        position: of its origin in the world, m. precision: (3, 3) inverse covariance of the position, 1/m².
         axis: (3,) its x axis or the opposite one, level. joint: m or rad.
-        lit: probability that it stands in a highlight.
+        lit: probability of a highlight around it.
     """
 
     kind: int
@@ -77,11 +77,11 @@ class DetectedObject:
     lit: float
 
     def merge(self, other: DetectedObject, one: bool) -> None:
-        """Merge the detection of another camera, of a lower score; ``one``: a scene has one object of this kind.
+        """Merge the detection of another camera with a lower score; ``one``: a scene has one object of this kind.
 
-        Positions are averaged by their precisions, along each line of sight and across. The higher score decides on
-        the rotation, unless it is the wrist camera's from afar. Fixtures and their parts, whose origin lies outside
-        the wrist camera's image, are placed by the other camera alone.
+        Positions are averaged by their precisions, along each line of sight and across. The rotation is that of the
+        higher score, except the wrist camera's from a large distance. The origins of fixtures and their parts are
+        outside the wrist camera's image, so the other camera alone places them.
         """
         outside = other if self.cameras[0] == "wrist" else self
         self.cameras += other.cameras
@@ -89,14 +89,14 @@ class DetectedObject:
         both = self.precision + other.precision
         mean = np.linalg.solve(both, self.precision @ self.position + other.precision @ other.position)
         self.position, self.precision = (outside.position, outside.precision) if one else (np.asarray(mean), both)
-        if self.cameras[0] == "wrist" and (one or self.depth > NEAR):
+        if self.cameras[0] == "wrist" and (one or self.depth > WRIST_RANGE):
             self.depth, self.axis, self.joint = other.depth, other.axis, other.joint
 
 
 class ObjectLocalizer:
     """Detect objects in both cameras' images and place them in the world.
 
-    Kinds that this version does not know are passed over.
+    Kinds that this version does not know are ignored.
     """
 
     def __init__(self, detector: Detector) -> None:
@@ -113,8 +113,8 @@ class ObjectLocalizer:
             images: of each camera, `agentview` and `wrist`, (N, 3, H, H) in [0, 1].
             states: (N, >= 6) the hand's position, m, and its rotation as axis times angle, rad.
         """
-        both = torch.cat([resized(images[camera]) for camera in MJCF_CAMERAS])  # one pass is quicker than two
-        found = detections(self.detector.detect(both))
+        both = torch.cat([resized(images[camera]) for camera in MJCF_CAMERAS])  # one pass is faster than two
+        found = detections(self.detector(both))
         hands = states.cpu().numpy().astype(np.float64)
         slots = []
         for row in range(len(hands)):
@@ -164,7 +164,7 @@ class ObjectLocalizer:
         else:
             depth = float(depth_at_height(sight, TABLE_TOP + detection["height"], view))
             along = height_error / max(-sight[2], 1e-3)
-            axis = axis - turned[:, 2] * (axis[2] / turned[2, 2])  # it is level, where the image is not
+            axis = axis - turned[:, 2] * (axis[2] / turned[2, 2])  # the axis is level, the image is not
         return DetectedObject(
             int(detection["kind"]),
             float(detection["score"]),
@@ -186,9 +186,9 @@ def precision(sight: Array, across: float, along: float) -> Array:
 
 
 def upright(slots: Tensor) -> Tensor:
-    """Return slots (..., SLOTS, WIDTH) with objects upright and facing the way tasks place them.
+    """Return slots (..., SLOTS, WIDTH) with upright objects that face the direction in which tasks place them.
 
-    Only the x axis of their rotation is read.
+    Only the x axis of their rotation is used.
     """
     slots = slots.clone()
     there, kind = field(slots, "present") > 0, field(slots, "class").squeeze(-1).long().cpu()
@@ -208,5 +208,5 @@ def set_axis(slots: Tensor, axis: Tensor) -> None:
 
 @cache
 def _classes(names: frozenset[str]) -> Tensor:
-    """Return for each object class whether it is one of those, (classes,) bool."""
+    """Return whether each object class is among the names, (classes,) bool."""
     return torch.tensor([name in names for name in classes()])

@@ -1,4 +1,4 @@
-"""Encode images as 8 x 8 tokens, and those as 4 x 4 pooled ones that keep where things are."""
+"""Encode images as 8 x 8 tokens, and these as 4 x 4 pooled tokens that keep the positions of objects."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def resized(images: Tensor) -> Tensor:
 
 
 class ConvNorm(nn.Module):
-    """A 3 x 3 convolution with batch normalisation, which `fold_norms` makes part of it."""
+    """A 3 x 3 convolution with batch normalisation, which `fold_norms` folds into it."""
 
     def __init__(self, channels: int, out_channels: int, stride: int = 1) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class VisualEncoder(nn.Module):
     Args:
         widths: channels of each stage; the last is the dimension of a token.
         blocks: residual blocks of each stage.
-        folded: without batch normalisation, as `weights` keeps it.
+        folded: without batch normalisation, as in the file of `weights`.
     """
 
     def __init__(
@@ -93,14 +93,14 @@ class VisualEncoder(nn.Module):
         return self.decorrelate(tokens), maps
 
     def pooled(self, tokens: Tensor) -> Tensor:
-        """Return 16 tokens (N, 16, width) of 64: one per square of four, by a linear map that keeps their order."""
+        """Pool 64 tokens to 16 (N, 16, width): one per square of four, by a linear map that knows their order."""
         near = rearrange(tokens, "n (y b x a) d -> n (y x) (b a d)", b=2, a=2, y=POOLED, x=POOLED)
         return self.pool(near)
 
     def fold(self) -> None:
         """Fold batch normalisation into the convolutions and add the linear map that whitens tokens, as identity.
 
-        Outputs stay as they were in evaluation. A folded encoder is not trained further.
+        The outputs in evaluation mode do not change. A folded encoder cannot be trained further.
         """
         fold_norms(self)
         if isinstance(self.decorrelate, nn.Identity):

@@ -1,4 +1,4 @@
-"""Trained checkpoints on disk: where they lie, what type they are, whether they are whole."""
+"""Find checkpoints of trained policies, and check that they are complete and of the expected type."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ CHECKPOINTS, LAST = "checkpoints", "last"
 """LeRobot's folder of a training run's checkpoints, and its link to the last one."""
 PREPROCESSOR_FILE = "policy_preprocessor.json"
 POSTPROCESSOR_FILE = "policy_postprocessor.json"
-GO_ON_WITHOUT = ("pi0", "pi05", "pi0_fast")
-"""Policies of LeRobot's that act with random weights where they find none."""
+RANDOM_IF_MISSING = ("pi0", "pi05", "pi0_fast")
+"""LeRobot's policies that act with random weights if there are none."""
 ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
@@ -40,7 +40,7 @@ class Feature(TypedDict, total=False):
 
 
 class StepConfig(TypedDict, total=False):
-    """What is used of a normalising step's settings."""
+    """Settings of a normalising step."""
 
     norm_map: dict[str, str]
     features: dict[str, Feature]
@@ -71,14 +71,16 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def checkpoint_folder(text: str) -> Path | None:
-    """Return the checkpoint that a text means: that of a policy that comes with the package, by its name; or a folder,
-    itself or the last one of a training run; None when there is none. Of two of one name, ``./name`` is the folder.
+    """Return the checkpoint of a name or path; None if there is none.
+
+    A name is that of a policy that comes with the package, a path that of a checkpoint or a training run, whose last
+    checkpoint is returned. If both exist, ``./name`` is the path.
     """
     return shipped_policies().get(text) or folder_with_checkpoint(text)
 
 
 def folder_with_checkpoint(text: str) -> Path | None:
-    """Return the checkpoint in a folder: itself, or the last one of a training run; None when there is none."""
+    """Return the checkpoint in a folder: the folder itself, or the last one of a training run; None without any."""
     base = _through_last(Path(text).expanduser())
     for folder in (base, *(checkpoint / "pretrained_model" for checkpoint in (base, *checkpoints_of(base)))):
         if (folder / CONFIG_FILE).is_file():
@@ -87,9 +89,9 @@ def folder_with_checkpoint(text: str) -> Path | None:
 
 
 def checkpoints_of(run: Path) -> list[Path]:
-    """Return a training run's checkpoint folders, whole or not: the one that ``last`` names, then the newest first.
+    """Return a run's checkpoint folders, complete or not: the one that ``last`` names, then the newest first.
 
-    ``last`` is a link. Where files are copied without links it is missing, a folder, or a file with the link's text.
+    ``last`` is a link. In a copy it may be missing, a folder, or a file with the link's text.
     """
     last = run / CHECKPOINTS / LAST
     numbered = [path for path in last.parent.iterdir() if path.name.isdecimal()] if last.parent.is_dir() else []
@@ -99,7 +101,7 @@ def checkpoints_of(run: Path) -> list[Path]:
 
 
 def _through_last(path: Path) -> Path:
-    """Return a path at or in a run's ``checkpoints/last`` with the checkpoint that the link named, where it is lost."""
+    """Replace ``checkpoints/last`` in a path by the checkpoint that the link named, if a copy lost the link."""
     for last in (path, path.parent):
         if (last.parent.name, last.name) == (CHECKPOINTS, LAST) and not last.is_dir():
             found = checkpoints_of(last.parent.parent)
@@ -108,20 +110,20 @@ def _through_last(path: Path) -> Path:
 
 
 def text_of_link(path: Path) -> str | None:
-    """Return the text of a small file that stands for a link, None where there is no such file."""
+    """Return the text of a small file that a copy made of a link, None if there is no such file."""
     if not path.is_file() or path.stat().st_size > LONGEST_NAME:
         return None
     return path.read_text(errors="replace").strip()
 
 
 def portable_path(path: str) -> str:
-    """Return how another machine knows a checkpoint: by its name if it comes with the package, else by its path."""
+    """Return the name of a checkpoint that comes with the package, which other machines know, else its path."""
     names = {str(folder): name for name, folder in shipped_policies().items()}
     return names.get(path, path)
 
 
 def local_folder(path: str) -> Path | None:
-    """Return the folder of a checkpoint: here, or where the hub's cache keeps a repository; None when not here."""
+    """Return the folder of a checkpoint, also of a repository in the hub's cache; None if it is not on this machine."""
     here = checkpoint_folder(path)
     if here is not None or looks_local(path):
         return here
@@ -132,7 +134,7 @@ def local_folder(path: str) -> Path | None:
 
 
 def checkpoint_type(path: str) -> str | None:
-    """Return the policy type of a checkpoint folder; None for one that is not on this machine."""
+    """Return the policy type of a checkpoint folder; None if the folder does not exist."""
     folder = Path(path).expanduser()
     if not folder.is_dir():
         return None
@@ -146,19 +148,23 @@ def checkpoint_type(path: str) -> str | None:
         )
     if not isinstance(name, str):
         raise MemobenchError(
-            f"{folder / CONFIG_FILE} names no policy type; expected a checkpoint of today's LeRobot, which cannot read "
-            "those of its first year: train it again"
+            f"{folder / CONFIG_FILE} names no policy type; LeRobot cannot read checkpoints of its first year: train "
+            "the policy again"
         )
     return name
 
 
 def read_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
-    """Return the object in a JSON file, or tell what is wrong with it."""
+    """Return the object in a JSON file.
+
+    Raises:
+        MemobenchError: the file is missing, or does not fit the schema.
+    """
     try:
         content: dict[str, Any] = read_json_file(path, schema, ADVICE)
     except FileNotFoundError:
         raise MemobenchError(
-            f"{path} is missing; expected a whole checkpoint folder as lerobot-train saves it"
+            f"{path} is missing; expected a complete checkpoint folder as lerobot-train saves it"
         ) from None
     return content
 
@@ -166,8 +172,7 @@ def read_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
 def check_checkpoint(path: str) -> None:
     """Refuse a checkpoint folder that cannot act as it was trained.
 
-    A policy without the statistics of its training data would run on raw numbers and score 0 % without a
-    word.
+    A policy without the statistics of its training data would run on raw numbers and score 0 % without any message.
 
     Raises:
         MemobenchError: weights, processors or normalisation statistics are missing.
@@ -183,7 +188,11 @@ def check_checkpoint(path: str) -> None:
         raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
     for weights in folder.glob("*.safetensors"):
         check_fetched(weights)
-    _check_form(folder)
+    if not (folder / PREPROCESSOR_FILE).is_file():
+        raise MemobenchError(
+            f"{folder / PREPROCESSOR_FILE} is missing; copy the checkpoint, or migrate one of an earlier LeRobot: "
+            f"python -m lerobot.processor.migrate_policy_normalization --pretrained-path {folder}"
+        )
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         for step in read_json(folder / name, Processor).get("steps", []):
             if str(step.get("registry_name", "")).endswith("normalizer_processor"):
@@ -192,7 +201,7 @@ def check_checkpoint(path: str) -> None:
 
 
 def check_processors(path: str | Path, revision: str | None = None) -> None:
-    """Refuse processors that name other code than registered steps (`processor_steps`); nothing is built.
+    """Refuse processors that name other code than registered steps (`processor_steps`), without building them.
 
     Args:
         path: a checkpoint folder, or a repository, whose processor files are fetched now.
@@ -211,24 +220,12 @@ def check_processors(path: str | Path, revision: str | None = None) -> None:
                 check_step(file, step, kind)
 
 
-def _check_form(folder: Path) -> None:
-    """Refuse weights with statistics among them, which LeRobot keeps in processors since its version 0.4."""
-    weights = folder / WEIGHTS_FILE
-    if (folder / PREPROCESSOR_FILE).is_file() or not weights.is_file():
-        return
-    if any(name.startswith(("normalize_inputs.", "model.normalize_inputs.")) for name in _shapes(weights)):
-        raise MemobenchError(
-            f"the checkpoint {folder} has an earlier LeRobot's form, with its statistics among its weights; migrate "
-            f"it: python -m lerobot.processor.migrate_policy_normalization --pretrained-path {folder}"
-        )
-
-
 def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
-    """Refuse weights that are not all there, or not of the shapes that the configuration asks for.
+    """Refuse weights that are incomplete, or of other shapes than the configuration sets.
 
-    LeRobot reserves whatever the configuration asks for, and goes on with random numbers where weights are missing.
-    The weights are compared with the policy built without memory for its weights. One that cannot be built so (its
-    parts come from the hub) is left to LeRobot.
+    LeRobot allocates the configured shapes, and continues with random numbers if weights are missing. The weights are
+    compared with a policy on the meta device. A policy that cannot be built there (its parts come from the hub) is not
+    checked.
 
     Args:
         path: a checkpoint folder, or a repository, whose weights are fetched now. policy: its configuration.
@@ -240,10 +237,10 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
         return
     file = _file_of(path, WEIGHTS_FILE, revision)
     if file is None:
-        if policy.type in GO_ON_WITHOUT:
+        if policy.type in RANDOM_IF_MISSING:
             raise MemobenchError(
-                f"the checkpoint {path} holds no weights ({WEIGHTS_FILE}), or they cannot be fetched, and LeRobot's "
-                f"{policy.type} would go on with random ones; copy or train it again"
+                f"the checkpoint {path} holds no weights ({WEIGHTS_FILE}), or they cannot be downloaded, and LeRobot's "
+                f"{policy.type} would act with random ones; copy or train it again"
             )
         return
     found = _shapes(file)
@@ -260,70 +257,68 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
         names.setdefault(id(wanted[name]), []).append(name)
     missing = [same[0] for same in names.values() if not any(name in tensors for name in same)]
     if type(policy).__module__.startswith(f"{__package__}."):
-        # Ours loads exactly, also weights of earlier names and without the heads of an alignment; it may not reserve
-        # more for them than the file holds.
+        # Our policies load weights strictly, of earlier names too; here only too large an allocation is refused.
         reserved = sum(math.prod(wanted[name].shape) for name in missing)
         missing = missing if reserved > sum(map(math.prod, found.values())) else []
     wrong = [name for name in built.state_dict() if name in tensors and tensors[name] != tuple(wanted[name].shape)]
     if missing or wrong:
         raise MemobenchError(
-            f"the weights of the checkpoint {path} are not those of its policy ({policy.type}): {len(missing)} of "
+            f"the weights of the checkpoint {path} do not fit its policy ({policy.type}): {len(missing)} of "
             f"{len(names)} are missing and {len(wrong)} have another shape, the first being {(missing + wrong)[0]}; "
-            "copy it whole or train it again"
+            "copy the whole checkpoint or train it again"
         )
 
 
 def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
-    """Refuse a checkpoint that is to act under other settings than its weights were trained for, or that is told how it
-    should have been trained.
+    """Refuse other settings of a checkpoint than those it was trained with.
 
-    Which these are its configuration says, by ``fixed_by_training`` and ``of_training_alone``, both of
-    ``ClassVar[tuple[str, ...]]``, on its class.
+    The class of its configuration lists them in ``fixed_by_training`` and ``of_training_alone``, both
+    ``ClassVar[tuple[str, ...]]``.
 
     Args:
-        source: folder or repository. policy: what it would act under.
+        source: folder or repository. policy: the configuration to act with.
 
     Raises:
-        MemobenchError: one of them is another.
+        MemobenchError: a setting differs.
     """
     fixed, of_training = getattr(policy, "fixed_by_training", ()), getattr(policy, "of_training_alone", ())
     if not fixed and not of_training:
         return
     trained = as_trained(source, policy, revision)
     for name, asked, held in differing(policy, trained, (*fixed, *of_training)):
-        why = "its weights mean nothing else" if name in fixed else "nothing of this setting acts at evaluation"
+        why = "its weights depend on it" if name in fixed else "the setting has no effect at evaluation"
         raise MemobenchError(
-            f"--policy.{name}={asked} cannot be followed: '{source}' was trained with {held}, and {why}; "
+            f"--policy.{name}={asked} cannot be used: '{source}' was trained with {held}, and {why}; "
             f"leave {name} out, or train with it"
         )
 
 
 def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTrainedConfig) -> None:
-    """Refuse to go on with a training under settings that it was not begun with.
+    """Refuse to resume a training with other settings.
 
-    Which settings these are the policy's configuration says, by ``kept_since_begun: ClassVar[tuple[str, ...]]``.
+    The class of its configuration lists them in ``kept_since_begun: ClassVar[tuple[str, ...]]``.
 
     Raises:
-        MemobenchError: one of them is another.
+        MemobenchError: a setting differs.
     """
     for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
         raise MemobenchError(
-            f"this training was begun with {name}={held}, and goes on with nothing else than that: found {value}; "
+            f"this training was begun with {name}={held} and cannot change it; found {value}; "
             f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
             "output_dir=<new folder>"
         )
 
 
 def as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> PreTrainedConfig:
-    """Return the configuration that a checkpoint, a folder or a repository, was trained with, on a policy's device."""
-    device = [f"--device={policy.device}"]  # or a word would be lost on that of the training
+    """Return the configuration that a checkpoint (folder or repository) was trained with, on a policy's device."""
+    device = [f"--device={policy.device}"]  # LeRobot logs a warning if the device of the training is not available
     return type(policy).from_pretrained(source, revision=revision, cli_overrides=device)
 
 
 def differing(
     policy: PreTrainedConfig, trained: PreTrainedConfig, names: Iterable[str]
 ) -> Iterator[tuple[str, object, object]]:
-    """Yield name, value and earlier value of those settings that are not as they were."""
+    """Yield name, value and earlier value of the settings that differ."""
     for name in names:
         asked, held = getattr(policy, name), getattr(trained, name)
         if asked != held:
@@ -331,7 +326,7 @@ def differing(
 
 
 def _shapes(file: Path) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every tensor in a file, of which only the head is read."""
+    """Return the shape of every tensor in a file; only its header is read."""
     from safetensors import safe_open
 
     with undamaged(file), safe_open(file, framework="numpy") as tensors:
@@ -344,25 +339,25 @@ def undamaged(file: Path) -> AbstractContextManager[None]:
 
 
 def _built_empty(policy: PreTrainedConfig) -> Any | None:
-    """Return LeRobot's policy without memory for its weights; None where it cannot be built so."""
+    """Return a policy on the meta device; None if it cannot be built there."""
     import torch
     from lerobot.policies.factory import get_policy_class
 
     config = copy.deepcopy(policy)
     config.device = "meta"
-    # What the checkpoint's weights replace, and a detector, which is none of them.
+    # Weights that the checkpoint replaces, and a detector, which the checkpoint does not hold.
     for loads in ("pretrained_backbone_weights", "load_vlm_weights", "base_weights", "detector"):
         if hasattr(config, loads):
             setattr(config, loads, None)
     try:
         with torch.device("meta"):
             return get_policy_class(policy.type)(config)
-    except Exception:  # whatever a policy of any kind raises, LeRobot meets it again and says so
+    except Exception:  # any policy may raise anything; LeRobot raises it again
         return None
 
 
 def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """Return shapes by the names that the policy loads them under: the family of pi0 renames what it finds."""
+    """Return shapes by the names under which the policy loads them: pi0 and its relatives rename tensors."""
     import torch
 
     renamed = getattr(policy, "_fix_pytorch_state_dict_keys", None)
@@ -373,9 +368,10 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
 
 
 def statistics_shapes(path: str | Path, revision: str | None = None) -> dict[str, tuple[int, ...]]:
-    """Return of which observations and actions a checkpoint holds statistics, and their shapes: what it was trained on.
+    """Return the observations and actions of a checkpoint's training data with their shapes; {} without statistics.
 
-    A configuration that was begun from another checkpoint lists that one's features instead. Empty without statistics.
+    They come from the statistics, because the configuration of a policy that began with another checkpoint may list
+    that checkpoint's features.
     """
     file = _file_of(path, PREPROCESSOR_FILE, revision)
     if file is None:
@@ -398,8 +394,7 @@ def _state_files(preprocessor: Path) -> Iterator[str]:
 
 
 def checkpoint_file(source: str | Path, name: str, revision: str | None = None) -> Path | None:
-    """Return a file of a checkpoint folder, or of a repository, from which it is fetched; None when there is no such
-    file.
+    """Return a file of a checkpoint folder, or download it from a repository; None if there is no such file.
 
     Raises:
         MemobenchError: the repository cannot be reached.
@@ -421,7 +416,7 @@ def checkpoint_file(source: str | Path, name: str, revision: str | None = None) 
 
 
 def _file_of(path: str | Path, name: str, revision: str | None = None) -> Path | None:
-    """Return `checkpoint_file`; None too where it cannot be fetched, which LeRobot says itself."""
+    """Return `checkpoint_file`; None also if it cannot be downloaded, which LeRobot reports."""
     try:
         return checkpoint_file(path, name, revision)
     except MemobenchError:
@@ -437,7 +432,7 @@ def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
         if str(modes.get(feature.get("type"), "IDENTITY")).upper() != "IDENTITY"
         # The preprocessor normalises observations (and actions in training), the postprocessor actions alone.
         and (file == PREPROCESSOR_FILE or feature.get("type") == "ACTION")
-        # Datasets have no statistics of these, so that they stay raw; `lerobot-train` names them inputs all the same.
+        # Datasets have no statistics of the clock, which stays raw, but `lerobot-train` lists it as an input.
         and key not in CLOCK
     ]
     state_file = step.get("state_file")
@@ -447,13 +442,12 @@ def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
         if not path.is_file():
             raise MemobenchError(
                 f"the checkpoint {folder} lacks its normalisation statistics ({path.name} is missing); "
-                "copy it whole or train it again"
+                "copy the whole checkpoint or train it again"
             )
         present = set(_shapes(path))
     missing = [key for key in needed if not any(name.startswith(f"{key}.") for name in present)]
     if missing:
         raise MemobenchError(
             f"the checkpoint {folder} has no normalisation statistics for {', '.join(missing)} "
-            f"({state_file or file}); copy it whole or train it again, since without them it would act on "
-            "raw numbers"
+            f"({state_file or file}), and would act on raw numbers; copy the whole checkpoint or train it again"
         )

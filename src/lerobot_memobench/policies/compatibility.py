@@ -1,4 +1,4 @@
-"""Check that a policy's inputs and an environment's observations agree, and say what to do where they do not."""
+"""Check that a policy's inputs fit an environment's observations."""
 
 from __future__ import annotations
 
@@ -29,18 +29,17 @@ SIZE_COUNTS = {
     "vqbet": None,
     "xvla": "resize_imgs_with_padding",
 }
-"""Policies of LeRobot's that see pictures in the size in which they come -> the setting by which they resize them, if
-they have one. All others bring every picture to a size of their own."""
+"""LeRobot's policies that read pictures in the environment's size -> their setting that resizes pictures, if any. All
+others resize every picture to a fixed size."""
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
-"""What the names of the cameras begin with that LeRobot's ``policy.empty_cameras`` adds: nobody has them."""
+"""Prefix of the cameras that LeRobot's ``policy.empty_cameras`` adds; no environment has them."""
 
 
 def cure(missing: str, observed: Collection[str]) -> str:
-    """Return how an observation is had, to end a sentence with.
+    """Return advice on a missing observation, for the end of an error message.
 
     Args:
-        missing: its name at the policy.
-        observed: the names that there are.
+        missing: its name at the policy. observed: the names of the present ones.
     """
     cameras = ", ".join(key for key in observed if key.startswith(f"{OBS_IMAGES}."))
     if missing == OBS_ENV_STATE:
@@ -53,19 +52,19 @@ def cure(missing: str, observed: Collection[str]) -> str:
 def check_features(
     path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
 ) -> None:
-    """Refuse to show a checkpoint other cameras, or numbers or pictures of other sizes, than it was trained on.
+    """Refuse other cameras, or vectors or pictures of other sizes, than a checkpoint was trained on.
 
-    LeRobot compares names of cameras alone, and those only without a ``rename_map``; policies that pad what they are
-    given, and those that take pictures of any size, would act on inputs that they have never seen.
+    LeRobot compares only the names of cameras, and only without a ``rename_map``. Policies that pad vectors, and those
+    that read pictures of any size, would act on inputs unlike their training data.
 
     Args:
         path: folder of the checkpoint, or a repository.
-        policy: its configuration, of the checkpoint's own features.
+        policy: its configuration.
         shown: the environment's features by their names at the policy, and its action.
-        renamed: LeRobot's ``rename_map``: names of the environment's -> names of the policy's.
+        renamed: LeRobot's ``rename_map``: names of the environment -> names of the policy.
 
     Raises:
-        MemobenchError: it is refused.
+        MemobenchError: an input differs.
     """
     if getattr(policy, "perception", None) == "any" or not policy.input_features:
         return
@@ -82,23 +81,22 @@ def check_features(
         length = _length(policy, name, feature, trained)
         if name == OBS_STATE and length is not None and name not in there:
             raise MemobenchError(
-                f"the policy {path} sees {name} ({length} numbers), and the environment shows {_list(original)}; map "
+                f"the policy {path} reads {name} ({length} numbers), and the environment has {_list(original)}; map "
                 "its names with --rename_map, or train on a dataset of this environment"
             )
         if length is not None and there[name].shape != (length,):
-            verb, what = ("acts by", "takes") if name == ACTION else ("sees", "shows")
             raise MemobenchError(
-                f"the policy {path} {verb} {name} of {length} numbers, and the environment {what} "
-                f"{there[name].shape[0]}; it was trained for something else: train it on a dataset of this environment"
+                f"the policy {path} has {name} of {length} numbers, and the environment has {there[name].shape[0]}; "
+                "train it on a dataset of this environment"
             )
     _check_sizes(path, policy, there)
 
 
 def _cameras(policy: Any, trained: Mapping[str, Any]) -> list[str]:
-    """Return the cameras that a policy must be shown.
+    """Return the cameras that a policy needs.
 
-    One that fills missing pictures with nothing may list those of the checkpoint that it was begun from: it needs those
-    that it was trained on, which its statistics tell.
+    A policy that fills missing pictures may list cameras of the checkpoint that its training began with; it needs those
+    of its training data, which its statistics name.
     """
     cameras = list(policy.image_features)
     if not hasattr(policy, "empty_cameras"):
@@ -115,15 +113,15 @@ def _check_cameras(
     if not missing:
         return
     free = [original[name] for name in there if name.startswith(f"{OBS_IMAGES}.") and name not in cameras]
-    says = f"the policy {path} sees {', '.join(cameras)}, and the environment shows {_list(original)}"
+    found = f"the policy {path} reads {', '.join(cameras)}, and the environment has {_list(original)}"
     if len(free) < len(missing):
         raise MemobenchError(
-            f"{says}: it has no picture for {', '.join(missing[len(free) :])}; train without that, or on a dataset of "
+            f"{found}, no picture for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
             "this environment"
         )
     mapped = {name: known for known, name in original.items() if known in cameras and known != name}
     guess = json.dumps(mapped | dict(zip(free, missing, strict=False)))
-    raise MemobenchError(f"{says}; map its names, whichever means which: --rename_map='{guess}'")
+    raise MemobenchError(f"{found}; map its names, for example by --rename_map='{guess}'")
 
 
 def _list(original: Mapping[str, str]) -> str:
@@ -131,9 +129,9 @@ def _list(original: Mapping[str, str]) -> str:
 
 
 def _length(policy: Any, name: str, feature: PolicyFeature | None, trained: Mapping[str, Any]) -> int | None:
-    """Return of how many numbers a state or an action was when a policy was trained; None where that is not known.
+    """Return the length of a state or an action in a policy's training data; None if it is unknown.
 
-    A policy that pads them may list the padded number, or that of the checkpoint which it was begun from.
+    A policy that pads them may list the padded length, or that of the checkpoint that its training began with.
     """
     if feature is None:
         return None
@@ -152,10 +150,10 @@ def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, Policy
     for name, feature in policy.image_features.items():
         if name in there and tuple(there[name].shape) != tuple(feature.shape):
             here, seen = (" x ".join(map(str, shape[1:])) for shape in (there[name].shape, feature.shape))
-            also = "" if resizes is None else f", or with --policy.{resizes} on both"
+            also = "" if resizes is None else f", or with --policy.{resizes} for both"
             raise MemobenchError(
-                f"the policy {path} was trained on pictures {name} of {seen} pixels and takes them as they come, and "
-                f"the environment shows {here}; train it on pictures of that size{also}"
+                f"the policy {path} was trained on {name} of {seen} pixels and does not resize it, and the environment "
+                f"has {here}; train it on pictures of that size{also}"
             )
 
 
@@ -169,5 +167,5 @@ def begins_episode(last: Clock | None, now: Clock) -> bool:
 
 
 def is_frozen(last: Clock | None, now: Clock) -> bool:
-    """Return whether nothing has moved since the observation before: the episode has ended."""
+    """Return whether an observation repeats the one before, because the episode has ended."""
     return now[1] == ENDED or (now == last and now[1] != NO_CLOCK)

@@ -1,4 +1,4 @@
-"""The moving average of the trained weights: a checkpoint's model is the average, the trained weights lie beside it."""
+"""The moving average of the trained weights. A checkpoint's model is the average; another file holds the weights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Averaged(NamedTuple):
     """State of one parameter in a checkpoint.
 
     Attributes:
-        weights: trained weights. average: their average, None where the model's file holds it exactly.
+        weights: trained weights. average: their average, None if the model's file holds it exactly.
         updates: number of updates in the average.
     """
 
@@ -39,8 +39,8 @@ class WeightAverage:
     """Trained weights, their average and the number of averaged updates, for each parameter.
 
     The average is kept outside the module, so that optimiser, DDP and ``state_dict`` do not see it. Its decay grows
-    from 0.1 to the given value as (1 + n) / (10 + n) over the first updates n of a parameter, so that a short run does
-    not evaluate initial weights; after 9,000 updates it is 0.999. Averages are float32 whatever the parameters are,
+    from 0.1 to the given value as (1 + n) / (10 + n) over the first updates n of a parameter, so that the average of a
+    short run is not dominated by the initial weights; after 9,000 updates it is 0.999. Averages are always float32,
     because bfloat16 cannot hold steps of a thousandth.
 
     Attributes:
@@ -69,12 +69,10 @@ class WeightAverage:
 
     @contextmanager
     def applied(self, dtypes: Mapping[nn.Parameter, torch.dtype] | None = None) -> Iterator[None]:
-        """Let the module hold the average inside the block.
-
-        Nothing is copied for float32 parameters.
+        """Set the module's parameters to the average inside the block; float32 parameters are not copied.
 
         Args:
-            dtypes: parameters that are to hold the average in another precision than their own.
+            dtypes: parameters whose precision changes too.
         """
         trained = {name: parameter.data for name, parameter in self.parameters.items()}
         try:
@@ -86,9 +84,9 @@ class WeightAverage:
                 parameter.data = trained[name]
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, str]]:
-        """Return tensors and metadata of a safetensors file, next to one that holds the averaged module.
+        """Return tensors and metadata of the file that `states_of` reads.
 
-        The trained weights, and the averages where the module's own precision would round them. `states_of` reads them.
+        They are the trained weights, and the averages that the precision of the model's file would round.
         """
         tensors = {f"weights.{name}": parameter.detach().contiguous() for name, parameter in self.parameters.items()}
         for name, parameter in self.parameters.items():
@@ -105,10 +103,10 @@ class WeightAverage:
 
     @torch.no_grad()
     def restore(self, states: Mapping[str, Averaged]) -> list[str]:
-        """Set the trained weights, averages and numbers of updates of a module that holds the average.
+        """Restore trained weights, averages and numbers of updates in a module that holds the average.
 
         Returns:
-            Names of parameters without a state; their average begins with their present weights.
+            Names of parameters without a saved state; their average starts at their present weights.
         """
         for name in states.keys() & self.parameters.keys():
             parameter, (weights, average, self.counts[name]) = self.parameters[name], states[name]
@@ -132,10 +130,10 @@ def states_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> dic
 
 
 def begin_average(policy: Any) -> WeightAverage | None:
-    """Return the average of a policy that is about to be trained; None if it has none (``ema_decay=0``, adapters).
+    """Return the average of a policy in training; None without one (``ema_decay=0``, adapters).
 
-    A policy that was loaded from a checkpoint holds the checkpoint's average. It gets the trained weights back, and the
-    average continues; that of parts which begin again, or which the checkpoint did not train, starts at their weights.
+    A policy loaded from a checkpoint holds the average. Its trained weights are restored, and the average continues;
+    for parts that are initialised again, or that the checkpoint did not train, it starts at their weights.
 
     Raises:
         MemobenchError: the checkpoint's trained weights cannot be read, or do not fit.
@@ -155,7 +153,7 @@ def begin_average(policy: Any) -> WeightAverage | None:
     states = {name: held[name] for name in held.keys() & average.parameters.keys() - restarted(policy, trained)}
     wrong = sorted(name for name, one in states.items() if one.weights.shape != average.parameters[name].shape)
     if wrong:
-        raise MemobenchError(f"{path} holds another shape of '{wrong[0]}' than this policy; copy the checkpoint again.")
+        raise MemobenchError(f"{path} holds '{wrong[0]}' in another shape than this policy; copy the checkpoint again")
     new = average.restore(states)
     if new:
         logger.info("the average continues from '%s'; that of %s starts again", source, ", ".join(new))

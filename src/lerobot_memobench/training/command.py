@@ -11,20 +11,24 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, INFO_FILE, check_whole, naming_damage
-from lerobot_memobench.envs.settings import OBS_TYPES
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on
-from lerobot_memobench.jobs.threads import LEARNING, cores, use_threads
-from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_CONFIG
-from lerobot_memobench.policies.checkpoint import (
-    as_trained,
-    check_weights,
-    differing,
-    local_folder,
-    read_json,
+import yaml
+
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    DEFAULT_REPO_ID,
+    INFO_FILE,
+    check_whole,
+    naming_damage,
+    read_info,
 )
+from lerobot_memobench.envs.settings import OBS_TYPES
+from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.io import check_fetched
+from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on
+from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_CONFIG
+from lerobot_memobench.policies.checkpoint import as_trained, check_weights, differing, local_folder, read_json
 from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.run.arguments import (
     CONFIG_FILE,
@@ -38,7 +42,6 @@ from lerobot_memobench.run.arguments import (
     resolve_recipe,
     whole_number,
 )
-from lerobot_memobench.run.plan import check_observations, env_config, policy_config
 from lerobot_memobench.training.resume import (
     check_same_training,
     how_to_go_on,
@@ -49,48 +52,51 @@ from lerobot_memobench.training.resume import (
 
 MEMORY_POLICY = "memobench_mem"
 OBJECT_BATCH = 72
-"""Default frames per update of a policy whose samples lie in main memory: a dozen episodes, six frames of each."""
+"""Default frames per update of a policy whose samples are in main memory: a dozen episodes, six frames of each."""
+SHORT_TRAINING = 2000
+"""Updates below which losses are logged ten times; LeRobot's default of every 200 updates would log too few."""
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
-"""Settings that name what is trained."""
-OF_MEMORY: Mapping[str, object] = {
+"""Settings that name the model to train."""
+MEMORY_DEFAULTS: Mapping[str, object] = {
     "memory_stride": None,
     "memory_fusion": None,
     "memory_frames": 32,
     "memory_phase": False,
     "subgoals": None,
 }
-"""Settings that another memory does not take over from a checkpoint or a recipe -> their defaults."""
+"""Settings that a memory does not take over from another memory's checkpoint or recipe -> their defaults."""
+SMALLEST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0, "eval.n_episodes": 1}
+"""Setting -> its smallest value."""
 
 
-def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) -> int:
+def train(given: Arguments, line: Sequence[str], notify: Callable[[str], None]) -> int:
     """Run ``lerobot train``; return the exit status.
 
     Args:
-        line: the words of the command, for the message that says how to resume.
-        tell: called with notes.
+        line: the words of the command, for the message that explains how to resume.
+        notify: called with notes.
     """
     begun = time.time()
-    use_threads(LEARNING)
     prompt_frames, obs_type, given = take_training_options(resolve_recipe(resumed(given)))
     check_task_names(given)
     arguments = read_arguments("train", given)
     if given.wants_help:
         return run_lerobot(arguments.for_parser)
-    arguments = complete_training(arguments)
-    note, left = note_on_resume(arguments)
-    for noted in (note, note_on_start(arguments)):
-        if noted is not None:
-            tell(noted)
-    if not left:
+    arguments = complete_training(arguments, notify)
+    note, updates_left = note_on_resume(arguments)
+    if note is not None:
+        notify(note)
+    if not updates_left:
         return 0
     make_room_for_link(arguments)
     root = arguments.get("dataset.root")
     with (
         saying_how_to_go_on("lerobot", lambda: how_to_go_on(arguments, line, begun)),
-        held_run(arguments),
+        locked_run(arguments),
         naming_damage(Path(root) if root else None),
     ):
-        if policy_type(arguments) == MEMORY_POLICY:
+        policy = arguments.chosen.get("policy")
+        if policy is not None and policy.get_choice_name(policy) == MEMORY_POLICY:  # type: ignore[attr-defined]
             from lerobot_memobench.training.configuration import read_training
             from lerobot_memobench.training.loop import train as train_memory_policy
 
@@ -98,9 +104,9 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
             return 0
         from lerobot_memobench.training.view import viewed
 
-        status = run_lerobot(viewed(arguments, prompt_frames, obs_type, tell).for_parser)
+        status = run_lerobot(viewed(arguments, prompt_frames, obs_type, notify).for_parser)
         if status and root and (Path(root) / INFO_FILE).is_file() and not arguments.has("dataset.episodes"):
-            check_whole(Path(root))  # its error, in the other process, does not name the file
+            check_whole(Path(root))  # LeRobot's error does not name the damaged file
         return status
 
 
@@ -110,20 +116,14 @@ def run_lerobot(flags: Sequence[str]) -> int:
     return subprocess.run(command, check=False).returncode
 
 
-def policy_type(arguments: LerobotArguments) -> str | None:
-    """Return the type of the policy that is trained, None for a reward model."""
-    kind = arguments.chosen.get("policy")
-    return None if kind is None else str(kind.get_choice_name(kind))  # type: ignore[attr-defined]
-
-
 @contextmanager
-def held_run(arguments: LerobotArguments) -> Iterator[None]:
-    """Hold the folder of a training by a lock file beside it, in the training's first process.
+def locked_run(arguments: LerobotArguments) -> Iterator[None]:
+    """Lock the folder of a training, in its first process.
 
-    LeRobot refuses a folder that exists before its first checkpoint, so the lock cannot lie in it.
+    The lock is a file next to the folder, because LeRobot refuses a folder that exists before its first checkpoint.
 
     Raises:
-        MemobenchError: another training holds it.
+        MemobenchError: another training holds the lock.
     """
     named = arguments.get("output_dir") or read_config_file(arguments.get(CONFIG_FILE)).get("output_dir")
     if not isinstance(named, str) or os.environ.get("RANK", "0") != "0":
@@ -137,40 +137,41 @@ def held_run(arguments: LerobotArguments) -> Iterator[None]:
         try:
             yield
         finally:
-            with suppress(OSError):  # Windows keeps a file that is open
+            with suppress(OSError):  # Windows does not delete an open file
                 lock.unlink()
 
 
-# -- the words ---------------------------------------------------------------------------------------------------------
-
-
 def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Arguments]:
-    """Return the options of a command line that LeRobot does not have, and the arguments without them.
+    """Split off the options that LeRobot does not have.
 
     Returns:
         Whether frames of demonstration prompts are trained on, the kind of observation (each None if it is not given),
-        and the rest.
+        and the other arguments.
 
     Raises:
-        MemobenchError: the first is neither true nor false, or the second no kind of observation.
+        MemobenchError: an option has an unknown value.
     """
     found = dict(given.pairs)
-    of_env = {"obs_type"} if "env" in found else set()  # it is a setting of it, too
+    of_env = {"obs_type"} if "env" in found else set()  # it is a setting of the environment, too
     rest = [pair for pair in given.pairs if pair[0] in of_env or pair[0] not in TRAINING_OPTIONS]
     obs_type = found.get("obs_type")
-    if obs_type is not None and obs_type not in OBS_TYPES:
-        raise MemobenchError(f"found obs_type={obs_type}, {nearest(obs_type, OBS_TYPES)}")
-    wanted = checked_value("prompt_frames", bool | None, found.get("prompt_frames", "null"))
-    return {"true": True, "false": False}.get(wanted), obs_type, replace(given, pairs=rest)
+    if obs_type is not None:
+        check_choice("obs_type", obs_type, OBS_TYPES)
+    prompts = checked_value("prompt_frames", bool | None, found.get("prompt_frames", "null"))
+    return {"true": True, "false": False}.get(prompts), obs_type, replace(given, pairs=rest)
 
 
-def complete_training(arguments: LerobotArguments) -> LerobotArguments:
-    """Return a training's arguments with the benchmark's defaults.
+def complete_training(arguments: LerobotArguments, notify: Callable[[str], None] = print) -> LerobotArguments:
+    """Check a training's arguments, and add the benchmark's defaults.
+
+    Args:
+        notify: called with notes.
 
     Raises:
-        MemobenchError: no policy is named, a number is too small, or the dataset or the model checkpoint is none.
+        MemobenchError: no policy is named, a number is too small, the dataset or the checkpoint cannot be used, or a
+            resumed training has other settings.
     """
-    from lerobot_memobench.training.checks import check_dataset, check_memory_settings, check_numbers
+    from lerobot_memobench.run.plan import check_observations, env_config  # imports torch
 
     from_file = arguments.has(CONFIG_FILE)
     if not from_file:
@@ -178,31 +179,54 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
             raise MemobenchError("name a policy: policy=memobench_mem")
         arguments = arguments.default("dataset.repo_id", DEFAULT_REPO_ID)
         named = arguments.has("policy.type") or arguments.has("policy.path")
-        if named and not arguments.has("policy.repo_id"):  # LeRobot would ask for one
+        if named and not arguments.has("policy.repo_id"):  # LeRobot would require one
             arguments = arguments.default("policy.push_to_hub", False)
     check_numbers(arguments)
     check_dataset(arguments)
     check_same_training(arguments)
-    arguments = without_unread(with_own_memory(arguments))
-    policy = policy_config(arguments)
+    arguments, policy = parse_policy(with_memory_defaults(arguments))
     check_memory_settings(arguments, policy)
     path = arguments.get("policy.path")
     if path is not None and policy is not None:
         with quiet():
-            check_weights(path, as_trained(path, policy))
+            trained = as_trained(path, policy)
+            check_weights(path, trained)
+        changed = list(differing(policy, trained, getattr(policy, "fixed_by_training", ())))
+        if changed:
+            was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
+            notify(f"note: '{path}' was trained with {was}; this training continues from its weights with {now}")
     check_observations(policy, env_config(arguments))
     steps = whole_number(arguments.get("steps"))
-    if steps is not None and steps < 2000 and arguments.get("resume") != "true":
-        # LeRobot's default of every 200 steps shows no loss of a short run.
+    if steps is not None and steps < SHORT_TRAINING and arguments.get("resume") != "true":
         arguments = arguments.default("log_freq", max(1, steps // 10))
     if not from_file and getattr(policy, "decodes_no_video", False):
         arguments = arguments.default("batch_size", OBJECT_BATCH)
-    if cores() < 4 and not from_file:  # LeRobot's default of 4 loaders would only wait for one another
+    if cores() < 4 and not from_file:  # LeRobot's default is four loaders
         arguments = arguments.default("num_workers", cores())
     return arguments
 
 
-def with_own_memory(arguments: LerobotArguments) -> LerobotArguments:
+def parse_policy(arguments: LerobotArguments) -> tuple[LerobotArguments, Any]:
+    """Parse the policy's configuration; it is None if a configuration file is named.
+
+    Settings of a checkpoint that have no effect under the settings of the command line are reset to their defaults.
+    """
+    from draccus.utils import ParsingError
+
+    from lerobot_memobench.run.plan import policy_config
+
+    try:
+        return arguments, policy_config(arguments)
+    except ParsingError as error:
+        unread = getattr(error.__cause__, "defaults", {})
+        if not unread or arguments.get("policy.path") is None:
+            raise
+        for name, value in unread.items():
+            arguments = arguments.default(f"policy.{name}", json.dumps(value))
+        return arguments, policy_config(arguments)
+
+
+def with_memory_defaults(arguments: LerobotArguments) -> LerobotArguments:
     """Return arguments in which a memory that differs from the checkpoint's or the recipe's has its own defaults."""
     memory, path = arguments.get("policy.memory"), arguments.get("policy.path")
     if memory is None:
@@ -213,38 +237,41 @@ def with_own_memory(arguments: LerobotArguments) -> LerobotArguments:
     held = begun.get("memory") or ("none" if begun.get("memory_fusion") == "none" else "frames")
     if begun.get("type") != MEMORY_POLICY or held == ("frames" if memory == "null" else memory):
         return arguments
-    for name, value in OF_MEMORY.items():
+    for name, value in MEMORY_DEFAULTS.items():
         arguments = arguments.default(f"policy.{name}", "null" if value is None else value)
     return arguments
 
 
-def without_unread(arguments: LerobotArguments) -> LerobotArguments:
-    """Return arguments that reset settings of a checkpoint that have no effect under the settings of the line.
-
-    Those of the line itself are refused later.
-    """
-    if arguments.get("policy.path") is None:
-        return arguments
-    from draccus.utils import ParsingError
-
-    try:
-        policy_config(arguments)
-    except ParsingError as error:
-        for name, value in getattr(error.__cause__, "defaults", {}).items():
-            arguments = arguments.default(f"policy.{name}", json.dumps(value))
-    return arguments
+def check_numbers(arguments: LerobotArguments) -> None:
+    """Refuse numbers on the command line, or else in the configuration file, that are below `SMALLEST`."""
+    file = read_config_file(arguments.get(CONFIG_FILE))
+    for key, smallest in SMALLEST.items():
+        section, _, name = key.rpartition(".")
+        held = file.get(section) if section else file
+        number = whole_number(arguments.get(key) or (str(held.get(name)) if isinstance(held, dict) else None))
+        if number is not None and number < smallest:
+            raise MemobenchError(f"found {key}={number}; expected at least {smallest}")
 
 
-def note_on_start(arguments: LerobotArguments) -> str | None:
-    """Return a note if a training begins from a checkpoint under other settings than its weights were trained for."""
-    path = arguments.get("policy.path")
-    policy = None if path is None else policy_config(arguments)
-    if path is None or policy is None:
-        return None
-    fixed = getattr(policy, "fixed_by_training", ())
-    with quiet():
-        changed = list(differing(policy, as_trained(path, policy), fixed)) if fixed else []
-    if not changed:
-        return None
-    was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
-    return f"note: '{path}' was trained with {was}, and its weights are now trained on with {now}"
+def check_dataset(arguments: LerobotArguments) -> None:
+    """Refuse a folder that is not a dataset; a folder that does not exist may be one to download into."""
+    root = arguments.get("dataset.root")
+    if root is None:
+        return
+    folder = Path(root).expanduser()
+    if not folder.exists() and not (arguments.get("dataset.repo_id") or "").startswith("local/"):
+        return
+    if not (folder / INFO_FILE).is_file():
+        problem = f"is not a LeRobot dataset ({INFO_FILE} is missing)" if folder.is_dir() else "does not exist"
+        raise MemobenchError(f"the dataset folder {root} {problem}; make one with `memobench generate --out <folder>`")
+    read_info(folder)
+    check_fetched(folder)
+
+
+def check_memory_settings(arguments: LerobotArguments, policy: Any) -> None:
+    """Refuse settings on the command line that belong to another memory; errors as of `read_settings`."""
+    from lerobot_memobench.policies.memobench_mem.memory import NONE, read_settings
+
+    given = yaml.safe_load(arguments.get("policy.memory_settings") or "{}")
+    if given and getattr(policy, "memory", NONE) != NONE:
+        read_settings(policy.memory, given)

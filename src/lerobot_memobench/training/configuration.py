@@ -1,26 +1,30 @@
-"""Read LeRobot's configuration of a training from flags, as LeRobot's trainer reads it from ``sys.argv``."""
+"""Read and check LeRobot's configuration of a training."""
 
 from __future__ import annotations
 
+import copy
 import datetime as dt
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import draccus
 from lerobot.common.train_utils import resolve_resume_checkpoint
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import FeatureType, PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.policies.lerobot_config import overrides
-from lerobot_memobench.training.checks import check_settings
 
 CHOICES = ["policy", "reward_model"]
-"""Fields of which LeRobot's parser takes a ``path``."""
+"""Fields for which LeRobot's parser takes a ``path``."""
 
 
 def read_config(flags: Sequence[str]) -> TrainPipelineConfig:
-    """Return the configuration as it is typed, with the policy's of the checkpoint that it names."""
+    """Return the configuration that the flags set, the policy's from the checkpoint that they name."""
     for key, package in parser.parse_plugin_args("discover_packages_path", flags).items():
         parser.load_plugin(package)
         flags = parser.filter_arg(key, flags)
@@ -33,8 +37,8 @@ def read_config(flags: Sequence[str]) -> TrainPipelineConfig:
         config = TrainPipelineConfig.from_pretrained(named, cli_args=parser.filter_arg("config_path", rest))
     path = parser.get_path_arg("policy", flags)
     if path is not None:
-        told = [*parser.get_yaml_overrides("policy"), *overrides("policy", flags)]
-        config.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=told)
+        given = [*parser.get_yaml_overrides("policy"), *overrides("policy", flags)]
+        config.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=given)
         config.policy.pretrained_path = Path(path)
     return config
 
@@ -68,3 +72,52 @@ def read_training(flags: Sequence[str]) -> TrainPipelineConfig:
     if config.use_policy_training_preset and not config.resume:
         config.optimizer, config.scheduler = policy.get_optimizer_preset(), policy.get_scheduler_preset()
     return config
+
+
+def check_settings(config: TrainPipelineConfig) -> None:
+    """Refuse settings of LeRobot's trainer that the loop of memory policies does not support."""
+    policy: Any = config.policy
+    encoded = config.dataset.image_transforms.enable and policy.encodes_ahead
+    no_optimizer = config.optimizer is None and not config.use_policy_training_preset
+    new_policy = not policy.pretrained_path and not config.resume
+    repository = policy.repo_id
+    refused = [
+        (config.dataset.streaming, "dataset.streaming=true", "memory needs all frames of an episode"),
+        (config.sample_weighting is not None, "sample_weighting", "all samples have the same weight"),
+        (config.job.is_remote, "job.target", "the loop runs on this machine"),
+        (encoded, "dataset.image_transforms.enable=true", "images are encoded once, before training"),
+        # Of LeRobot's main branch.
+        (getattr(getattr(config, "parallelism", None), "is_sharded", False), "parallelism.dp_shard", "no shards"),
+        (getattr(getattr(config, "ema", None), "enable", False), "ema.enable=true", "see policy.ema_decay"),
+    ]
+    for present, setting, why in refused:
+        if present:
+            raise MemobenchError(f"{setting} has no effect on policy={policy.type} ({why}); leave it out")
+    lacking = [
+        (no_optimizer, "optimizer.type=", "use_policy_training_preset=false"),
+        (config.eval_steps > 0 and config.dataset.eval_split == 0.0, "dataset.eval_split=0.1", "eval_steps="),
+        (policy.push_to_hub and not repository, "policy.repo_id=user/name", "policy.push_to_hub=true"),
+        (config.save_checkpoint_to_hub and not repository, "policy.repo_id=user/name", "save_checkpoint_to_hub=true"),
+        (config.rename_map and new_policy, "policy=<checkpoint>", "rename_map="),
+    ]
+    for absent, needed, setting in lacking:
+        if absent:
+            raise MemobenchError(f"{setting} needs {needed}; give it, or leave {setting.rstrip('=')} out")
+
+
+def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
+    """Refuse evaluations on the benchmark during a training on other cameras or sizes.
+
+    Args:
+        features: of the dataset.
+    """
+    if config.policy is None or getattr(config.env, "type", None) != "memobench":
+        return
+    unused = None if getattr(config.policy, "uses_pictures", True) else FeatureType.VISUAL
+    known = dataset_to_policy_features(features)
+    policy = copy.copy(config.policy)
+    policy.output_features = {key: one for key, one in known.items() if one.type is FeatureType.ACTION}
+    policy.input_features = policy.input_features or {
+        key: one for key, one in known.items() if one.type not in (FeatureType.ACTION, unused)
+    }
+    check_features(f"that learns from {meta.root}", policy, env_to_policy_features(config.env), config.rename_map)

@@ -1,4 +1,4 @@
-"""Open what a memory policy learns from: datasets, the lookup of their frames, samples and processors."""
+"""Open the data of a training: datasets, the lookup of their frames, samples and processors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import copy
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from lerobot_memobench.datasets.frames import FrameLookup, TextEncoder, read_frame_table, read_recorded
+from lerobot_memobench.datasets.frames import Encoded, FrameLookup, Remember, TextEncoder, read_frame_table, read_recorded
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, read_info, without_pattern
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
@@ -47,18 +46,18 @@ from lerobot_memobench.training.features import cameras_of, detections, picture_
 logger = logging.getLogger(__name__)
 
 RECORDED = (OBS_STATE, OBS_ENV_STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index", "index")
-"""Columns of which samples are made if training decodes no video."""
+"""Columns of samples if training decodes no video."""
 LEAST_DEVIATION = 0.01
-"""Added to the standard deviations of actions, so that a number that hardly varies is not scaled up to noise."""
+"""Added to the standard deviations of actions, so that nearly constant numbers are not scaled up to noise."""
 
 
 @dataclass
 class Training:
-    """A policy and what it learns from.
+    """A policy and its training data.
 
     Attributes:
-        policy: LeRobot's, with adapters perhaps. processors: pre- and postprocessor.
-        dataset: the episodes to train on. held_out: those held out, None without any.
+        policy: possibly with adapters. processors: pre- and postprocessor.
+        dataset: the episodes to train on. held_out: the held-out episodes, or None.
         lookup: all frames of the dataset.
     """
 
@@ -69,7 +68,7 @@ class Training:
     lookup: FrameLookup
 
     def samples(self, dataset: LeRobotDataset | None = None) -> Dataset[dict[str, Any]]:
-        """Return the samples of a part of the dataset by their global indices; of the episodes to train on if None."""
+        """Return the samples of a part of the dataset by their global indices; None: of the episodes to train on."""
         dataset = dataset or self.dataset
         if not self.lookup.columns:
             return DecodedSamples(dataset)
@@ -77,7 +76,7 @@ class Training:
 
 
 def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
-    """Make or load the policy of a training, compute features that are not cached yet, and make the processors.
+    """Make or load the policy of a training, compute missing features, and make the processors.
 
     Args:
         datasets: of `open_datasets`.
@@ -100,10 +99,10 @@ def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, L
 
 
 def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
-    """Open the episodes to train on and those that are held out, as LeRobot does; complete their statistics.
+    """Open the episodes to train on and the held-out ones, as LeRobot does, and complete their statistics.
 
     Raises:
-        MemobenchError: the dataset has no such episodes, or an earlier version made it.
+        MemobenchError: the dataset lacks an episode, or an earlier version made it.
     """
     opened = copy.copy(config)
     if config.dataset.root is not None:
@@ -125,20 +124,20 @@ def check_dataset_version(meta: LeRobotDatasetMetadata) -> None:
 
 
 def check_episodes(episodes: Sequence[int] | None, meta: LeRobotDatasetMetadata) -> None:
-    """Refuse episodes that a dataset does not have; LeRobot leaves them out, and fails if none is left."""
+    """Refuse episodes that a dataset lacks; LeRobot ignores them, and fails if no episode is left."""
     if episodes is None:
         return
     absent = [episode for episode in episodes if episode >= meta.total_episodes]
     if absent or not episodes:
         raise MemobenchError(
             f"found episodes={absent or episodes}, and the dataset {meta.root} has "
-            f"{count_of(meta.total_episodes, 'episode')}; name some of 0 to {meta.total_episodes - 1}, or leave "
+            f"{count_of(meta.total_episodes, 'episode')}; choose from 0 to {meta.total_episodes - 1}, or leave "
             "episodes out for all"
         )
 
 
 def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -> None:
-    """Add the statistics that a policy normalises by and its dataset lacks.
+    """Add missing statistics that a policy needs for normalisation to its dataset.
 
     Args:
         policy: its configuration. given: LeRobot's configuration of the dataset.
@@ -153,10 +152,10 @@ def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -
 
 
 def complete_policy(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:
-    """Set the subgoals of a memory that learns from them.
+    """Set the subgoals of a memory that is supervised with them.
 
     Raises:
-        MemobenchError: the dataset lacks texts that the policy learns from.
+        MemobenchError: the dataset lacks texts that the policy needs.
     """
     require_texts(Path(meta.root), config)
     if config.privileged_memory:
@@ -170,7 +169,7 @@ def complete_policy(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) ->
 def open_lookup(
     root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str] | None = None
 ) -> FrameLookup:
-    """Open the lookup of a dataset's frames; compute features first that are not cached yet.
+    """Open the lookup of a dataset's frames; compute missing features first.
 
     Args:
         encoder: the policy's perception.
@@ -180,56 +179,52 @@ def open_lookup(
         MemobenchError: the dataset lacks a column, or features cannot be computed.
     """
     in_data = {known: given for given, known in (renamed or {}).items()}
-    stride = config.memory_stride
+    remember: Remember | None = None
     if isinstance(encoder, ImageTowerEncoder):
-        table, remember = read_frame_table(root), None
+        table = read_frame_table(root)
         if config.memory != "none":
             remembered = encoder.memory_input
             camera = in_data.get(remembered, remembered) or next(iter(cameras_of(read_info(root)["features"])), "")
-            how = {"progress": partial(logger.info, "feature cache: %d of %d episodes")}
-            remember = remembered_features(root, config, encoder, camera, **how).tokens
-        return FrameLookup(root, table, stride=stride, texts=text_encoder(config), remember=remember)
+            remember = remembered_features(root, config, encoder, camera).tokens
+        return FrameLookup(root, table, stride=config.memory_stride, texts=text_encoder(config), remember=remember)
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
     columns, table = read_recorded(root, names)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
+    encoded: dict[str, Encoded] = {}
     if isinstance(encoder, VisualTokenEncoder):
         cameras = dict.fromkeys(encoder.cameras or [*cameras_of(read_info(root)["features"]), encoder.memory_input])
-        names_in_data = {name: in_data.get(name, name) for name in cameras}
-        how = {"progress": partial(logger.info, "pictures encoded: %d of %d episodes")}
-        memory, present = picture_tokens(root, config, encoder, names_in_data, **how)
+        memory, present = picture_tokens(root, config, encoder, {name: in_data.get(name, name) for name in cameras})
         encoded = {encoded_key(camera): one.of_frames for camera, one in present.items()}
         remember = None if memory is None else memory.tokens
-        return FrameLookup(
-            root, table, stride=stride, texts=text_encoder(config), remember=remember, columns=columns, encoded=encoded
-        )
-    observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
-    encoded = {}
-    if isinstance(encoder, DetectionEncoder):
-        names_in_data = {name: in_data.get(name, name) for name in VIEWS}
-        how = {"progress": partial(logger.info, "objects detected in %d of %d episodes")}
-        found = detections(root, encoder.detect, names_in_data, in_data.get(OBS_STATE, OBS_STATE), **how)
-        slots = found.all_frames().sum(dim=1, dtype=torch.float32)
-        observed[DETECTED], encoded[DETECTED] = slots, lambda indices: slots[indices]
+    else:
+        observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
+        if isinstance(encoder, DetectionEncoder):
+            views = {name: in_data.get(name, name) for name in VIEWS}
+            found = detections(root, encoder.detect, views, in_data.get(OBS_STATE, OBS_STATE))
+            slots = found.all_frames().sum(dim=1, dtype=torch.float32)
+            observed[DETECTED], encoded[DETECTED] = slots, lambda indices: slots[indices]
 
-    def remember_objects(episode: int, slots: Sequence[int]) -> Tensor:
-        first = int(table.episodes[episode])
-        return encoder.remember(observed, [first + slot * stride for slot in slots])
+        def remember_objects(episode: int, slots: Sequence[int]) -> Tensor:
+            first = int(table.episodes[episode])
+            return encoder.remember(observed, [first + slot * config.memory_stride for slot in slots])
+
+        remember = remember_objects
 
     return FrameLookup(
         root,
         table,
-        stride=stride,
+        stride=config.memory_stride,
         texts=text_encoder(config),
-        remember=remember_objects,
+        remember=remember,
         columns=columns,
         encoded=encoded,
     )
 
 
 def text_encoder(config: MemobenchMemConfig) -> TextEncoder:
-    """Return the encoder of the subgoals that memory is aligned with; without an alignment nothing reads its output."""
+    """Return the text encoder of the subgoals for the alignment; without an alignment its output is not used."""
     name = "words" if config.align == "none" else config.text_encoder
-    assert name is not None  # set by the configuration
+    assert name is not None  # the configuration sets it
     return make_text_encoder(name, config.dimensions.text_dim, str(config.device))
 
 
@@ -237,10 +232,10 @@ def text_encoder(config: MemobenchMemConfig) -> TextEncoder:
 
 
 class RecordedSamples(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their global indices, made of numbers in main memory, without pictures.
+    """LeRobot's samples by their global indices, from columns in main memory, without pictures.
 
     Args:
-        chunk: actions of a sample, counted from its frame.
+        chunk: steps of a sample's actions, relative to its frame.
     """
 
     def __init__(self, lookup: FrameLookup, tasks: Sequence[str], chunk: Sequence[int]) -> None:
@@ -272,7 +267,7 @@ class DecodedSamples(Dataset[dict[str, Any]]):
 
 
 def make_processors(config: TrainPipelineConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup) -> tuple[Any, Any]:
-    """Return pre- and postprocessor of the policy in training: new ones, or those of the checkpoint it begins with."""
+    """Return pre- and postprocessor of a training: new ones, or those of the checkpoint that it begins with."""
     policy: Any = config.policy
     stats = {**meta.stats, **execution_statistics(policy, meta, lookup)}
     if not policy.pretrained_path:
@@ -282,7 +277,7 @@ def make_processors(config: TrainPipelineConfig, meta: LeRobotDatasetMetadata, l
         "norm_map": policy.normalization_mapping,
     }
     unnormalizer: dict[str, Any] = {**normalizer, "features": policy.output_features}
-    if not config.resume:  # a training that is resumed keeps its statistics
+    if not config.resume:  # a resumed training keeps its statistics
         normalizer["stats"] = unnormalizer["stats"] = stats
     before: dict[str, Any] = {
         "device_processor": {"device": torch.device(policy.device).type},
@@ -311,12 +306,12 @@ def make_processors(config: TrainPipelineConfig, meta: LeRobotDatasetMetadata, l
 def execution_statistics(
     config: MemobenchMemConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup
 ) -> dict[str, dict[str, Any]]:
-    """Return the statistics of states and actions over execution frames; none if LeRobot makes the samples.
+    """Return the statistics of states and actions over execution frames; {} if LeRobot makes the samples.
 
-    Relative actions depend on the chunk, so theirs are the dataset's.
+    Statistics of relative actions depend on the chunk and are the dataset's.
 
     Raises:
-        MemobenchError: actions are relative, and the dataset's statistics are of absolute ones.
+        MemobenchError: actions are relative, and the dataset has statistics of absolute actions.
     """
     if not lookup.columns:
         return {}
@@ -327,10 +322,10 @@ def execution_statistics(
         found[ACTION] = dict(meta.stats[ACTION])
         if np.allclose(found[ACTION]["mean"], columns[ACTION].mean(axis=0), atol=1e-4):
             raise MemobenchError(
-                f"The dataset {meta.root} has statistics of absolute actions, and "
+                f"the dataset {meta.root} has statistics of absolute actions, and "
                 "--policy.use_relative_actions=true normalises relative ones; recompute them "
                 "(`lerobot-edit-dataset --operation.type=recompute_stats --operation.relative_action=true "
-                f"--operation.chunk_size={config.chunk_size}`) or leave use_relative_actions out."
+                f"--operation.chunk_size={config.chunk_size}`) or leave use_relative_actions out"
             )
     found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + LEAST_DEVIATION
     return found

@@ -1,9 +1,9 @@
 """Cache the outputs of frozen encoders for every frame of a dataset: one safetensors file per episode.
 
-A memory reads up to 32 earlier frames per sample, and a policy that reads pictures through a frozen encoder needs their
-tokens at every update. They are computed once, before training, and lie in ``feature_cache/<name>/`` in the dataset's
-folder. The name ends with a hash of the frames, the encoder's weights, the camera and the stride, so a cache that does
-not fit has another name. A file that exists is complete. With several processes each encodes a part of the episodes.
+A memory reads up to 32 earlier frames per sample, and a policy with a frozen encoder needs the tokens of its pictures
+at every update. They are computed once, before training, in ``feature_cache/<name>/`` in the dataset's folder. The name
+ends with a hash of frames, encoder weights, camera and stride, so other inputs have another cache. A file that exists
+is complete. With several processes, each one encodes a part of the episodes.
 """
 
 from __future__ import annotations
@@ -58,20 +58,20 @@ MOST_THREADS = 8
 BYTES = 2
 """Of a bfloat16 number."""
 _SAMPLE = 1 << 16
-"""Bytes of a video that are hashed at its start, middle and end."""
+"""Bytes of a video that are hashed at each of its start, middle and end."""
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
 Progress = Callable[[int, int], None]
-"""Called as progress(episodes done, episodes in all)."""
+"""Called as progress(completed episodes, all episodes)."""
 
 
 @dataclass(frozen=True)
 class Features:
-    """Features of a frame.
+    """An encoder of frames.
 
     Attributes:
         key: identity of the encoder: weights and input size.
         tokens_per_frame: P. dim: D.
-        make: from images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16.
+        make: maps images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16.
     """
 
     key: str
@@ -81,7 +81,7 @@ class Features:
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes of one stored frame: 64 KiB at full size."""
+        """Bytes of a stored frame: 64 KiB at full size."""
         return BYTES * self.tokens_per_frame * self.dim
 
 
@@ -105,7 +105,7 @@ class EpisodeFeatures:
         return self._opened[number]
 
     def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
-        """Return the features (n, P, D) of slots of an episode; slot k is its frame k * stride."""
+        """Return the features (n, P, D) of an episode's slots; slot k is frame k * stride."""
         return self.episode(episode)[torch.as_tensor(slots, dtype=torch.long)]
 
     def of_frames(self, indices: Sequence[int]) -> Tensor:
@@ -127,7 +127,7 @@ def episode_file(folder: Path, number: int) -> Path:
 
 
 def features_folder(root: Path, prefix: str, features: Features, camera: str, stride: int) -> Path:
-    """Return the folder of a dataset's features: a readable prefix, and a hash of everything they depend on."""
+    """Return the folder of a dataset's features: a readable prefix and a hash of all inputs."""
     parts = (dataset_fingerprint(root, camera), features.key, camera, str(stride))
     return root / FOLDER / f"{prefix}-{hashlib.blake2b(chr(10).join(parts).encode(), digest_size=8).hexdigest()}"
 
@@ -145,21 +145,20 @@ def make_features(
     progress: Progress | None = None,
     tell: Callable[[str], None] = logger.info,
 ) -> EpisodeFeatures:
-    """Compute the features of the episodes that have none yet, and open all.
+    """Compute missing features, and open those of all episodes.
 
     Args:
-        camera: image column that is encoded. stride: every how many frames one is stored.
+        camera: image column to encode. stride: every ``stride``-th frame is stored.
         read: source of frames; by default the camera's videos.
         batch_size: frames per pass of the encoder.
         workers: threads that decode videos ahead of the encoder; by default one per core, up to 8.
-        progress: called with (episodes done, episodes in all).
         tell: called with the folder and its size before anything is encoded.
 
     Raises:
-        MemobenchError: ``root`` is no dataset, has no such camera, or the disk has no room.
+        MemobenchError: ``root`` is not a dataset, lacks the camera, or the disk is full.
     """
     folder, table = features_folder(root, prefix, features, camera, stride), read_frame_table(root)
-    progress = progress or (lambda _done, _all: None)
+    progress = progress or functools.partial(logger.info, "feature cache: %d of %d episodes")
     counts = -(-np.diff(table.episodes) // stride)
     missing = [number for number in range(table.num_episodes) if not episode_file(folder, number).is_file()]
     progress(table.num_episodes - len(missing), table.num_episodes)
@@ -167,10 +166,10 @@ def make_features(
         return EpisodeFeatures(folder, table.episodes, stride)
     read = read or frame_reader(root, camera)
     needed, free = int(counts[missing].sum()) * features.frame_bytes, free_bytes(folder)
-    tell(f"The feature cache {folder} takes {in_words(needed)} more; {in_words(free)} are free there.")
+    tell(f"The feature cache {folder} needs {in_words(needed)}; {in_words(free)} are free.")
     if needed > free:
         raise MemobenchError(
-            f"the feature cache {folder} needs {in_words(needed)} and its disk has {in_words(free)} left; make room, "
+            f"the feature cache {folder} needs {in_words(needed)} and its disk has {in_words(free)} left; free space, "
             f"replace {root / FOLDER} by a link to a folder on another disk, or store fewer frames "
             "(policy.memory_stride=)"
         )
@@ -191,7 +190,7 @@ def make_features(
 
 
 def _keep_from_the_hub(root: Path) -> None:
-    """Exclude caches from uploads of the dataset's folder, by the ``.gitignore`` that the hub obeys."""
+    """Exclude caches from uploads of the dataset's folder by its ``.gitignore``, which the hub's client follows."""
     path, line = root / ".gitignore", f"/{FOLDER}/"
     there = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
     if line not in there:
@@ -202,11 +201,11 @@ def dataset_fingerprint(root: Path, camera: str) -> str:
     """Hash the frame tables in full, and the camera's videos by their size and three samples each.
 
     Raises:
-        MemobenchError: ``root`` holds no LeRobotDataset.
+        MemobenchError: ``root`` is not a LeRobotDataset.
     """
     if not (root / "meta" / "info.json").is_file():
         raise MemobenchError(
-            f"{root} is no LeRobotDataset: it has no meta/info.json; give the folder that holds meta, data and videos."
+            f"{root} is not a LeRobotDataset (meta/info.json is missing); name the folder of meta, data and videos"
         )
     digest = hashlib.blake2b(digest_size=12)
     for path in sorted((root / "data").rglob("*.parquet")):
@@ -237,7 +236,7 @@ SMALL = Features(THUMBNAILS, 1, THUMBNAIL**2, thumbnails)
 def remembered_features(
     root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncoder, camera: str, **how: Any
 ) -> EpisodeFeatures:
-    """Make the features that a memory of a policy with an image tower reads: pooled tokens, or thumbnails.
+    """Make the memory's features for a policy with an image tower: pooled tokens, or thumbnails.
 
     Args:
         camera: the dataset's name of the remembered camera. how: of `make_features`.
@@ -253,15 +252,15 @@ def remembered_features(
 def picture_tokens(
     root: Path, config: MemobenchMemConfig, encoder: VisualTokenEncoder, cameras: dict[str, str], **how: Any
 ) -> tuple[EpisodeFeatures | None, dict[str, EpisodeFeatures]]:
-    """Make a visual encoder's tokens of the present pictures, and what a memory reads of them.
+    """Make a visual encoder's tokens of present pictures, and the memory's features.
 
-    Pooled tokens are made of the present ones, so no video is decoded twice.
+    Pooled tokens are computed from the present ones, so that no video is decoded twice.
 
     Args:
         cameras: the policy's name of each camera -> the dataset's. how: of `make_features`.
 
     Returns:
-        The memory's features, None without a memory, and those of present pictures by the policy's camera.
+        The memory's features, None without a memory, and those of present pictures by the policy's name of the camera.
     """
     whole = Features(encoder.present_key, GRID**2, WIDTH, encoder.encode)
     prefix = f"{config.size}-present"
@@ -280,16 +279,16 @@ def picture_tokens(
 def detections(
     root: Path, detect: ObjectsFromPictures, cameras: dict[str, str], state: str, **how: Any
 ) -> EpisodeFeatures:
-    """Make a detector's object slots at every frame.
+    """Make a detector's object slots for every frame.
 
-    A number is stored as two bfloat16 ones, its rounded value and the rest: one alone knows places to 4 mm.
+    Each number is stored as two bfloat16 numbers, its rounded value and the rest; one alone has errors of 4 mm.
 
     Args:
         cameras: the policy's name of each camera -> the dataset's. state: the dataset's name of the state.
         how: of `make_features`.
     """
     readers = {name: frame_reader(root, of) for name, of in cameras.items()}
-    recorded = functools.cache(lambda: read_recorded(root, [state]))  # complete features need none
+    recorded = functools.cache(lambda: read_recorded(root, [state]))  # not needed if the features are complete
 
     def read(episode: int, numbers: list[int]) -> tuple[dict[str, Tensor], Tensor]:
         columns, table = recorded()
@@ -309,19 +308,19 @@ def detections(
 
 
 def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = None) -> ImageTowerEncoder:
-    """Load the frozen image tower of ``config``'s size alone, without the rest of the model.
+    """Load the frozen image tower of ``config``'s size, without the rest of the model.
 
     Args:
-        weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None takes ``config.base_weights``, or
-            the fixed-seed tower when there are none.
+        weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None: ``config.base_weights``, or else
+            random weights of a fixed seed.
 
     Raises:
-        MemobenchError: the weights cannot be read or do not fit, or there is no tower.
+        MemobenchError: the weights cannot be read or do not fit, or the policy has no tower.
     """
     if config.uses_objects:
         raise MemobenchError(
-            "perception=objects needs no feature cache where the environment gives the objects: training reads the "
-            "dataset's columns; leave this command out, or name a detector."
+            "perception=objects needs no feature cache without a detector: training reads the dataset's columns; skip "
+            "this command, or name a detector"
         )
     with torch.device("meta"):
         model = make_backbone(config).paligemma.model
@@ -341,7 +340,7 @@ def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
     """Load ``config``'s visual encoder alone; arguments and errors as of `load_image_tower`."""
     source = weights or config.base_weights
     if source is None:
-        assert config.visual_encoder is not None  # asked of a configuration that has one
+        assert config.visual_encoder is not None  # the configuration has one
         tower = load_visual_encoder(config.visual_encoder)
     else:
         tower = VisualEncoder(folded=True).eval()
@@ -351,15 +350,15 @@ def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
 
 
 def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path | None = None, **how: Any) -> Path:
-    """Make (or finish) the features that ``config`` reads of the dataset at ``root``.
+    """Make or complete the features of a dataset for a policy.
 
     Args:
         config: a policy configuration, for example ``MemobenchMemConfig(size="tiny", memory_stride=1)``.
-        weights: model checkpoint whose image tower or visual encoder is used, see `load_image_tower`.
+        weights: checkpoint with the image tower or visual encoder, see `load_image_tower`.
         how: of `make_features`.
 
     Returns:
-        Their folder, ``<root>/feature_cache/<prefix>-<hash>``; with a visual encoder that of the memory.
+        Their folder, ``<root>/feature_cache/<prefix>-<hash>``; with a visual encoder the memory's folder.
 
     Raises:
         MemobenchError: the dataset lacks a camera, the disk has no room, or the policy needs no cache.

@@ -24,7 +24,7 @@ COLUMNS = ("step", "mode", "name", "value")
 
 
 class TrainingLog:
-    """Numbers of the updates.
+    """Log the numbers of a training.
 
     Attributes:
         numbers: LeRobot's tracker: means since the last line.
@@ -64,7 +64,7 @@ class TrainingLog:
             _keep_until(self._file, step)
 
     def note(self, logged: Mapping[str, Any]) -> None:
-        """Take in the numbers of an update."""
+        """Add the numbers of an update."""
         for name in ("loss", "grad_norm", "lr", "update_s"):
             setattr(self.numbers, name, logged[name])
         if torch.cuda.is_available():
@@ -75,7 +75,7 @@ class TrainingLog:
         self._bar.update(1)
 
     def write(self, step: int) -> None:
-        """Write the means since the last line, over all processes."""
+        """Write the means since the last call, over all processes."""
         numbers = self.numbers
         numbers.reduce_across_ranks()
         seconds = numbers.update_s.avg + numbers.dataloading_s.avg
@@ -102,7 +102,7 @@ class TrainingLog:
             self._wandb.log_video(overall["video_paths"][0], step, mode="eval")
 
     def keep_model(self, checkpoint: Path) -> None:
-        """Send a checkpoint to W&B, if that is asked for."""
+        """Send a checkpoint to W&B, if it is enabled."""
         if self._wandb is not None:
             self._wandb.log_policy(checkpoint)
 
@@ -128,7 +128,7 @@ def read_losses(file: Path) -> Iterator[tuple[int, str, str, float]]:
 
 
 def _keep_until(file: Path, step: int) -> None:
-    """Keep the rows until a step, for a training that is resumed; begin the file if there is none."""
+    """Remove the rows after the step of a resumed training; create the file if it does not exist."""
     rows = [row for row in read_losses(file) if row[0] <= step] if file.is_file() else []
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("w", encoding="utf-8", newline="") as begun:

@@ -1,12 +1,14 @@
 """Train ``policy=memobench_mem``: datasets, policy, processors, updates, checkpoints.
 
-The checkpoints are LeRobot's, so that LeRobot and `lerobot eval` load them; ``training_weights.safetensors`` beside the
-model holds the trained weights, of which the model is the average. A training that is resumed continues to the bit.
+The checkpoints are LeRobot's, so that LeRobot and `lerobot eval` load them; ``training_weights.safetensors`` next to
+the model holds the trained weights; the model is their average. A resumed training continues to the bit.
 """
 
 from __future__ import annotations
 
+import ctypes
 import logging
+import platform
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -39,11 +41,10 @@ from torch.utils.data import DataLoader, Subset
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.training.average import WeightAverage, begin_average
-from lerobot_memobench.training.checks import check_environment
+from lerobot_memobench.training.configuration import check_environment
 from lerobot_memobench.training.data import Training, open_datasets, open_training
 from lerobot_memobench.training.log import TrainingLog
 from lerobot_memobench.training.sampler import FrameSampler, frame_sampler, task_weights
-from lerobot_memobench.training.speed import keep_freed_memory, quick_products
 
 logger = logging.getLogger(__name__)
 
@@ -115,8 +116,8 @@ def begin(config: TrainPipelineConfig) -> Accelerator:
     )
     if accelerator.distributed_type not in DISTRIBUTED:
         raise MemobenchError(
-            f"accelerate was asked for {accelerator.distributed_type}, and each process of this training holds the "
-            "whole policy; launch it with --multi_gpu"
+            f"found {accelerator.distributed_type}; each process of this training holds the whole policy: launch it "
+            "with --multi_gpu"
         )
     init_logging(accelerator=accelerator)
     if config.seed is not None:
@@ -131,7 +132,7 @@ def begin(config: TrainPipelineConfig) -> Accelerator:
 
 @dataclass
 class Run:
-    """What a training changes and saves.
+    """State of a training.
 
     Attributes:
         model: the policy as accelerate wraps it.
@@ -283,7 +284,7 @@ def make_sampler(config: TrainPipelineConfig, training: Training) -> FrameSample
 def make_loader(
     config: TrainPipelineConfig, training: Training, samples: Any, sampler: FrameSampler | None = None
 ) -> DataLoader[Any]:
-    """Return batches of samples: as a sampler draws them, or each once and in order."""
+    """Return batches of samples: as a sampler draws them, or each sample once in order."""
     workers = 0 if training.lookup.columns else config.num_workers  # samples in main memory need no processes
     decoding: dict[str, Any] = {
         "prefetch_factor": config.prefetch_factor,
@@ -297,7 +298,7 @@ def make_loader(
         num_workers=workers,
         pin_memory=training.policy.config.device != "cpu",
         collate_fn=lerobot_collate_fn if training.dataset.meta.has_language_columns else None,
-        # Of its own: an iteration that begins draws from it, and a resumed training begins one more.
+        # Each iteration draws from it, and a resumed training starts one more than an uninterrupted one.
         generator=torch.Generator(),
         **(decoding if workers else {}),
     )
@@ -319,3 +320,56 @@ def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> Dat
         most = max(1, config.max_eval_samples // len(of_task))
         frames = [frame for task in sorted(of_task) for frame in of_task[task][:most]]
     return make_loader(config, training, Subset(training.samples(dataset), frames))
+
+
+# -- speed on a CPU ----------------------------------------------------------------------------------------------------
+
+
+def quicker_in_bfloat16() -> bool:
+    """Return whether this CPU has instructions that make products in bfloat16 faster; False if torch cannot tell.
+
+    The answer depends on the instructions and not on a measurement, so that a machine always learns the same. With
+    ``avx512_bf16`` an AMD EPYC made twice as many products per second as in float32; an Intel Xeon without AMX, which
+    also has ``avx512_fp16``, made no more.
+    """
+    # LeRobot supports torch 2.7, which has no such function.
+    known: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()
+    return known.get("amx_bf16", False) or (known.get("avx512_bf16", False) and not known.get("avx512_fp16", False))
+
+
+@contextmanager
+def quick_products() -> Iterator[None]:
+    """Inside the block, round the factors of products to bfloat16, if that is faster on this CPU.
+
+    Weights, gradients, sums and everything but products stay float32. The fused attention kernel, whose many small
+    products suffer, is disabled; code that asks for it (`layers.attend`) computes exact products.
+    """
+    if not quicker_in_bfloat16():
+        yield
+        return
+    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # torch sets it late
+    before = products.fp32_precision, torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
+    products.fp32_precision = "bf16"
+    torch.backends.cuda.enable_flash_sdp(False)
+    try:
+        yield
+    finally:
+        products.fp32_precision, fused = before
+        torch.backends.cuda.enable_flash_sdp(fused)
+
+
+_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # of glibc's malloc.h
+_LARGEST = 32 << 20
+"""The largest threshold of mapped blocks that glibc allows, bytes."""
+
+
+def keep_freed_memory() -> None:
+    """Make malloc keep freed memory in this process; only glibc supports it.
+
+    An update of a small policy frees and allocates some hundred MB. Without the page faults it took 16 % less time.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return
+    libc = ctypes.CDLL(None)
+    for parameter, value in ((_MMAP_THRESHOLD, _LARGEST), (_TRIM_THRESHOLD, 2**31 - 1), (_TOP_PAD, 8 * _LARGEST)):
+        libc.mallopt(parameter, value)

@@ -1,4 +1,4 @@
-"""Draw the frames of a training: execution frames only, several of an episode in a row, tasks by their weights."""
+"""Draw the frames of a training: execution frames, several of an episode in a row, tasks by their weights."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from lerobot_memobench.protocol import PROMPT
 
 @dataclass
 class FrameSampler:
-    """Yield global indices of frames, in an order that depends on the seed and the epoch alone.
+    """Yield global indices of frames, in an order that depends on seed and epoch alone.
 
-    Every process draws the same order, of which accelerate gives each its share; a training that is resumed draws the
-    rest of the epoch. With one frame of an episode at a time and no weights it is the order of LeRobot's sampler.
+    Every process draws the same order, and accelerate distributes it. A resumed training draws the rest of its epoch.
+    Without groups and weights the order is that of LeRobot's sampler.
 
     Args:
-        starts: (E,) first execution frame of each episode that is drawn. ends: (E,) the frame after its last.
-        together: frames of an episode that follow one another.
+        starts: (E,) first execution frame of each episode. ends: (E,) the frame after its last one.
+        together: frames of an episode in a row.
         tasks: (E,) number of each episode's task, with ``weights``; None: each frame is drawn once per epoch.
-        weights: (T,) how often each task is drawn. An epoch has as many frames as without weights.
-        epoch, offset: where the next iteration begins.
+        weights: (T,) weight of each task. An epoch has as many frames as without weights.
+        epoch, offset: start of the next iteration.
     """
 
     starts: np.ndarray
@@ -45,9 +45,7 @@ class FrameSampler:
     def __post_init__(self) -> None:
         drawn = self.starts < self.ends
         if not drawn.any():
-            raise MemobenchError(
-                "no episode has an execution frame to train on; name a dataset of `memobench generate`"
-            )
+            raise MemobenchError("no episode has an execution frame; name a dataset of `memobench generate`")
         self.starts, self.ends = self.starts[drawn], self.ends[drawn]
         self.tasks = None if self.tasks is None else self.tasks[drawn]
         self.frames = np.concatenate(list(map(np.arange, self.starts, self.ends)))
@@ -61,7 +59,7 @@ class FrameSampler:
         return iter(self.frames[order.numpy()].tolist())
 
     def order(self, epoch: int) -> Tensor:
-        """Return the places in ``frames`` that an epoch draws, in their order."""
+        """Return an epoch's order of the entries of ``frames``."""
         seed = np.random.SeedSequence([self.seed, epoch]).generate_state(1, dtype=np.uint64)[0]
         generator = torch.Generator().manual_seed(int(seed))
         ends = np.cumsum(self.ends - self.starts)
@@ -72,17 +70,17 @@ class FrameSampler:
         return torch.randperm(len(self), generator=generator)
 
     def go_on(self, step: int, batch_size: int, processes: int) -> None:
-        """Continue after so many updates, of a batch size per process."""
-        per_epoch = math.ceil(math.ceil(len(self) / batch_size) / processes)  # accelerate fills up the last batches
+        """Continue after so many updates with a batch size per process."""
+        per_epoch = math.ceil(math.ceil(len(self) / batch_size) / processes)  # accelerate pads the last batches
         self.epoch, batches = divmod(step, per_epoch)
         self.offset = min(batches * batch_size * processes, len(self))
 
 
 def grouped_order(ends: np.ndarray, together: int, generator: torch.Generator) -> Tensor:
-    """Return all places 0 ... N - 1 in a random order in which ``together`` of an episode follow one another.
+    """Return a random order of 0 ... N - 1 in which ``together`` entries of an episode are in a row.
 
     Args:
-        ends: (E,) end of each episode's places, counted from the first's beginning; the last is N.
+        ends: (E,) end of each episode's entries; the last is N.
     """
     lengths = torch.from_numpy(np.diff(ends, prepend=0))
     episode = torch.repeat_interleave(lengths)
@@ -97,7 +95,7 @@ def grouped_order(ends: np.ndarray, together: int, generator: torch.Generator) -
 def weighted_order(
     ends: np.ndarray, tasks: np.ndarray, weights: np.ndarray, together: int, generator: torch.Generator
 ) -> Tensor:
-    """Return N random places, ``together`` of an episode in a row: tasks by their weights, a task's episodes equally.
+    """Return N random entries, ``together`` of an episode in a row: tasks by weight, episodes of a task equally.
 
     Args:
         ends: (E,) as for `grouped_order`. tasks: (E,) number of each episode's task. weights: (T,) of the tasks.
@@ -116,7 +114,7 @@ def weighted_order(
 
 
 def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """Return the first execution frame of each episode (E,); its end for an episode without one.
+    """Return the first execution frame of each episode (E,); an episode without execution gives its end.
 
     Args:
         episodes: (E + 1,) first frame of each episode, and the number of frames N. phase: (N,) 0 in the prompt.
@@ -139,8 +137,8 @@ def frame_sampler(
 
     Args:
         episodes: (E + 1,) first frame of each episode, and N. phase: (N,) 0 in the prompt.
-        used: the episodes that are drawn; None: all.
-        tasks: of `task_weights`.
+        used: the episodes to draw; None: all.
+        tasks: result of `task_weights`.
     """
     chosen = np.arange(len(episodes) - 1) if used is None else np.array(sorted(used), dtype=np.int64)
     starts = execution_starts(episodes, phase)[chosen]
@@ -153,20 +151,20 @@ def task_weights(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the number (E,) of each episode's task, and the weight (T,) of each task.
 
-    A task is that of our records, which may have several instructions ("twice", "three times"); of another dataset it
-    is the episode's instruction.
+    A task of the benchmark may have several instructions ("twice", "three times"). In other datasets each instruction
+    is a task.
 
     Args:
         meta: the dataset's metadata. episodes: (E + 1,) first frame of each episode, and N.
         phase: (N,) 0 in the prompt.
-        weights: by task name, memory type or ``prompted``; the first of them that a task has counts, and else 1.
+        weights: by task name, memory type or ``prompted``; the first match in this order counts, the default is 1.
 
     Raises:
-        MemobenchError: a name is none of the dataset's, or no task is left to draw.
+        MemobenchError: the dataset lacks a name, or all weights are 0.
     """
     records = [place.record for place in list_episodes(Path(meta.root))]
-    said = (" / ".join(tasks) for tasks in meta.episodes["tasks"])
-    names = [words if record is None else record.task_name for record, words in zip(records, said, strict=True)]
+    texts = (" / ".join(tasks) for tasks in meta.episodes["tasks"])
+    names = [text if record is None else record.task_name for record, text in zip(records, texts, strict=True)]
     tasks, numbers = np.unique(names, return_inverse=True)
     types = {name: record.memory_type for name, record in zip(names, records, strict=True) if record is not None}
     prompted = np.bincount(np.repeat(numbers, np.diff(episodes)), phase == PROMPT) > 0
@@ -178,10 +176,12 @@ def task_weights(
     for name in weights:
         if name not in known:
             raise MemobenchError(
-                f"policy.task_weights names '{name}', which is no task, memory type or '{PROMPTED}' of the dataset "
-                f"{meta.root}; {nearest(name, known)}"
+                f"policy.task_weights names '{name}'; expected a task or memory type of the dataset {meta.root}, or "
+                f"'{PROMPTED}'; {nearest(name, known)}"
             )
     found = np.array([next((weights[key] for key in row if key in weights), 1.0) for row in keys])
     if not found.any():
-        raise MemobenchError(f"policy.task_weights={dict(weights)} leaves no task of {meta.root} to draw.")
+        raise MemobenchError(
+            f"policy.task_weights={dict(weights)} gives every task of {meta.root} the weight 0; set one above 0"
+        )
     return numbers, found

@@ -1,8 +1,8 @@
-"""Write a view of a dataset for LeRobot's own trainer: without prompt frames, and with the columns of chosen inputs.
+"""Write a view of a dataset for LeRobot's trainer: without prompt frames, and with the columns of chosen inputs.
 
-LeRobot trains on all frames of all episodes, also on those of demonstration prompts, in which actions have no effect.
-It takes every column that begins with ``observation`` for an input: pictures, object state, phase and step. A view is a
-LeRobotDataset v3.0 that holds the wanted frames and columns; its videos are links to the dataset's.
+LeRobot trains on all frames, including those of demonstration prompts, in which actions have no effect. It uses every
+column that begins with ``observation`` as an input: pictures, object state, phase and step. A view is a LeRobotDataset
+v3.0 with a part of the frames and columns; its videos are links to the dataset's.
 """
 
 from __future__ import annotations
@@ -43,22 +43,21 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, telling_of_the_disk, write_file
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import LerobotArguments
-from lerobot_memobench.training.checks import check_environment
-from lerobot_memobench.training.configuration import read_config
+from lerobot_memobench.training.configuration import check_environment, read_config
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
 OURS = {*CLOCK, "simple_subgoal"}
-"""Columns of a dataset of the benchmark; a phase alone may have another meaning."""
+"""Columns that identify a dataset of the benchmark; a phase alone may have another meaning."""
 EPISODES_FOLDER = Path("meta") / "episodes"
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a view keeps of a dataset.
+    """The frames and columns of a view.
 
     Attributes:
-        prompts: whether it keeps the frames of demonstration prompts, and with them the clock.
+        prompts: whether the view has the frames of demonstration prompts, and the clock.
         obs_type: `envs.observations.OBS_TYPES`; None: all observations.
     """
 
@@ -66,10 +65,10 @@ class Choice:
     obs_type: str | None = None
 
     def columns(self, features: Mapping[str, Any]) -> dict[str, str]:
-        """Return column -> its name in the view, for the columns that are kept.
+        """Return the view's columns: name in the dataset -> name in the view.
 
         Raises:
-            MemobenchError: the dataset has no such observations.
+            MemobenchError: the dataset lacks the observations.
         """
         cameras = cameras_of(features)
         objects = [name for name in (PRIVILEGED, OBJECTS_COLUMN) if name in features][:1]
@@ -77,8 +76,8 @@ class Choice:
         if (self.obs_type in (OBJECTS, BOTH) and not objects) or (self.obs_type in (PIXELS, BOTH) and not cameras):
             found = ", ".join(cameras + objects) or "neither pictures nor objects"
             raise MemobenchError(
-                f"obs_type={self.obs_type} was asked for, and the dataset has {found}; "
-                "choose another obs_type, or generate a dataset that has it"
+                f"found obs_type={self.obs_type}, and the dataset has {found}; choose another obs_type, or generate a "
+                "dataset that has it"
             )
         if self.obs_type == OBJECTS:
             dropped |= {*cameras}
@@ -92,14 +91,14 @@ class Choice:
 
 
 def viewed(
-    arguments: LerobotArguments, prompt_frames: bool | None, obs_type: str | None, tell: Callable[[str], None]
+    arguments: LerobotArguments, prompt_frames: bool | None, obs_type: str | None, notify: Callable[[str], None]
 ) -> LerobotArguments:
-    """Return the arguments of a training by LeRobot's trainer, on a view of its dataset if it needs one.
+    """Return the arguments for LeRobot's trainer, with a view of the dataset if it is needed.
 
     Args:
-        prompt_frames: whether prompt frames are trained on; None: if the policy reads prompts.
+        prompt_frames: whether to train on prompt frames; None: if the policy reads prompts.
         obs_type: kind of observation; None: pictures if the dataset has them, else objects.
-        tell: called with the view's folder.
+        notify: called with the view's folder.
 
     Raises:
         MemobenchError: the dataset lacks the observations, or is streamed from the hub.
@@ -125,28 +124,28 @@ def viewed(
         return arguments
     complete_statistics(policy, meta, given)
     if policy.input_features or chooses_inputs(policy) or not choice.prompts:
-        told = arguments
-    else:  # the clock is kept, and is no input
+        completed = arguments
+    else:  # the view has the clock, which is not an input
         inputs = {
             name: {"type": one.type.name, "shape": list(one.shape)}
             for name, one in dataset_to_policy_features({new: meta.features[old] for old, new in kept.items()}).items()
             if one.type is not FeatureType.ACTION and name not in CLOCK
         }
-        told = arguments.default("policy.input_features", json.dumps(inputs))
+        completed = arguments.default("policy.input_features", json.dumps(inputs))
     if not needs_view(meta.features, choice):
-        return told
+        return completed
     root = Path(meta.root)
     if not (root / "data").is_dir():
         root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
     folder = cache_folder() / "views" / f"{root.resolve().name}-{view_hash(root, choice)}"
     if not (folder / INFO_FILE).is_file():
         write_view(root, folder, choice)
-    tell(f"LeRobot's trainer reads {folder}: {described(choice)}")
-    return told.changed("dataset.root", folder).changed("dataset.repo_id", given.repo_id)
+    notify(f"LeRobot's trainer reads {folder}: {described(choice)}")
+    return completed.changed("dataset.root", folder).changed("dataset.repo_id", given.repo_id)
 
 
 def choice_for(policy: Any, features: Mapping[str, Any], prompt_frames: bool | None, obs_type: str | None) -> Choice:
-    """Return what a policy is trained on: as asked now, or as its checkpoint was."""
+    """Return the frames and inputs that a policy is trained on; a checkpoint keeps its inputs."""
     prompts = reads_prompt(policy) if prompt_frames is None else prompt_frames
     begun = getattr(policy, "input_features", None) or {}
     if chooses_inputs(policy):
@@ -178,7 +177,7 @@ def described(choice: Choice) -> str:
 
 
 def view_hash(root: Path, choice: Choice) -> str:
-    """Return a hash of a dataset's place, tables and metadata, and of the choice."""
+    """Return a hash of a dataset's path, tables and metadata, and of the choice."""
     digest = hashlib.blake2b(f"{root.resolve()} {choice}".encode(), digest_size=8)
     for path in (*sorted((root / "meta").rglob("*.*")), *sorted((root / "data").rglob("*.parquet"))):
         digest.update(path.read_bytes())
@@ -189,10 +188,10 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
     """Write a view of the dataset in ``root``.
 
     Raises:
-        MemobenchError: ``out`` exists, the dataset lacks the observations or is damaged, or the disk has no room.
+        MemobenchError: ``out`` exists, the dataset lacks the observations or is damaged, or the disk is full.
     """
     if out.exists():
-        raise MemobenchError(f"{out} exists already; name another folder, or delete this one")
+        raise MemobenchError(f"{out} exists already; name another folder, or delete it")
     info, table = read_info(root), read_frame_table(root)
     kept = choice.columns(info["features"])
     wanted = np.ones(len(table.phase), dtype=bool)
@@ -224,10 +223,10 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
 
 
 def _part_of(rows: pa.Table, kept: Mapping[str, str], wanted: np.ndarray, left_out: np.ndarray, fps: float) -> pa.Table:
-    """Return the wanted rows and columns of a data file, renumbered.
+    """Return the view's rows and columns of a data file, with new numbers.
 
     Args:
-        wanted: (N,) which frames of the dataset. left_out: (E,) frames before the first that is kept.
+        wanted: (N,) whether the view has each frame. left_out: (E,) omitted frames at the start of each episode.
     """
     index = rows.column("index").to_numpy()
     rows = rows.filter(pa.array(wanted[index])).replace_schema_metadata(None)
@@ -248,7 +247,7 @@ def _part_of(rows: pa.Table, kept: Mapping[str, str], wanted: np.ndarray, left_o
 
 
 def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
-    """Return LeRobot's language rows (N,) with earlier timestamps, by so many seconds (N,)."""
+    """Return LeRobot's language rows (N,) with timestamps reduced by seconds (N,)."""
     lengths, rows = pc.list_value_length(texts).fill_null(0).to_numpy(zero_copy_only=False), texts.flatten()
     columns = {field.name: rows.field(place) for place, field in enumerate(rows.type)}
     kind = columns["timestamp"].type
@@ -258,10 +257,10 @@ def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
 
 
 def _episodes_of(rows: pa.Table, ends: np.ndarray, seconds: np.ndarray) -> pa.Table:
-    """Return the episodes' table with the bounds of the frames that are kept, and the videos' beginnings moved.
+    """Return the episodes' table with the bounds of the view's frames and later starts of the videos.
 
     Args:
-        ends: (E + 1,) first frame of each episode in the view, and the number of frames. seconds: (E,) left out.
+        ends: (E + 1,) first frame of each episode in the view, and the number of frames. seconds: (E,) omitted.
     """
     numbers = rows.column("episode_index").to_numpy()
     changed = {
@@ -284,7 +283,7 @@ def _write_table(table: pa.Table, path: Path) -> None:
 
 
 def _link(path: Path, place: Path) -> None:
-    """Link to a file; copy it where the system allows no links."""
+    """Link to a file, or copy it if links are not supported."""
     place.parent.mkdir(parents=True, exist_ok=True)
     try:
         place.symlink_to(path)

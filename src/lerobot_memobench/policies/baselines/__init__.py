@@ -1,1 +1,1 @@
-"""Baselines without weights: the scripted expert, the published routine repeated blindly, and random actions."""
+"""Baselines without weights: the scripted expert, the published routine replayed blindly, and random actions."""

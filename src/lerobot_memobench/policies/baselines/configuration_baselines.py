@@ -1,4 +1,4 @@
-"""Configurations of policies without weights: the expert, the blind routine, random actions, and the base of all."""
+"""Configurations of policies without weights: expert, blind routine, random actions, and their base class."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from lerobot_memobench.errors import MemobenchError
 
 @dataclass
 class UntrainedConfig(PreTrainedConfig):
-    """Answer what LeRobot asks every policy's configuration, for one that is never trained."""
+    """Base class of configurations of policies that cannot be trained."""
 
     perception: ClassVar[str] = "any"
-    """Any observations will do (`envs.observations`), also where a checkpoint lists pictures among its features."""
+    """Any observations are accepted (`envs.observations`), whatever features a checkpoint lists."""
 
     weightless: ClassVar[bool] = True
-    """Nothing is computed in this process that more than one core would be quicker at (`jobs.threads`)."""
+    """The policy runs no network in this process, so one core suffices (`jobs.threads`)."""
 
     device: str | None = "cpu"
     push_to_hub: bool = False
@@ -38,20 +38,20 @@ class UntrainedConfig(PreTrainedConfig):
         """No rewards of other steps."""
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        """LeRobot asks for one before it builds the policy; ``forward`` then refuses to train."""
+        """Return a preset, which LeRobot needs before it builds the policy; ``forward`` refuses to train."""
         return AdamWConfig()
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """No schedule."""
 
     def validate_features(self) -> None:
-        """Take the environment's features as they are."""
+        """Accept the environment's features."""
 
 
 @PreTrainedConfig.register_subclass("memobench_expert")
 @dataclass
 class MemobenchExpertConfig(UntrainedConfig):
-    """Nothing to choose: the action comes from the environment's expert (``--env.expert_action=true``)."""
+    """The expert has no settings; its action comes from the environment (``--env.expert_action=true``)."""
 
     reads_prompt: ClassVar[bool] = True
     inputs: ClassVar[tuple[str, ...]] = (SIMULATOR,)
@@ -60,7 +60,7 @@ class MemobenchExpertConfig(UntrainedConfig):
 @PreTrainedConfig.register_subclass("memobench_blind")
 @dataclass
 class MemobenchBlindConfig(MemobenchExpertConfig):
-    """Nothing to choose: the action comes from the environment's routine (``--env.blind_action=true``)."""
+    """The routine has no settings; its action comes from the environment (``--env.blind_action=true``)."""
 
 
 @PreTrainedConfig.register_subclass("memobench_random")
@@ -69,9 +69,9 @@ class MemobenchRandomConfig(UntrainedConfig):
     """Settings of random actions.
 
     Args:
-        seed: of the policy's own generator, so that LeRobot's seed and other policies' draws change nothing.
-        smoothing: share of the last action kept in the next one, in [0, 1). At 0 draws are independent and the
-            arm trembles about one place; towards 1 it wanders.
+        seed: of the policy's own generator, which is independent of LeRobot's seed and of other policies.
+        smoothing: share of the last action in the next one, in [0, 1). At 0 actions are independent and the arm
+            trembles in one place; towards 1 it wanders.
     """
 
     inputs: ClassVar[tuple[str, ...]] = ()

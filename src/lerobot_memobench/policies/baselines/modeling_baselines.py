@@ -1,6 +1,6 @@
-"""Policies without weights: the expert, the blind routine, random actions, and the base of all.
+"""Policies without weights: expert, blind routine, random actions, and their base class.
 
-Apart from the configurations, which are imported whenever LeRobot starts.
+This module is separate from the configurations, which LeRobot imports at every start.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from lerobot_memobench.protocol import ACTION_DIM
 
 
 class UntrainedPolicy(PreTrainedPolicy):
-    """Answer what LeRobot asks every policy, for one that only acts; a subclass has a name and ``select_action``."""
+    """Base class of policies that cannot be trained; a subclass has a name and ``select_action``."""
 
     config_class = UntrainedConfig
     name = "untrained"
     why_not_trained: ClassVar[str] = "has no parameters and cannot be trained"
 
     def get_optim_params(self) -> list[nn.Parameter]:
-        """Return nothing to optimise."""
+        """Return no parameters."""
         return []
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
         """Refuse to train."""
         raise MemobenchError(
-            f"The policy '{self.name}' {self.why_not_trained}; choose a learning policy, for example "
-            "--policy.type=memobench_mem."
+            f"the policy '{self.name}' {self.why_not_trained}; choose another policy, for example "
+            "--policy.type=memobench_mem"
         )
 
     def needs_observation(self) -> bool:
-        """Whether it needs the images of the next observation: never."""
+        """Return whether the images of the next observation are needed: never."""
         return False
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return one step at a time, so the chunk is (B, 1, 7)."""
+        """Return a chunk of one action, (B, 1, 7)."""
         return self.select_action(batch).unsqueeze(1)
 
 
@@ -52,7 +52,7 @@ class MemobenchExpertPolicy(UntrainedPolicy):
     """The scripted expert: ``select_action`` returns ``batch["observation.expert_action"]``, (B, 7) float32.
 
     Attributes:
-        offered: the environment's setting, and the part of the observation, with the action.
+        offered: name of the environment's setting and of the observation that holds the action.
     """
 
     config_class = MemobenchExpertConfig
@@ -64,10 +64,10 @@ class MemobenchExpertPolicy(UntrainedPolicy):
         self.config = config
 
     def reset(self) -> None:
-        """The expert lives in the environment, so there is no state to clear."""
+        """Do nothing: the state of the expert is in the environment."""
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the action (B, 7) in [-1, 1] that the environment offers for the current observation.
+        """Return the action (B, 7) in [-1, 1] in the observation.
 
         Raises:
             MemobenchError: the environment was made without ``offered``.
@@ -75,14 +75,14 @@ class MemobenchExpertPolicy(UntrainedPolicy):
         key = f"observation.{self.offered}"
         if key not in batch:
             raise MemobenchError(
-                f"The policy '{self.name}' found no '{key}' in the observation: pass --env.{self.offered}=true, or use "
-                "`lerobot eval env=memobench`, which sets it."
+                f"the policy '{self.name}' needs '{key}' in the observation: pass --env.{self.offered}=true, or use "
+                "`lerobot eval env=memobench`, which sets it"
             )
         return batch[key]
 
 
 class MemobenchBlindPolicy(MemobenchExpertPolicy):
-    """The published routine, which neither remembers nor reads: ``batch["observation.blind_action"]``, (B, 7)."""
+    """The published routine without memory or prompt: ``batch["observation.blind_action"]``, (B, 7)."""
 
     config_class = MemobenchBlindConfig
     name = "memobench_blind"
@@ -92,8 +92,8 @@ class MemobenchBlindPolicy(MemobenchExpertPolicy):
 class MemobenchRandomPolicy(UntrainedPolicy):
     """Uniform random actions, the floor of every result: ``select_action`` draws (B, 7) float32 in [-1, 1].
 
-    One generator, seeded once, serves all rows and rollouts: the same command with the same batch size draws the same
-    actions, and no two rollouts of a run share theirs.
+    One generator is used for all rows and rollouts. The same command with the same batch size repeats its actions, and
+    the rollouts of a run differ.
     """
 
     config_class = MemobenchRandomConfig
@@ -102,12 +102,12 @@ class MemobenchRandomPolicy(UntrainedPolicy):
     def __init__(self, config: MemobenchRandomConfig, **kwargs: Any) -> None:
         super().__init__(config)
         self.config = config
-        # On the CPU, whose draws are the same on every machine.
+        # Random numbers of the CPU are the same on every machine.
         self._generator = torch.Generator().manual_seed(config.seed)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last action, which smoothing would carry into the next rollout; the generator goes on."""
+        """Clear the last action, so that smoothing does not carry it into the next rollout; the generator continues."""
         self._last: Tensor | None = None
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

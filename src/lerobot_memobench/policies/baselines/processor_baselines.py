@@ -1,4 +1,4 @@
-"""Processors of policies whose actions are in the environment's units already: nothing is normalised."""
+"""Processors of policies that act in the environment's units, without normalisation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Processors = tuple[
 
 
 def pass_through(device: str) -> Processors:
-    """Return pre- and post-processor that rename, batch and move to ``device``, and never normalise."""
+    """Return pre- and postprocessor that rename, batch and move to ``device``."""
     return make_policy_processor_pipelines(
         input_steps=[
             RenameObservationsProcessorStep(rename_map={}),

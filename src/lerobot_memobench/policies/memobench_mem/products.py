@@ -1,4 +1,4 @@
-"""Exact products inside an update whose other products are rounded (`training.speed.quick_products`)."""
+"""Exact products inside an update whose other products are rounded (`training.loop.quick_products`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configuration of the policy in a server: ``lerobot eval env=memobench policy=memobench_remote host=… port=…``."""
+"""Configuration of a policy in a server: ``lerobot eval env=memobench policy=memobench_remote host=… port=…``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.baselines.configuration_baselines import UntrainedConfig
 
 IMAGE, WRIST_IMAGE, STATE, TASK = "image", "wrist_image", "state", "task"
-"""Names of observations that can be sent: both cameras (256, 256, 3) uint8, proprioception (8,) float32, the
-instruction. Any other observation of the environment goes by its own name (``phase``, ``step``)."""
+"""Names of observations to send: both cameras (256, 256, 3) uint8, proprioception (8,) float32, the instruction. Other
+observations have the environment's names (``phase``, ``step``)."""
 
 OPENPI_KEYS = {
     "observation/image": IMAGE,
@@ -24,12 +24,11 @@ OPENPI_KEYS = {
 }
 
 VLA_EVAL_KEYS = {"images.agentview": IMAGE, "images.wrist": WRIST_IMAGE, "states": STATE, "task_description": TASK}
-"""Keys of vla-evaluation-harness's model servers; a point leads a level down."""
+"""Keys of vla-evaluation-harness's model servers; a dot separates levels."""
 
 LIBERO, RLDS = "libero", "rlds"
 GRIPPERS = (LIBERO, RLDS)
-"""``libero``: −1 opens, 1 closes, as this environment has it. ``rlds``: 1 opens, 0 closes, and the client turns
-whatever lies between into the nearer of both."""
+"""``libero``: −1 opens, 1 closes, as in this environment. ``rlds``: 1 opens, 0 closes; values between are rounded."""
 
 
 OPENPI, VLA_EVAL = "openpi", "vla_eval"
@@ -41,14 +40,13 @@ class Dialect:
 
     Attributes:
         protocol: ``openpi`` or ``vla_eval`` (vla-evaluation-harness), both over a websocket.
-        port: where the server listens by default.
-        keys: the server's name of each thing that is sent -> our name of it.
-        image_size: side of the images that are sent, pixels; None for as rendered, where the server resizes itself.
-        n_action_steps: actions executed of each answer by default.
-        memory: the server remembers what it was sent, so that it has to see the episode again when it was restarted.
-        shared: it has one memory for all its connections, so it serves one environment at a time.
-        buffers: it is sent every frame, in a message of its own before each question (``add_buffer``).
-        history: it is sent the demonstration prompt at once, with the first question of the execution.
+        port: default port of the server.
+        keys: the server's name of each observation -> our name.
+        image_size: side of sent images, pixels; None: as rendered, and the server resizes them.
+        n_action_steps: default number of executed actions of each answer.
+        shared: all connections share one memory, so the server serves one environment at a time.
+        buffers: the server receives every frame, in a message before each question (``add_buffer``).
+        history: the server receives the whole demonstration prompt with the first question of the execution.
     """
 
     protocol: str = OPENPI
@@ -56,7 +54,6 @@ class Dialect:
     keys: Mapping[str, str] = field(default_factory=lambda: dict(OPENPI_KEYS))
     image_size: int | None = None
     n_action_steps: int = 5
-    memory: bool = False
     shared: bool = False
     buffers: bool = False
     history: bool = False
@@ -66,39 +63,37 @@ DIALECTS: dict[str, Dialect] = {
     # openpi: examples/libero/main.py, src/openpi/serving/websocket_policy_server.py, openpi-client 0.1.2
     "openpi": Dialect(image_size=224),
     # RoboMME/robomme_policy_learning: examples/robomme/{eval,utils}.py, serving/websocket_policy_server.py
-    "robomme": Dialect(port=8011, memory=True, shared=True, buffers=True),
+    "robomme": Dialect(port=8011, shared=True, buffers=True),
     # vla-eval 0.8: protocol/{messages,numpy_codec,image_codec}.py, connection.py, model_servers/{serve,predict}.py. Its
-    # servers answer one action, and keep the rest of a chunk themselves.
-    "vla_eval": Dialect(protocol=VLA_EVAL, keys=VLA_EVAL_KEYS, n_action_steps=1, memory=True, history=True),
+    # servers answer one action, and queue the rest of a chunk.
+    "vla_eval": Dialect(protocol=VLA_EVAL, keys=VLA_EVAL_KEYS, n_action_steps=1, history=True),
 }
 
 BY_DIALECT: Any = None
-"""Value of a field that follows from ``dialect`` unless it is set; `__post_init__` fills it in."""
+"""Default of a field that `__post_init__` fills in from the dialect."""
 
 
 @PreTrainedConfig.register_subclass("memobench_remote")
 @dataclass
 class RemoteConfig(UntrainedConfig):
-    """Address and dialect of the server, and patience when it goes away.
+    """Address and dialect of the server, and waiting times.
 
     Args:
-        host: name or address of the server's machine; ``ws://`` or ``wss://`` before it is understood.
-        port: its port; the dialect's usual one when left out.
+        host: name or address of the server's machine, optionally with ``ws://`` or ``wss://``.
+        port: its port; the dialect's default if left out.
         servers: several servers, ``host:port,host:port``; environment i of a batch asks server i modulo their number.
         dialect: protocol of the server, one of `DIALECTS`.
-        n_action_steps: actions executed of each answer (``replan=``); 5, of ``vla_eval`` 1, when left out.
-        keys: names of what is sent, ``theirs=ours,…`` with ours one of image, wrist_image, state, task or another
+        n_action_steps: executed actions of each answer (``replan=``); default 5, for ``vla_eval`` 1.
+        keys: observations to send, ``theirs=ours,…`` with ours one of image, wrist_image, state, task or another
             observation of the environment; replaces the dialect's.
-        image_size: side of the images that are sent, padded to a square, pixels; 0 for as rendered.
-        mirror: send images mirrored left to right, for checkpoints trained on LIBERO's images as openpi turns them.
+        image_size: side of sent images, padded to a square, pixels; 0: as rendered.
+        mirror: send images mirrored left to right, for checkpoints trained on LIBERO's images as openpi rotates them.
         gripper: meaning of the last number of an action, one of `GRIPPERS`.
-        memory: whether the server remembers what it was sent; the dialect's when left out.
-        send_prompt: whether it sees the demonstration prompt. Switch it off for a policy without memory, to save time.
-        history_every: steps between the frames of the prompt that it sees; ``n_action_steps`` when left out, of
-            ``vla_eval`` 1. A server that buffers frames (robomme) gets all of them.
-        connect_timeout: how long the first connection is waited for, s.
-        timeout: how long an answer is waited for, s; the first one may include compilation.
-        retry: how long a server that went away is waited for, s.
+        send_prompt: send the demonstration prompt; set to false to save time with a policy without memory.
+        history_every: steps between sent frames of the prompt; default ``n_action_steps``, for ``vla_eval`` 1. A
+            server that buffers frames (robomme) receives all of them.
+        connect_timeout: longest wait for a connection, s.
+        timeout: longest wait for an answer, s; the first one may include compilation.
         label: name of the checkpoint for the result card; servers do not send one.
     """
 
@@ -113,12 +108,10 @@ class RemoteConfig(UntrainedConfig):
     image_size: int | None = None
     mirror: bool = False
     gripper: str = LIBERO
-    memory: bool | None = None
     send_prompt: bool = True
     history_every: int | None = None
     connect_timeout: float = 60.0
     timeout: float = 300.0
-    retry: float = 300.0
     label: str | None = None
 
     def __post_init__(self) -> None:
@@ -133,11 +126,11 @@ class RemoteConfig(UntrainedConfig):
             number = getattr(self, name)
             if number is not None and number < 1:
                 raise MemobenchError(f"policy.{name} is {number}; expected a whole number from 1 on")
-        for name in ("connect_timeout", "timeout", "retry"):
+        for name in ("connect_timeout", "timeout"):
             if getattr(self, name) <= 0:
                 raise MemobenchError(f"policy.{name} is {getattr(self, name)}; expected seconds above 0")
         if self.image_size is not None and self.image_size < 0:
-            raise MemobenchError(f"policy.image_size is {self.image_size}; expected pixels, or 0 for as rendered")
+            raise MemobenchError(f"policy.image_size is {self.image_size}; expected pixels, or 0 as rendered")
         self.addresses()
         self.sent()
 
@@ -151,39 +144,34 @@ class RemoteConfig(UntrainedConfig):
 
     @property
     def spoken(self) -> Dialect:
-        """The protocol of the server."""
+        """The server's dialect."""
         return DIALECTS[self.dialect]
 
     @property
-    def remembers(self) -> bool:
-        """Whether the server has a memory."""
-        return self.spoken.memory if self.memory is None else self.memory
-
-    @property
     def needs_every_frame(self) -> bool:
-        """Whether frames count that are seen between two plans: a server that buffers frames gets all of them."""
+        """Whether frames between two plans are needed: a server that buffers frames receives all of them."""
         return self.spoken.buffers
 
     @property
     def prompt_stride(self) -> int:
-        """Steps between the frames of the prompt that the server sees."""
+        """Steps between sent frames of the prompt."""
         return 1 if self.spoken.buffers else self.history_every or (1 if self.spoken.history else self.n_action_steps)
 
     @property
     def max_environments(self) -> int | None:
-        """How many environments can be stepped at once; None for any number."""
+        """Largest number of environments in a batch; None: any number."""
         return len(self.addresses()) if self.spoken.shared else None
 
     @property
     def side(self) -> int | None:
-        """Side of the images that are sent, None for as rendered."""
+        """Side of sent images, pixels; None: as rendered."""
         return (self.spoken.image_size if self.image_size is None else self.image_size) or None
 
     def addresses(self) -> list[str]:
         """Return the addresses of the servers, ``scheme://host:port``.
 
         Raises:
-            MemobenchError: one of them is no address.
+            MemobenchError: an address is invalid.
         """
         given = self.servers.split(",") if self.servers else [f"{self.host}:{self.port or self.spoken.port}"]
         return [self._address(text.strip()) for text in given]
@@ -197,11 +185,11 @@ class RemoteConfig(UntrainedConfig):
                 "port=8000 or policy.servers=gpu1:8000,gpu2:8000"
             )
         if scheme not in ("", "ws", "wss"):
-            raise MemobenchError(f"found the address {text!r}; policy servers are reached by ws:// or wss://")
+            raise MemobenchError(f"found the address {text!r}; expected ws:// or wss://")
         return f"{scheme or 'ws'}://{host}:{port}"
 
     def sent(self) -> dict[str, str]:
-        """Return the server's name -> our name of everything that is sent.
+        """Return the server's name -> our name of each sent observation.
 
         Raises:
             MemobenchError: ``keys`` is not a list of pairs.

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cached_property, partial
+from operator import call
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,15 @@ from lerobot_memobench.policies.remote.session import Row, Session
 from lerobot_memobench.protocol import ACTION_DIM, EXECUTION
 
 Action = NDArray[np.float32]
+MOST_THREADS = 256
+"""Largest number of servers that are asked at a time; threads are started as they are needed."""
 
 
 class Actor:
-    """One environment: when its episode begins, when the server is asked, which action is next.
+    """State of one environment: its episode, its session with the server and its queued actions.
 
-    By ``phase`` and ``step`` of an observation it knows when an episode begins and whether it has ended
-    (`begins_episode`, `is_frozen`). In an environment without them an episode begins with the policy's reset.
+    ``phase`` and ``step`` of an observation mark the beginning and the end of an episode (`begins_episode`,
+    `is_frozen`). Without them, an episode begins with the policy's reset.
     """
 
     def __init__(self, config: RemoteConfig, session: Session) -> None:
@@ -36,19 +39,19 @@ class Actor:
         self.forget()
 
     def forget(self) -> None:
-        """A rollout begins: whatever comes next is another episode."""
+        """Begin a rollout: the next observation is of another episode."""
         self._clock: tuple[int, int] | None = None
         self._prompt = self._rests = False
         self._queue: deque[Action] = deque()
 
     def act(self, row: Row) -> Action:
-        """Return the action (7,) for the present observation; the server may be asked."""
+        """Return the action (7,) for the present observation, queued or of a new answer."""
         step, phase = row.scalar("step"), row.scalar("phase")
         last, self._clock = self._clock, self._now(step, phase)
         begins = begins_episode(last, self._clock)
         self._rests = (not begins and is_frozen(last, self._clock)) or (step is not None and row.blank)
         if self._rests:
-            return np.zeros(ACTION_DIM, np.float32)  # the episode has ended, or was never run
+            return np.zeros(ACTION_DIM, np.float32)  # the episode has ended, or is not simulated
         if begins:
             self.session.begin(row)
             self._queue.clear()
@@ -66,13 +69,13 @@ class Actor:
         return self._queue.popleft()
 
     def _now(self, step: int | None, phase: int | None) -> tuple[int, int]:
-        """Return the phase and the control step since it began."""
+        """Return the phase and its control step."""
         if step is None:
             return EXECUTION, 0 if self._clock is None else self._clock[1] + 1
         return EXECUTION if phase is None else phase, step
 
     def needs_observation(self) -> bool:
-        """Whether the server is sent the pictures of the next observation; the first of an execution it always is."""
+        """Return whether the next observation's pictures are sent. Those of the first execution step always are."""
         if self._rests or self._clock is None:
             return not self._rests
         if self._prompt:
@@ -80,11 +83,11 @@ class Actor:
         return self.config.spoken.buffers or not self._queue
 
     def _shows_prompt(self, step: int) -> bool:
-        """Whether the server sees the prompt's frame at a step."""
+        """Return whether the prompt's frame at a step is sent."""
         return self.config.send_prompt and step % self.config.prompt_stride == 0
 
     def _see_prompt(self, row: Row, step: int) -> Action:
-        """Show the server the prompt, in which actions have no effect."""
+        """Send a frame of the prompt, in which actions have no effect."""
         self._prompt = True
         if self._shows_prompt(step):
             waits = self.config.spoken.buffers or self.config.spoken.history
@@ -93,7 +96,7 @@ class Actor:
 
 
 class RemotePolicy(UntrainedPolicy):
-    """Parameter-less policy that asks a server; see `RemoteConfig`. ``select_action`` returns (B, 7) float32."""
+    """A policy that asks a server; see `RemoteConfig`. ``select_action`` returns (B, 7) float32."""
 
     config_class = RemoteConfig
     name = "memobench_remote"
@@ -103,11 +106,9 @@ class RemotePolicy(UntrainedPolicy):
         super().__init__(config)
         self.config: RemoteConfig = config
         self._actors: list[Actor] = []
-        self._pool: ThreadPoolExecutor | None = None
-        self._threads = 0
 
     def reset(self) -> None:
-        """Begin a rollout. Connections stay; a missing server is an error before anything is simulated."""
+        """Begin a rollout. Connections stay open; a missing server is an error before any simulation."""
         if not self._actors:
             self._add_actor()
         self._actors[0].session.connect()
@@ -115,7 +116,7 @@ class RemotePolicy(UntrainedPolicy):
             actor.forget()
 
     def needs_observation(self) -> bool:
-        """Whether a server is sent the pictures of the next observation."""
+        """Return whether the next observation's pictures are sent to a server."""
         return any(actor.needs_observation() for actor in self._actors)
 
     def _add_actor(self) -> None:
@@ -123,33 +124,30 @@ class RemotePolicy(UntrainedPolicy):
         self._actors.append(Actor(self.config, Session(self.config, addresses[len(self._actors) % len(addresses)])))
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the next action (B, 7) in [-1, 1] of each environment; servers are asked at the same time.
+        """Return the next action (B, 7) in [-1, 1] of each environment; servers are asked in parallel.
 
         Raises:
-            MemobenchError: a server fails or stays away, or the batch is larger than its one memory can serve.
+            MemobenchError: a server fails or does not return, or its memory cannot serve the batch.
         """
         rows = _size(batch)
         limit = self.config.max_environments
         if limit is not None and rows > limit:
             raise MemobenchError(
-                f"a {self.config.dialect} server keeps one memory for all who ask it, and {rows} environments would "
-                f"share {limit}; use batch_size={limit}, or name {rows} servers by policy.servers=host:port,…"
+                f"a {self.config.dialect} server has one memory for all of its connections, and {rows} environments "
+                f"would share {limit}; use batch_size={limit}, or name {rows} servers by policy.servers=host:port,…"
             )
         while len(self._actors) < rows:
             self._add_actor()
         jobs = [partial(actor.act, Row(batch, k)) for k, actor in enumerate(self._actors[:rows])]
-        return torch.from_numpy(np.stack([job() for job in jobs] if rows == 1 else self._together(jobs)))
+        return torch.from_numpy(np.stack([job() for job in jobs] if rows == 1 else [*self._pool.map(call, jobs)]))
 
-    def _together(self, jobs: list[partial[Action]]) -> list[Action]:
-        if self._pool is None or self._threads < len(jobs):
-            if self._pool is not None:
-                self._pool.shutdown()
-            self._pool, self._threads = ThreadPoolExecutor(len(jobs), "policy-server"), len(jobs)
-        return list(self._pool.map(lambda job: job(), jobs))
+    @cached_property
+    def _pool(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(MOST_THREADS, "policy-server")
 
 
 def _size(batch: Mapping[str, Any]) -> int:
-    """Return how many environments a batch holds."""
+    """Return the number of environments in a batch."""
     if OBS_STATE in batch:
         return len(batch[OBS_STATE])
     return len(next(value for value in batch.values() if isinstance(value, Tensor) and value.ndim))

@@ -1,4 +1,4 @@
-"""A policy server normalises by itself: the processors pass everything through."""
+"""Processors of the remote policy; the server normalises its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 def make_memobench_remote_pre_post_processors(
     config: RemoteConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> Processors:
-    """Return pre- and post-processor that rename and batch, and never normalise; images stay on the CPU."""
+    """Return pre- and postprocessor that rename and batch only; images stay on the CPU."""
     return pass_through("cpu")

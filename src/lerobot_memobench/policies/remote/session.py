@@ -1,10 +1,10 @@
-"""One environment's session with its server; episodes survive a server that goes away and comes back."""
+"""One environment's session with its server."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,28 +33,22 @@ from lerobot_memobench.protocol import ACTION_DIM
 logger = logging.getLogger(__name__)
 
 MOST_ACTIONS = 4096
-"""Limit of an answer: more than three episodes of the paper's horizon."""
+"""Largest number of actions in an answer: more than three episodes of the paper's horizon."""
 PAUSE = 0.5
-"""Between two attempts to reach a server, s."""
+"""Time between two attempts to connect, s."""
 RESET = {"reset": True}
 HISTORY = {IMAGE: "video_history", WRIST_IMAGE: "wrist_video_history", STATE: "state_history"}
-"""Our name of what is observed -> that of the demonstration prompt's part of it, with vla-evaluation-harness."""
-
-
-@dataclass(frozen=True)
-class Question:
-    """A message to a server, and whether its memory then holds it."""
-
-    content: dict[str, Any]
-    remembered: bool
+"""Our name of an observation -> vla-evaluation-harness's name of its frames in the demonstration prompt."""
 
 
 class Session:
     """A connection to one server on behalf of one environment.
 
+    An episode that loses its server is not continued, because a server that starts again has lost its memory and its
+    random state: the evaluation stops, and resuming it repeats the episode.
+
     Args:
-        config: the policy's.
-        address: of the server.
+        config: of the policy. address: of the server.
     """
 
     def __init__(self, config: RemoteConfig, address: str) -> None:
@@ -62,79 +56,56 @@ class Session:
         self._dialect, self._keys = config.spoken, config.sent()
         self._speaks_vla_eval = self._dialect.protocol == VLA_EVAL
         self._transport = (VlaEval if self._speaks_vla_eval else Websocket)(address, config.timeout)
-        self._connected = False  # ever
-        self._fresh = False  # the connection has served no episode yet
-        self._begin_memory()
-
-    def _begin_memory(self) -> None:
-        self._sent: list[Question] = []  # messages that a restarted server gets again
+        self._connected = False
+        self._used = False  # whether the connection has served an episode
         self._frames: list[dict[str, Any]] = []  # by our names, not sent yet
-        self._opening: dict[str, Any] | None = None  # the message that begins an episode
         self._seen, self._execution_starts = 0, 0
 
-    # --- what the policy calls ---
+    # --- for the policy ---
 
     def connect(self) -> None:
-        """Reach the server, so that one that is not there costs no simulation.
+        """Connect, so that a missing server is an error before any simulation.
 
         Raises:
-            MemobenchError: it does not answer within ``connect_timeout``.
+            MemobenchError: the server does not answer within ``connect_timeout``.
         """
-        if self._connected:
-            return
-        metadata = self._until(
-            time.monotonic() + self.config.connect_timeout,
-            self._transport.open,
-            lambda reason: (
-                f"no policy server answered at {self.address} within {self.config.connect_timeout:g} s ({reason}); "
-                "start it, or give its address by host= and port="
-            ),
-            on_wait=lambda reason: logger.warning("waiting for the policy server at %s (%s)", self.address, reason),
-        )
-        self._connected = self._fresh = True
-        logger.info("connected with the policy server at %s: %s", self.address, short(metadata))
+        if not self._connected:
+            logger.info("connected with the policy server at %s: %s", self.address, short(self._open()))
+            self._connected = True
 
     def begin(self, row: Row) -> None:
-        """Start an episode: a memory in the server, of the connection or of its own, forgets the last one."""
+        """Start an episode on a connection of its own; the server's memory is cleared."""
         self.connect()
-        self._begin_memory()
+        if self._used:
+            self._open()
+        self._used, self._frames, self._seen, self._execution_starts = True, [], 0, 0
         if self._dialect.buffers:
-            self._opening = dict(RESET)
+            self._ask(dict(RESET))
         elif self._speaks_vla_eval:
-            self._opening = episode_start(row.get(TASK))
-        if not self._fresh:
-            self._again(time.monotonic() + self.config.retry)
-        elif self._opening is not None:
-            self._deliver(Question(self._opening, remembered=False))
+            self._ask(episode_start(row.get(TASK)))
 
     def watch(self, row: Row) -> None:
-        """Note a frame that is not asked about; the server gets it with the next question."""
+        """Keep a frame for the next question."""
         sent = self._keys.values()
         names = (IMAGE, STATE) if self._dialect.buffers else [name for name in HISTORY if name in sent]
         self._frames.append({name: self._value(row, name) for name in names})
 
     def execution_starts(self) -> None:
-        """Note that the frames so far showed the prompt."""
+        """Note that all frames so far belong to the prompt."""
         self._execution_starts = self._seen + len(self._frames)
 
     def ask(self, row: Row) -> NDArray[np.float32]:
         """Return the server's actions for an observation, (H, 7).
 
         Raises:
-            MemobenchError: the server failed, took too long, stays away, or answered something else.
+            MemobenchError: the server failed, took too long, disconnected, or gave a wrong answer.
         """
         if self._dialect.buffers:
             self.watch(row)
-            self._deliver(self._buffer())
-        question = self._observation(row)
-        answer = self._deliver(Question(question, self.config.remembers and not self._dialect.buffers))
-        return read_actions(answer, self.config, self.address)
+            self._ask(self._buffer())
+        return read_actions(self._ask(self._observation(row)), self.config, self.address)
 
-    def close(self) -> None:
-        """Hang up."""
-        self._transport.close()
-
-    # --- questions ---
+    # --- messages ---
 
     def _observation(self, row: Row) -> dict[str, Any]:
         found = {theirs: self._value(row, ours) for theirs, ours in self._keys.items()}
@@ -145,7 +116,7 @@ class Session:
         return found
 
     def _history(self) -> dict[str, list[Any]]:
-        """Return the demonstration prompt as it is sent, once per episode."""
+        """Return the frames of the demonstration prompt, once per episode."""
         frames, self._frames = self._frames, []
         return {HISTORY[name]: [frame[name] for frame in frames] for name in (frames[0] if frames else ())}
 
@@ -156,103 +127,58 @@ class Session:
             return png_map(image) if self._speaks_vla_eval else image
         return value
 
-    def _buffer(self) -> Question:
+    def _buffer(self) -> dict[str, Any]:
         frames, self._frames = self._frames, []
         self._seen += len(frames)
-        content = {
+        return {
             "images": np.stack([frame[IMAGE] for frame in frames])[:, None],
             "state": np.stack([frame[STATE] for frame in frames]),
             "add_buffer": True,
             "exec_start_idx": self._execution_starts,
         }
-        return Question(content, self.config.remembers)
 
-    # --- delivery ---
+    # --- the connection ---
 
-    def _deliver(self, question: Question) -> dict[str, Any]:
-        """Send a question until it is answered; after a reconnection the episode is sent again."""
-        deadline = 0.0
+    def _open(self) -> dict[str, Any]:
+        """Connect; return the server's metadata."""
+        deadline, warned = time.monotonic() + self.config.connect_timeout, False
         while True:
             try:
-                answer = self._transport.ask(question.content)
-                break
+                return self._transport.open(max(deadline - time.monotonic(), 0.0))
             except ServerAway as error:
-                if deadline:  # it came back and broke over the same question
-                    time.sleep(PAUSE)
-                deadline = deadline or time.monotonic() + self.config.retry
-                logger.warning("the policy server at %s went away (%s); waiting for it", self.address, error)
-                self._again(deadline, str(error))
-        self._fresh = False
-        if question.remembered:
-            self._sent.append(question)
-        return answer
+                if time.monotonic() >= deadline:
+                    raise MemobenchError(
+                        f"no policy server answered at {self.address} within {self.config.connect_timeout:g} s "
+                        f"({error}); start it, or give its address by host= and port="
+                    ) from error
+                if not warned:
+                    logger.warning("waiting for the policy server at %s (%s)", self.address, error)
+                warned = True
+            time.sleep(min(PAUSE, max(0.0, deadline - time.monotonic())))
 
-    def _again(self, deadline: float, reason: str = "") -> None:
-        """Connect again and bring the server to the present state of the episode.
-
-        Raises:
-            MemobenchError: it stays away until the deadline.
-        """
-        self._until(
-            deadline,
-            self._send_again,
-            lambda reason: (
-                f"the policy server at {self.address} went away and did not come back within "
-                f"{self.config.retry:g} s ({reason}); the episode that was running is not counted: start "
-                "the server and go on with resume=true output_dir=<this run's folder>"
-            ),
-            reason=reason,
-        )
-
-    def _send_again(self, patience: float) -> None:
-        self._transport.open(patience)
-        if self._opening is not None:
-            self._transport.ask(self._opening)
-        for question in self._sent:
-            self._transport.ask(question.content)
-        self._fresh = not self._sent
-
-    def _until[Result](
-        self,
-        deadline: float,
-        attempt: Callable[[float], Result],
-        failed: Callable[[str], str],
-        *,
-        reason: str = "",
-        on_wait: Callable[[str], None] | None = None,
-    ) -> Result:
-        """Return what ``attempt`` gives, called with the seconds left, as soon as the server is there for it.
-
-        Args:
-            failed: words for the last reason, when the deadline has passed. on_wait: called with the first reason.
-        """
-        while True:
-            left = deadline - time.monotonic()
-            if left <= 0:
-                raise MemobenchError(failed(reason))
-            try:
-                return attempt(left)
-            except ServerAway as error:
-                reason = str(error)
-            if on_wait is not None:
-                on_wait(reason)
-                on_wait = None
-            time.sleep(min(PAUSE, max(0.0, left)))
+    def _ask(self, content: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return self._transport.ask(content)
+        except ServerAway as error:
+            raise MemobenchError(
+                f"the policy server at {self.address} disconnected ({error}); its episode is not counted: start the "
+                "server, and resume the evaluation by resume=true output_dir=<this run's folder>"
+            ) from error
 
 
 def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) -> NDArray[np.float32]:
-    """Return the actions (H, 7) in an answer, their gripper in the environment's terms.
+    """Return the actions (H, 7) of an answer, with the environment's gripper convention.
 
-    One that is not finite is passed on: the environment ends the episode with it, and the others go on.
+    Infinite actions are returned too: the environment ends that episode, and the others continue.
 
     Raises:
-        MemobenchError: there are none, too few for a plan, or something else.
+        MemobenchError: there are no actions, too few, or values of another shape.
     """
     actions = _numbers(answer, address)
     if len(actions) < config.n_action_steps:
         raise MemobenchError(
             f"the policy server at {address} answers {len(actions)} actions at a time, fewer than the "
-            f"{config.n_action_steps} to be executed; choose replan={len(actions)} or less"
+            f"{config.n_action_steps} to execute; set replan={len(actions)} or less"
         )
     if config.gripper == RLDS:
         gripper = actions[:, -1]
@@ -272,28 +198,28 @@ def _numbers(answer: Mapping[str, Any], address: str) -> NDArray[np.float32]:
     return actions
 
 
-def _wrong(address: str, what: str) -> MemobenchError:
+def _wrong(address: str, found: str) -> MemobenchError:
     return MemobenchError(
-        f"the policy server at {address} gave {what}; expected finite numbers of shape (steps, {ACTION_DIM}), at most "
-        f"{MOST_ACTIONS:,} steps: six of the end effector's displacement and one of the gripper"
+        f"the policy server at {address} answered {found}; expected finite numbers of shape (steps, {ACTION_DIM}), at "
+        f"most {MOST_ACTIONS:,} steps: six numbers of the end effector's displacement and one of the gripper"
     )
 
 
 @dataclass(frozen=True)
 class Row:
-    """One environment's part of a batch; nothing is copied until it is asked for."""
+    """One environment's row of a batch; values are copied on access."""
 
     batch: Mapping[str, Any]
     number: int
 
     def scalar(self, name: str) -> int | None:
-        """Return an observation that is one whole number, None where the environment has none."""
+        """Return an observation that is one integer, None if the environment has no such observation."""
         value = self.batch.get(f"{OBS_STR}.{name}")
         return None if value is None else round(float(value[self.number].reshape(-1)[0]))
 
     @property
     def blank(self) -> bool:
-        """Whether this row is not simulated: an episode that the log holds already observes nothing but zeros."""
+        """Whether this row is not simulated: observations of an episode that is already in the log are zeros."""
         found = [value[self.number] for key, value in self.batch.items() if key == OBS_STATE or OBS_IMAGES in key]
         return bool(found) and not any(bool(value.any()) for value in found)
 
@@ -307,20 +233,20 @@ class Row:
                 return to_image(value) if OBS_IMAGES in key else value.float().cpu().reshape(-1).numpy()
         known = [key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBS_STR}.") for key in self.batch if OBS_STR in key]
         raise MemobenchError(
-            f"policy.keys names {name!r}, which the environment does not observe; known are "
+            f"policy.keys names {name!r}, which the environment does not observe; available: "
             f"{', '.join(sorted([*known, TASK]))}"
         )
 
 
 def to_image(value: Tensor) -> NDArray[np.uint8]:
-    """Return LeRobot's image (3, H, W) in [0, 1] as it was rendered, (H, W, 3) uint8."""
+    """Convert LeRobot's image (3, H, W) in [0, 1] to the rendered one, (H, W, 3) uint8."""
     pixels = (value.float() * 255).round().clamp(0, 255).to(torch.uint8)
     array: NDArray[np.uint8] = pixels.permute(1, 2, 0).contiguous().cpu().numpy()
     return array
 
 
 def fit(image: NDArray[np.uint8], side: int | None, mirror: bool = False) -> NDArray[np.uint8]:
-    """Return an image of (side, side, 3), scaled bilinearly and padded with black; as it is where side is None.
+    """Resize an image bilinearly to (side, side, 3), padded with black; unchanged if side is None.
 
     Equal to openpi-client's ``resize_with_pad``, pixel for pixel.
     """

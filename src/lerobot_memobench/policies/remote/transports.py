@@ -1,17 +1,12 @@
-"""openpi's websocket protocol, which its package openpi-client cannot speak here: it needs NumPy 1, LeRobot NumPy 2.
+"""openpi's websocket protocol. Its package openpi-client needs NumPy 1 and LeRobot NumPy 2, so it cannot be used here.
 
-A server first sends its metadata. Then each binary frame is a question and gets a binary frame, or a text frame with a
-traceback where the server failed. Arrays are msgpack, which cannot carry code.
+A server first sends its metadata. Then it answers each binary frame with a binary frame, or with a traceback as a text
+frame. Messages are msgpack, which cannot carry code.
 """
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
-from concurrent.futures import Future
-from contextlib import ExitStack, suppress
-from functools import partial
-from socket import SHUT_RDWR
+from contextlib import ExitStack
 from typing import Any
 
 import msgpack
@@ -23,48 +18,21 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import LONGEST_REASON, Malformed, cut, refusing
 
 REFUSED = "VOc"
-"""Kinds of arrays that openpi's format leaves out: structures, Python objects and complex numbers."""
+"""Kinds of arrays that openpi's format excludes: structures, Python objects and complex numbers."""
 LARGEST_ANSWER = 8 << 20
-"""Bytes of an answer, on the wire."""
+"""Largest size of an answer, bytes."""
 LONGEST_LIST = 1 << 16
-"""Entries of a list or map in msgpack: the unpacker reserves memory for the number that a header names."""
+"""Largest number of entries of a list or map: the unpacker allocates memory for the number in its header."""
 
 
 class ServerAway(Exception):
-    """The server cannot be reached, or went away; it may come back."""
-
-
-def within[Result](seconds: float, call: Callable[[], Result]) -> Result:
-    """Return the result of a call that may wait on a server.
-
-    Libraries bound each read or write and not their sum: a server that sends a byte per second would be read for hours.
-
-    Raises:
-        TimeoutError: the call lasts longer. Its thread ends with the process at the latest.
-    """
-    done: Future[Result] = Future()
-
-    def work() -> None:
-        try:
-            done.set_result(call())
-        except BaseException as error:
-            done.set_exception(error)
-
-    threading.Thread(target=work, daemon=True).start()
-    return done.result(seconds)
+    """The server cannot be reached, or disconnected."""
 
 
 def last_line(text: str) -> str:
     """Return the last line of a traceback, printable and short."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     return reason(lines[-1]) if lines else "without a reason"
-
-
-def too_slow(address: str, timeout: float) -> MemobenchError:
-    """Return the error of a server that thinks for too long."""
-    return MemobenchError(
-        f"the policy server at {address} took more than {timeout:g} s for an answer; give it longer by policy.timeout="
-    )
 
 
 def reason(error: BaseException | str) -> str:
@@ -74,10 +42,10 @@ def reason(error: BaseException | str) -> str:
 
 
 class Websocket:
-    """openpi's protocol; a subclass greets and asks in another.
+    """A connection by openpi's protocol; subclasses implement other protocols.
 
     Args:
-        address: ``ws://host:port``. timeout: how long an answer may take, s.
+        address: ``ws://host:port``. timeout: longest time of an answer, s.
     """
 
     protocol = "openpi's websocket protocol"
@@ -88,15 +56,27 @@ class Websocket:
         self._connection: ClientConnection | None = None
 
     def open(self, patience: float) -> dict[str, Any]:
-        """Connect within ``patience`` seconds, and return the metadata that the server sends first.
+        """Connect within ``patience`` seconds; return the server's metadata.
 
         Raises:
             ServerAway: no server answers.
-            MemobenchError: it is no server of this kind.
+            MemobenchError: the server has another protocol.
         """
         self.close()
+        patience = max(patience, 1.0)
         try:
-            return self._bounded(patience := max(patience, 1.0), partial(self._connect, patience))
+            # No pings: openpi's servers do not answer them during inference, and the first one can take minutes.
+            connection = connect(
+                self.address,
+                compression=None,
+                max_size=LARGEST_ANSWER,
+                open_timeout=patience,
+                ping_interval=None,
+                close_timeout=1.0,
+                proxy=None,
+            )
+            self._connection = self._stack.enter_context(connection)
+            return self.greet(patience)
         except InvalidStatus as error:
             code = error.response.status_code
             if code >= 500:
@@ -109,39 +89,15 @@ class Websocket:
         except (OSError, TimeoutError, WebSocketException) as error:
             raise ServerAway(reason(error)) from error
 
-    def _bounded[Result](self, seconds: float, call: Callable[[], Result]) -> Result:
-        """Return the result of a call; hang up where it lasts longer than that many seconds."""
-        try:
-            return within(seconds, call)
-        except TimeoutError:
-            if self._connection is not None:
-                with suppress(OSError):
-                    self._connection.socket.shutdown(SHUT_RDWR)  # close() would wait for a write that never ends
-            raise
-
-    def _connect(self, patience: float) -> dict[str, Any]:
-        # No pings: openpi's servers answer none while they think, and the first thought can take minutes.
-        connection = connect(
-            self.address,
-            compression=None,
-            max_size=LARGEST_ANSWER,
-            open_timeout=patience,
-            ping_interval=None,
-            close_timeout=1.0,
-            proxy=None,
-        )
-        self._connection = self._stack.enter_context(connection)
-        return self.greet(patience)
-
     def greet(self, patience: float) -> dict[str, Any]:
         """Return the server's metadata, within ``patience`` seconds."""
         metadata = self.receive(patience)
         return metadata if isinstance(metadata, dict) else {}
 
-    def foreign(self, what: str) -> MemobenchError:
-        """Return the error of a server that does not speak this protocol."""
+    def foreign(self, problem: str) -> MemobenchError:
+        """Return the error of a server with another protocol."""
         return MemobenchError(
-            f"the server at {self.address} is no policy server with {self.protocol} ({what}); check "
+            f"the server at {self.address} is no policy server with {self.protocol} ({problem}); check "
             "host= and port=, or choose another dialect="
         )
 
@@ -157,7 +113,7 @@ class Websocket:
         try:
             frame = self._connection.recv(timeout=patience)
         except ConnectionClosed as error:
-            if error.sent is not None and not error.rcvd_then_sent:  # this side refused the frame
+            if error.sent is not None and not error.rcvd_then_sent:  # this side closed the connection
                 raise self.foreign(reason(error)) from error
             raise
         if isinstance(frame, str):
@@ -168,20 +124,23 @@ class Websocket:
             raise self.foreign(str(error)) from error
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Send a frame and return the one that comes back.
+        """Send a message and return the answer.
 
         Raises:
             ServerAway: the connection broke.
-            MemobenchError: the server failed, took too long, or is none of this kind.
+            MemobenchError: the server failed, took too long, or has another protocol.
         """
         try:
-            answer = self._bounded(self.timeout, partial(self.exchange, question))
+            answer = self.exchange(question)
         except TimeoutError as error:
-            raise too_slow(self.address, self.timeout) from error
+            raise MemobenchError(
+                f"the policy server at {self.address} took more than {self.timeout:g} s for an answer; set a longer "
+                "policy.timeout="
+            ) from error
         except (ConnectionClosed, OSError) as error:
             raise ServerAway(reason(error)) from error
         if not isinstance(answer, dict):
-            raise self.foreign(f"it answered a {type(answer).__name__}, no map")
+            raise self.foreign(f"it answered a {type(answer).__name__} instead of a map")
         return answer
 
     def exchange(self, question: dict[str, Any]) -> Any:
@@ -190,7 +149,7 @@ class Websocket:
         return self.receive(self.timeout)
 
     def close(self) -> None:
-        """Hang up."""
+        """Disconnect."""
         self._connection = None
         self._stack.close()
 
@@ -211,14 +170,14 @@ def _unpack(found: dict[Any, Any]) -> Any:
     if b"__ndarray__" in found:
         return _array(found[b"data"], found[b"dtype"], found[b"shape"])
     if b"__npgeneric__" in found:
-        return _dtype(found[b"dtype"]).type(found[b"data"])  # of the data's length, not of the one that dtype names
+        return _dtype(found[b"dtype"]).type(found[b"data"])  # of the data's length, whatever length dtype names
     return found
 
 
 def _dtype(text: Any) -> np.dtype[Any]:
     dtype = np.dtype(text)
     if dtype.kind in REFUSED:
-        raise ValueError(f"arrays of type {dtype} are not taken")
+        raise ValueError(f"arrays of type {dtype} are not accepted")
     return dtype
 
 
@@ -227,7 +186,7 @@ def _array(data: bytes, dtype: Any, shape: Any) -> np.ndarray:
 
 
 def pack(message: dict[str, Any]) -> bytes:
-    """Return a message as openpi-client packs it: arrays as maps of their bytes, type and shape."""
+    """Pack a message as openpi-client does: arrays are maps of their bytes, type and shape."""
     packed: bytes = msgpack.packb(message, default=_pack)
     return packed
 
@@ -236,7 +195,7 @@ def unpack(data: bytes) -> Any:
     """Return the message in a frame.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the frame is not a message.
     """
     with refusing(lambda why: Malformed(f"it is not msgpack with arrays ({why})")):
         return msgpack.unpackb(data, object_hook=_unpack, max_array_len=LONGEST_LIST, max_map_len=LONGEST_LIST)

@@ -1,8 +1,8 @@
-"""The protocol of vla-evaluation-harness (vla-eval), so that its model servers act as policies without the package.
+"""The protocol of vla-evaluation-harness (vla-eval) for its model servers, without a dependency on the package.
 
-A frame is a map of ``type``, ``payload``, ``seq`` and ``timestamp``. Both sides send ``hello``. An ``episode_start`` is
-not answered; an ``observation`` is, by an ``action`` or an ``error``. The demonstration prompt goes with the first
-observation of an episode.
+A frame is a map of ``type``, ``payload``, ``seq`` and ``timestamp``. Both sides send ``hello``. The server does not
+answer an ``episode_start``; it answers an ``observation`` with an ``action`` or an ``error``. The first observation of
+an episode includes the demonstration prompt.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ logger = logging.getLogger(__name__)
 HELLO, EPISODE_START, OBSERVATION, ACTION, EPISODE_END, ERROR = (
     *("hello", "episode_start", "observation", "action", "episode_end", "error"),
 )
-"""Types of vla-eval's frames."""
+"""Types of frames."""
 VERSION, PROTOCOL = "0.8.0", 1
-"""The version of vla-eval that was read, and of its protocol."""
+"""The supported version of vla-eval, and of its protocol."""
 FORMATS = {
     "position": "delta_xyz",
     "rotation": "axis_angle",
     "gripper": "binary_close_positive",
     "state": "eef_pos3_axisangle3_gripper2",
 }
-"""vla-eval's names of this environment's conventions, from which a server's hello may differ."""
+"""vla-eval's names of this environment's conventions; a server's hello may list others."""
 ANY_FORMAT = "raw"
 
 
 class VlaEval(Websocket):
-    """vla-evaluation-harness's protocol. Questions are `episode_start`, which is not answered, and `observation`."""
+    """A connection by vla-evaluation-harness's protocol; questions are `episode_start` and `observation`."""
 
     protocol = "vla-evaluation-harness's protocol"
 
@@ -58,8 +58,8 @@ class VlaEval(Websocket):
             raise self.foreign(f"it answered a hello with {short(kind)}")
         if (version := short(found.get("protocol_version"))) != str(PROTOCOL):
             raise MemobenchError(
-                f"the policy server at {self.address} speaks version {version} of {self.protocol}, and version "
-                f"{PROTOCOL} is spoken here; serve the policy with vla-eval {VERSION}"
+                f"the policy server at {self.address} has version {version} of {self.protocol}; expected version "
+                f"{PROTOCOL}: serve the policy with vla-eval {VERSION}"
             )
         if not self._warned and (others := other_formats(found)):
             logger.warning("the policy server at %s works with %s", self.address, "; ".join(others))
@@ -94,7 +94,7 @@ class VlaEval(Websocket):
         return kind, payload
 
     def close(self) -> None:
-        """Send the end of the episode, and hang up."""
+        """Send the end of the episode, and disconnect."""
         if self._in_episode:
             self._in_episode = False
             with suppress(ServerAway, ConnectionClosed, OSError):
@@ -103,7 +103,7 @@ class VlaEval(Websocket):
 
 
 def episode_start(task: str) -> dict[str, Any]:
-    """Return the message that an episode begins; the instruction is all that is known of its task."""
+    """Return the message that begins an episode; of its task the server learns the instruction alone."""
     return {"type": EPISODE_START, "payload": {"task": {"name": task}}}
 
 
@@ -112,7 +112,7 @@ def observation(named: Mapping[str, Any], history: Mapping[str, Any]) -> dict[st
 
     Args:
         named: by the server's names; ``images.wrist`` is ``wrist`` within ``images``.
-        history: the demonstration prompt as lists of pictures; {} where there is none to send now.
+        history: the demonstration prompt as lists of pictures; {} if it is not sent now.
     """
     payload: dict[str, Any] = {}
     for name, value in named.items():
@@ -125,7 +125,7 @@ def observation(named: Mapping[str, Any], history: Mapping[str, Any]) -> dict[st
 
 
 def png_map(image: NDArray[np.uint8]) -> dict[str, Any]:
-    """Return an RGB picture as vla-eval's frames hold it: as PNG, without loss."""
+    """Encode an RGB picture for a frame: as PNG, without loss."""
     import cv2
 
     done, data = cv2.imencode(".png", image[..., ::-1])
@@ -134,7 +134,7 @@ def png_map(image: NDArray[np.uint8]) -> dict[str, Any]:
 
 
 def other_formats(hello: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each convention in which a server, by its hello, differs from this environment."""
+    """Return a phrase for each convention of a server's hello that differs from this environment."""
     return [
         f"{name} as {reason(str(spec.get('format')))}, and this environment with {FORMATS[name]}"
         for specs in (hello.get("action_spec"), hello.get("observation_spec"))
@@ -145,7 +145,7 @@ def other_formats(hello: Mapping[str, Any]) -> list[str]:
 
 
 def _pack(value: Any) -> Any:
-    """Return an array as vla-eval's frames hold it: unlike openpi's, the keys of its map are text."""
+    """Encode an array for a frame; unlike openpi's, the keys of its map are text."""
     if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": value.shape}
     raise TypeError(f"a {type(value).__name__} cannot be sent")

@@ -1,0 +1,439 @@
+"""Checkpoints: inputs that fit the environment, complete weights, trusted processors, settings, damaged files."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import random
+import re
+import shutil
+import struct
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.factory import get_policy_class, make_policy_config
+from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
+from lerobot.processor import ProcessorStep, ProcessorStepRegistry
+from safetensors.torch import load_file, save_file
+
+from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.conformance.subject import load_subject
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import (
+    check_as_trained,
+    check_checkpoint,
+    check_weights,
+    checkpoint_type,
+    shipped_policies,
+)
+from lerobot_memobench.policies.compatibility import SIZE_COUNTS, check_features
+from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreement, require_statistics
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.run.card import training_facts
+from tests.support import mutations
+
+TASK = "turn_on_the_stove_and_turn_it_off"
+IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
+CAMERAS = ("image", "wrist_image")
+SHOWN = env_to_policy_features(MemobenchEnvConfig())
+PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
+TINY: dict[str, dict[str, Any]] = {
+    "act": {
+        "pretrained_backbone_weights": None,
+        "use_vae": False,
+        "dim_model": 32,
+        "n_heads": 2,
+        "dim_feedforward": 32,
+        "n_encoder_layers": 1,
+    },
+    "diffusion": {"pretrained_backbone_weights": None, "down_dims": (16, 32), "n_groups": 4},
+    "tdmpc": {"latent_dim": 8, "mlp_dim": 16, "image_encoder_hidden_dim": 8},
+}
+
+
+def config(
+    kind: str = "act", cameras: tuple[str, ...] = CAMERAS, state: int = 8, action: int = 7, side: int = 256, **more: Any
+) -> PreTrainedConfig:
+    """Return the configuration of a policy with such cameras and vectors."""
+    return make_policy_config(
+        kind,
+        device="cpu",
+        push_to_hub=False,
+        input_features={
+            STATE: PolicyFeature(FeatureType.STATE, (state,)),
+            **{IMAGES + name: PolicyFeature(FeatureType.VISUAL, (3, side, side)) for name in cameras},
+        },
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (action,))},
+        **TINY.get(kind, {}),
+        **more,
+    )
+
+
+def saved(folder: Path, policy: PreTrainedConfig) -> Path:
+    """Save a checkpoint with random weights, as LeRobot does."""
+    get_policy_class(policy.type)(policy).save_pretrained(folder)
+    assert policy.input_features is not None
+    assert policy.output_features is not None
+    stats = {}
+    for name, feature in {**policy.input_features, **policy.output_features}.items():
+        shape = (3, 1, 1) if feature.type is FeatureType.VISUAL else feature.shape
+        stats[name] = {"mean": torch.zeros(shape), "std": torch.ones(shape)}
+        stats[name] |= {"min": -torch.ones(shape), "max": torch.ones(shape)}
+    for pipeline in make_pre_post_processors(policy, dataset_stats=stats):
+        pipeline.save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def act(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of ACT that fits the environment; tests that change it copy it."""
+    return saved(tmp_path_factory.mktemp("act") / "act", config())
+
+
+@pytest.fixture
+def copied(act: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(act, tmp_path / "act"))
+
+
+@pytest.fixture
+def memory_policy(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(shipped_policies()["memobench_small"], tmp_path / "memory_policy"))
+
+
+def refused(checkpoint: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
+    """Evaluate a checkpoint that is refused before LeRobot makes an environment; return the message."""
+    out = checkpoint.parent / "out"
+    words = (f"tasks={TASK}", "episodes=1", "horizon=3", "videos=0", "device=cpu", f"output_dir={out}")
+    assert main(["eval", "env=memobench", f"policy={checkpoint}", *words, *more]) == 2
+    assert not out.exists()
+    return capsys.readouterr().err.strip().splitlines()[-1]
+
+
+# --- inputs ---
+
+
+@pytest.mark.parametrize(
+    ("inputs", "named"),
+    [
+        ({"cameras": ("front", "wrist")}, '"observation.images.image": "observation.images.front"'),
+        ({"cameras": ("wrist_image", "front")}, '{"observation.images.image": "observation.images.front"}'),
+        ({"cameras": (*CAMERAS, "empty_camera_0")}, "no picture for observation.images.empty_camera_0"),
+        ({"state": 7}, f"{STATE} of 7 numbers"),
+        ({"action": 6}, f"{ACTION} of 6 numbers"),
+        ({"side": 128}, "observation.images.image of 128 x 128 pixels"),
+        ({"kind": "diffusion", "side": 128}, "--policy.resize_shape"),
+    ],
+)
+def test_inputs_that_differ_are_refused(inputs: dict[str, Any], named: str, tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=re.escape(named)):
+        check_features(str(tmp_path), config(**inputs), SHOWN, {})
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        *({"kind": kind, "cameras": ("image",) if kind == "tdmpc" else CAMERAS} for kind in TINY),
+        *({"kind": kind, "side": 128} for kind in ("pi0", "pi05", "memobench_mem")),
+        {"kind": "diffusion", "side": 128, "resize_shape": (96, 96)},
+    ],
+    ids=lambda inputs: "-".join(map(str, inputs.values())),
+)
+def test_inputs_that_fit_are_accepted(inputs: dict[str, Any], tmp_path: Path) -> None:
+    """Policies that resize pictures may be trained on another size."""
+    check_features(str(tmp_path), config(**inputs), SHOWN, {})
+
+
+def test_shipped_policies_are_accepted() -> None:
+    for folder in shipped_policies().values():
+        shown = env_to_policy_features(MemobenchEnvConfig(obs_type="both"))
+        check_features(str(folder), PreTrainedConfig.from_pretrained(folder), shown, {})
+
+
+def test_suggested_rename_map_is_complete(tmp_path: Path) -> None:
+    policy = config(cameras=("front", "wrist"))
+    with pytest.raises(MemobenchError, match="--rename_map=") as error:
+        check_features(str(tmp_path), policy, SHOWN, {})
+    suggested = yaml.safe_load(str(error.value).partition("--rename_map='")[2].rstrip("'"))
+    check_features(str(tmp_path), policy, SHOWN, suggested)
+    with pytest.raises(MemobenchError, match=r"observation.images.front"):
+        check_features(str(tmp_path), policy, SHOWN, {IMAGES + "image": IMAGES + "wrist"})
+
+
+def test_size_settings_are_lerobots() -> None:
+    known = PreTrainedConfig.get_known_choices()
+    for kind, setting in SIZE_COUNTS.items():
+        assert setting is None or setting in known[kind].__dataclass_fields__
+
+
+def test_statistics_name_the_training_data_of_policies_that_pad(tmp_path: Path) -> None:
+    """A policy that began with another checkpoint lists that checkpoint's cameras and lengths."""
+    listed = config("pi05", cameras=("base_0_rgb", *CAMERAS, "empty_camera_0"), state=32, action=32)
+    listed.normalization_mapping = dict.fromkeys(("VISUAL",), NormalizationMode.IDENTITY)
+    with pytest.raises(MemobenchError, match=r"observation.images.base_0_rgb"):
+        check_features(str(tmp_path), listed, SHOWN, {})
+    for length, action in ((8, 7), (14, 14)):
+        folder = tmp_path / str(length)
+        folder.mkdir()
+        step = {"registry_name": "normalizer_processor", "config": {}, "state_file": "statistics.safetensors"}
+        (folder / PIPELINES[0]).write_text(json.dumps({"name": "before", "steps": [step]}))
+        shapes = {STATE: length, ACTION: action, **{IMAGES + name: 3 for name in CAMERAS}}
+        tensors = {f"{name}.mean": torch.zeros(size) for name, size in shapes.items()}
+        save_file(tensors | {f"{STATE}.count": torch.zeros(1)}, folder / "statistics.safetensors")
+        with pytest.raises(MemobenchError, match="of 14 numbers") if length == 14 else nullcontext():
+            check_features(str(folder), listed, SHOWN, {})
+
+
+def test_evaluation_refuses_unfit_checkpoints(copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = saved(tmp_path / "it", config(cameras=("front", "wrist"), state=7))
+    assert "--rename_map=" in refused(other, capsys)
+    renamed = json.dumps({IMAGES + "image": IMAGES + "front", IMAGES + "wrist_image": IMAGES + "wrist"})
+    assert "of 7 numbers" in refused(other, capsys, f"--rename_map={renamed}")
+    rewrite(copied, lambda weights: weights.pop("model.action_head.weight"))
+    assert "model.action_head.weight" in refused(copied, capsys)
+
+
+# --- weights ---
+
+
+def rewrite(checkpoint: Path, change: Callable[[dict[str, torch.Tensor]], object]) -> None:
+    weights = load_file(checkpoint / "model.safetensors")
+    change(weights)
+    save_file(weights, checkpoint / "model.safetensors")
+
+
+@pytest.mark.parametrize("kind", TINY)
+def test_incomplete_and_unfit_weights_are_refused(kind: str, tmp_path: Path) -> None:
+    policy = config(kind, cameras=("image",))
+    checkpoint = saved(tmp_path / "it", policy)
+    check_weights(str(checkpoint), policy)
+    name = next(iter(load_file(checkpoint / "model.safetensors")))
+    rewrite(checkpoint, lambda weights: weights.update({name: torch.zeros(3, 2, 1)}))
+    with pytest.raises(MemobenchError, match=f"0 of .* missing and 1 have another shape, the first being {name}"):
+        check_weights(str(checkpoint), policy)
+    rewrite(checkpoint, lambda weights: weights.pop(name))
+    with pytest.raises(MemobenchError, match=f"1 of .* missing and 0 have another shape, the first being {name}"):
+        check_weights(str(checkpoint), policy)
+    (checkpoint / "model.safetensors").unlink()
+    with pytest.raises(MemobenchError, match=r"model\.safetensors"):
+        check_checkpoint(str(checkpoint))
+
+
+@pytest.mark.parametrize("kind", ["pi05", pytest.param("pi0", marks=pytest.mark.slow)])
+def test_large_policies_are_compared_by_file_headers(kind: str, tmp_path: Path) -> None:
+    """LeRobot only prints a warning about missing weights of these policies. No large tensor is made here."""
+    policy = config(kind)
+    policy.device = "meta"
+    with torch.device("meta"):
+        built = get_policy_class(kind)(policy)
+    shapes = {name.removeprefix("model."): tuple(tensor.shape) for name, tensor in built.state_dict().items()}
+    policy.device = "cpu"
+    write_header(tmp_path / "model.safetensors", shapes)
+    check_weights(str(tmp_path), policy)
+    shapes.pop("action_in_proj.weight")
+    write_header(tmp_path / "model.safetensors", shapes)
+    with pytest.raises(MemobenchError, match=r"1 of .* the first being model.action_in_proj.weight"):
+        check_weights(str(tmp_path), policy)
+
+
+def write_header(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Write a safetensors file whose tensors are a hole in the file."""
+    entries, end = {}, 0
+    for name, shape in shapes.items():
+        size = 4 * int(torch.tensor(shape).prod())
+        entries[name] = {"dtype": "F32", "shape": shape, "data_offsets": [end, end + size]}
+        end += size
+    head = json.dumps(entries).encode()
+    with file.open("wb") as out:
+        out.write(struct.pack("<Q", len(head)) + head)
+        out.truncate(out.tell() + end)
+
+
+def test_weights_of_repositories_are_required_if_lerobot_would_use_random_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(MemobenchError, match=r"someone/pi .*pi05 .*random"):
+        check_weights("someone/pi", config("pi05"))
+    check_weights("someone/act", config())  # LeRobot refuses it
+
+
+def test_huge_configurations_allocate_nothing(act: Path, memory_policy: Path) -> None:
+    policy = PreTrainedConfig.from_pretrained(act)
+    policy.dim_feedforward = 10**10  # type: ignore[attr-defined]
+    held = json.loads((memory_policy / "config.json").read_text())
+    (memory_policy / "config.json").write_text(json.dumps(held | {"max_action_dim": 10**10}))
+    for load in (lambda: check_weights(act, policy), lambda: MemobenchMemPolicy.from_pretrained(memory_policy)):
+        with pytest.raises(MemobenchError, match=r"[1-9]\d* have another shape"):
+            load()
+
+
+# --- processors ---
+
+
+@dataclasses.dataclass
+class ForeignStep(ProcessorStep):
+    """A step of a package that is no plugin."""
+
+    def __call__(self, transition: Any) -> Any:
+        raise AssertionError("it was built and called")
+
+    def transform_features(self, features: Any) -> Any:
+        raise AssertionError
+
+
+def add_step(checkpoint: Path, file: str, **step: Any) -> None:
+    held = json.loads((checkpoint / file).read_text())
+    held["steps"].insert(0, step)
+    (checkpoint / file).write_text(json.dumps(held))
+
+
+@pytest.mark.parametrize(("kind", "file"), [("copied", PIPELINES[1]), ("memory_policy", PIPELINES[0])])
+def test_loading_runs_no_code_of_a_checkpoint(
+    kind: str,
+    file: str,
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    checkpoint, mark = request.getfixturevalue(kind), tmp_path / "mark"
+    add_step(checkpoint, file, **{"class": "subprocess.check_call", "config": {"args": ["touch", str(mark)]}})
+    monkeypatch.chdir(tmp_path)
+    held = (f"policy={checkpoint}", "device=cpu", "output_dir=out")
+    for words in (["eval", "env=memobench", f"tasks={TASK}", *held], ["train", "dataset=a/b", "steps=1", *held]):
+        assert main(words) == 2
+        assert "subprocess.check_call" in capsys.readouterr().err
+    with pytest.raises(MemobenchError, match="check_call"):
+        load_subject([f"policy={checkpoint}"], tmp_path)
+    if kind == "memory_policy":
+        with pytest.raises(MemobenchError, match="check_call"):
+            MemobenchMemPolicy.from_pretrained(checkpoint)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("step", "named"),
+    [
+        ({"registry_name": "no_such_step"}, "no_such_step"),
+        ({"registry_name": "foreign"}, __name__.rpartition(".")[2]),
+        ({"registry_name": "rename_observations_processor", "class": "os.system"}, "os.system"),
+        ({"registry_name": "rename_observations_processor", "config": {"a": [{"_target_": "os.system"}]}}, "_target_"),
+        ({"registry_name": "action_tokenizer_processor", "config": {"action_tokenizer_name": "a/b"}}, "a/b"),
+        (
+            {
+                "registry_name": "action_tokenizer_processor",
+                "config": {"action_tokenizer_name": PI0FastConfig.action_tokenizer_name},
+            },
+            None,
+        ),
+        ({"registry_name": "pi05_prepare_state_tokenizer_processor_step"}, None),
+        ({"registry_name": "memobench_gather_memory"}, None),
+    ],
+)
+def test_only_steps_of_installed_packages_are_accepted(step: dict[str, Any], named: str | None, copied: Path) -> None:
+    ProcessorStepRegistry.register("foreign")(ForeignStep)
+    add_step(copied, PIPELINES[0], **step)
+    try:
+        with nullcontext() if named is None else pytest.raises(MemobenchError, match=named):
+            check_checkpoint(str(copied))
+    finally:
+        ProcessorStepRegistry.unregister("foreign")
+
+
+def test_checkpoints_of_earlier_lerobots_are_refused(copied: Path) -> None:
+    (copied / PIPELINES[0]).unlink()
+    with pytest.raises(MemobenchError, match="migrate_policy_normalization"):
+        check_checkpoint(str(copied))
+    (copied / "config.json").write_text(json.dumps({"input_shapes": {STATE: [8]}, "output_shapes": {ACTION: [7]}}))
+    with pytest.raises(MemobenchError, match="policy type"):
+        check_checkpoint(str(copied))
+
+
+# --- settings of training ---
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "fixed"),
+    [
+        *(("memory_frames", 4, True), ("chunk_size", 2, True), ("align", "contrastive", True)),
+        *(("optimizer_lr", 1.0, True), ("n_action_steps", 2, False), ("device", "cpu", False)),
+    ],
+)
+def test_settings_of_training_cannot_change_at_evaluation(name: str, value: object, fixed: bool) -> None:
+    checkpoint = shipped_policies()["memobench_small"]
+    policy = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=["--device=cpu"])
+    setattr(policy, name, value)
+    with pytest.raises(MemobenchError, match=rf"policy\.{name}=") if fixed else nullcontext():
+        check_as_trained(checkpoint, policy)
+    with pytest.raises(MemobenchError, match=rf"policy\.{name}=") if fixed else nullcontext():
+        assert getattr(MemobenchMemPolicy.from_pretrained(checkpoint, config=policy).config, name) == value
+
+
+def test_evaluation_refuses_other_settings(memory_policy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for word in ("memory_frames=4", "align=contrastive"):
+        assert f"--policy.{word}" in refused(memory_policy, capsys, "obs_type=both", f"--policy.{word}")
+
+
+# --- damage ---
+
+FEATURES = {STATE: {"type": "STATE", "shape": [8]}, ACTION: {"type": "ACTION", "shape": [7]}}
+STEP = {
+    "registry_name": "normalizer_processor",
+    "config": {"norm_map": {"STATE": "QUANTILES", "ACTION": "QUANTILES"}, "features": FEATURES},
+    "state_file": "statistics.safetensors",
+}
+FILES = {
+    "config.json": {"type": "act", "chunk_size": 50},
+    PIPELINES[0]: {"name": "before", "steps": [{"registry_name": "rename_observations_processor"}, STEP]},
+    PIPELINES[1]: {"name": "after", "steps": [STEP]},
+    "train_config.json": {"dataset": {"repo_id": "me/it", "root": None, "episodes": None}, "steps": 5},
+}
+RECIPE = """# A recipe.
+policy: {type: act, chunk_size: 50}
+dataset:
+  repo_id: me/it
+steps: 100
+"""
+KINDS = {"checkpoint": [*FILES, "statistics.safetensors"], "recipe": ["recipe.yaml"]}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
+def test_damaged_files_end_in_a_result_or_an_error(tmp_path: Path, kind: str, count: int) -> None:
+    source, whole = tmp_path / "source", tmp_path / "whole"
+    whole.mkdir()
+    folder = source / "it"
+    folder.mkdir(parents=True)
+    for name, content in FILES.items():
+        (folder / name).write_text(json.dumps(content))
+    save_file({key: torch.ones(2) for key in (f"{STATE}.mean", "action.mean")}, folder / "statistics.safetensors")
+    (folder / "model.safetensors").write_bytes(b"")
+    (folder / "recipe.yaml").write_text(RECIPE)
+    damaged = whole / "it"
+
+    def prepare(rng: random.Random) -> None:
+        mutations.fresh_copy(source, whole)
+        name = rng.choice(KINDS[kind])
+        mutations.damage(damaged / name, rng, mutations.mutated_json if "json" in name else mutations.mutated_bytes)
+
+    def use(_: random.Random) -> None:
+        if kind == "recipe":
+            read_arguments("train", split_arguments([f"config_path={damaged / 'recipe.yaml'}"]))
+            return
+        training_facts(damaged)
+        check_checkpoint(str(damaged))
+        checkpoint_type(str(damaged))
+        require_statistics(damaged)
+        require_agreement(damaged, None, MemobenchMemConfig(device="cpu"), training=True)
+
+    found = mutations.ends_well(range(count), prepare, use, whole, ("it",))
+    assert min(found["result"], found["refused"]) > count / 8
