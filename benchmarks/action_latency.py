@@ -42,8 +42,8 @@ def main() -> None:
     result: dict[str, Any] = {"benchmark": "action_latency", "rows": asked.rows}
     for size in asked.size:
         actors = {
-            name: Actor(size, asked.rows, asked.device, memory_fusion)
-            for name, memory_fusion in (("memory", "modulation"), ("plain", "none"))
+            name: Actor(size, asked.rows, asked.device, memory)
+            for name, memory in (("memory", "frames"), ("plain", "none"))
         }
         replan = medians({name: actor.replan for name, actor in actors.items()}, asked.repeats, 2, clock)
         between = medians({name: actor.between for name, actor in actors.items()}, asked.repeats, 2, clock)
@@ -60,9 +60,9 @@ def main() -> None:
 class Actor:
     """A policy in the middle of an episode."""
 
-    def __init__(self, size: str, rows: int, device: str, memory_fusion: str) -> None:
+    def __init__(self, size: str, rows: int, device: str, memory: str) -> None:
         torch.manual_seed(0)
-        settings = config(size, device=device, memory_fusion=memory_fusion)
+        settings = config(size, device=device, memory=memory)
         self.policy = MemobenchMemPolicy(settings).eval()
         self.batch = {key: value.to(device) for key, value in observation(settings, rows).items()}
         self.rows, self.step = rows, 0

@@ -86,7 +86,9 @@ def equal(size: str, device: str, steps: int) -> dict[str, Any]:
     found = []
     for place in ("cpu", device):
         torch.manual_seed(0)
-        policy = random_policy(config("tiny", device="cpu", open_gate=True))
+        policy = random_policy(config("tiny", device="cpu"))
+        for modulator in policy.model.fusion.modulators:
+            modulator.modulation.reset_parameters()  # zero at first: memory would have no effect
         policy.config.device = place
         policy = policy.to(place).eval()
         batch = {key: value.to(place) for key, value in training_batch(policy.config, 2).items()}
@@ -117,7 +119,7 @@ def planning(rows: int, **fields: Any) -> Part:
         seen = {key: value.to(device) for key, value in observation(policy.config, rows).items()}
         policy.reset()
         started = time.perf_counter()
-        for _ in range(policy.config.memory_frames):
+        for _ in range(policy.config.memory_settings["frames"]):
             policy.observe(seen)
         policy.predict_action_chunk(seen)
         first, _ = time.perf_counter() - started, peak()

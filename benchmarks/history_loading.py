@@ -31,7 +31,7 @@ from turns import medians, peak, reset_peak, resident
 
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.lookup import FrameLookup
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SIZES
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SIZES, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from lerobot_memobench.training.features import Features, features_folder, make_features
@@ -113,7 +113,8 @@ def measure(root: Path, size: str, numbers: list[int], samples: int, repeats: in
             decode_video_frames(root / meta.get_video_file_path(episode, CAMERA), times, tolerance_s=1e-4)
 
     for frames in numbers:
-        step = GatherMemoryProcessorStep(frames=frames, lookup=cache)
+        settings = MemobenchMemConfig(device="cpu", memory_settings={"frames": frames})
+        step = GatherMemoryProcessorStep(config=settings, lookup=cache)
         sides = {"cache": lambda step=step: step.gather(cache, indices), "lerobot": lambda n=frames: decode(n)}
         rise = {}
         for name, side in sides.items():

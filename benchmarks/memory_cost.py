@@ -38,7 +38,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import CHOICES, M
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep, gathering
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from lerobot_memobench.protocol import CONTROL_HZ, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.training.speed import keep_freed_memory
@@ -82,7 +82,7 @@ def main() -> None:
 
 def settings_of(name: str, size: str) -> MemobenchMemConfig:
     """Return the configuration of a policy with a memory: of objects at size small, else of pixels."""
-    objects: dict[str, Any] = {"perception": "objects", "full_chunk_when_stalled": False}
+    objects: dict[str, Any] = {"perception": "objects"}
     settings = config(size, device="cpu", memory=name, **(objects if size == "small" else {}))
     settings.subgoals = SUBGOALS if settings.privileged_memory else {}
     if settings.uses_objects:
@@ -138,7 +138,7 @@ def updater(settings: MemobenchMemConfig, steps: int) -> Callable[[], None]:
     rows = EPISODES * MOMENTS
     moments = torch.randint(steps // 3, steps, (EPISODES, MOMENTS)) + torch.arange(EPISODES)[:, None] * steps
     cache: Any = Recorded(steps, settings.memory_stride or 1)
-    looked_up = GatherMemoryProcessorStep(cache=cache, **gathering(settings)).gather(cache, moments.flatten().tolist())
+    looked_up = GatherMemoryProcessorStep(config=settings).gather(cache, moments.flatten().tolist())
     actions = {ACTION: torch.rand(rows, settings.chunk_size, 7)}
     policy = MemobenchMemPolicy(settings)
     return updates(policy, observed(settings, rows) | actions | looked_up)

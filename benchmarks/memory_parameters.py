@@ -24,7 +24,7 @@ def main() -> None:
     with torch.device("meta"):
         model = MemoryPI05(settings)
         heads = {
-            name: make_alignment(name, dims.vlm.width, dims.text_dim, settings.memory_frames, settings.tokens_per_frame)
+            name: make_alignment(name, dims.vlm.width, dims.text_dim, settings.tokens_per_frame)
             for name in ("semantic", "contrastive", "framewise")
         }
     parts: dict[str, int] = {"encoder": 0, "memory_to_expert": 0, "modulators": 0}

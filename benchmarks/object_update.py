@@ -122,7 +122,7 @@ def updater(settings: MemobenchMemConfig, words: int) -> Callable[[], None]:
     """Return a function that makes one update on some moments of each of some episodes."""
     rows, count = EPISODES * MOMENTS, EPISODES * REMEMBERED
     if settings.memory == "frames":
-        numbers = remembered(rows, MOMENTS, settings.memory_frames, REMEMBERED)
+        numbers = remembered(rows, MOMENTS, settings.memory_settings["frames"], REMEMBERED)
     else:  # all frames up to a moment
         lengths = torch.randint(REMEMBERED // 3, REMEMBERED, (rows, 1))
         all_of = torch.arange(REMEMBERED) + torch.arange(rows)[:, None] // MOMENTS * REMEMBERED

@@ -110,7 +110,7 @@ def histories(numbers: torch.Tensor, stored: torch.Tensor, kept: int, stride: in
 
 def training_batch(settings: MemobenchMemConfig, rows: int) -> dict[str, torch.Tensor]:
     """A preprocessed training batch with full histories."""
-    dims, frames = settings.dimensions, settings.memory_frames
+    dims, frames = settings.dimensions, settings.memory_settings.get("frames", 0)
     return observation(settings, rows) | {
         "action": torch.rand(rows, settings.chunk_size, 7),
         "phase": torch.ones(rows, dtype=torch.int64),

@@ -3,7 +3,7 @@
     python benchmarks/train_step.py [--size tiny middle] [--batch 4] [--repeats 7] [--align contrastive]
 
 A step is forward, backward, clipping, AdamW and the weight average; seconds are CPU seconds on a CPU. Plain pi0.5 is
-``memory_fusion=none``, which a test holds to LeRobot's own pi05 parameter for parameter. Prints one JSON line: seconds
+``memory=none``, which a test holds to LeRobot's own pi05 parameter for parameter. Prints one JSON line: seconds
 and ratio (memory / plain) per size that a CPU can train; and for the full size, which it cannot, the ratio of
 floating-point operations of forward and backward, counted on the meta device.
 """
@@ -25,7 +25,7 @@ from turns import medians
 
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
-SIDES = {"memory": {"memory_fusion": "modulation"}, "plain": {"memory_fusion": "none"}}
+SIDES = {"memory": {"memory": "frames"}, "plain": {"memory": "none"}}
 
 
 def main() -> None:
@@ -83,14 +83,14 @@ def count_operations(fields: dict[str, Any]) -> int:
     dims = settings.dimensions
     with torch.device("meta"):
         model = MemoryPI05(settings)
-        head = make_alignment(settings.align, dims.vlm.width, dims.text_dim, 32, 16)
+        head = make_alignment(settings.align, dims.vlm.width, dims.text_dim, 16)
     batch = {key: value.to("meta") for key, value in training_batch(settings, 1).items()}
     images = [batch["observation.images.image"], batch["observation.images.wrist_image"]]
     seen = torch.ones(1, dtype=torch.bool, device="meta")
     actions = torch.zeros(1, settings.chunk_size, settings.max_action_dim, device="meta")
     with FlopCounterMode(display=False) as counter:
         loss, reading = torch.zeros((), device="meta"), None
-        if settings.memory_fusion != "none":
+        if settings.memory != "none":
             assert model.memory is not None
             read = model.memory.replay(Histories(batch[FRAMES], batch[STEPS], batch[PLACES]))
             reading = model.reading(read)

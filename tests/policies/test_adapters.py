@@ -19,8 +19,9 @@ def _whole(policy: object) -> set[str]:
 
 @pytest.mark.parametrize("memory_fusion", ["modulation", "context", "none"])
 def test_memory_and_heads_are_trained_whole_and_nothing_else(dataset_root: Path, memory_fusion: str) -> None:
-    align = "none" if memory_fusion == "none" else "contrastive"
-    policy, *_ = made_for_training(dataset_root, memory_fusion=memory_fusion, align=align)
+    without = memory_fusion == "none"
+    fields = {"memory": "none"} if without else {"memory_fusion": memory_fusion, "align": "contrastive"}
+    policy, *_ = made_for_training(dataset_root, **fields)
     own = {f"model.{name}" for name in policy.model.memory_parameters()}
     own |= {name for name, _ in policy.named_parameters() if name.startswith("alignment.")}
     assert _whole(policy) == own

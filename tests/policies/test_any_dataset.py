@@ -86,7 +86,7 @@ def train(root: Path, out: Path, *flags: str, size: str | None = "tiny") -> Path
     """Train two updates; return the checkpoint."""
     own = [] if size is None else ["--policy.type=memobench_mem", f"--policy.size={size}"]
     own += ["--policy.num_inference_steps=2"] if size == "tiny" else []
-    own += [] if "--policy.memory_fusion=none" in flags else ["--policy.memory_frames=4"]
+    own += [] if "--policy.memory=none" in flags else ["--policy.memory_settings={frames: 4}"]
     usual = [
         *("--dataset.repo_id=somebody/robot", f"--dataset.root={root}", f"--output_dir={out}"),
         *("--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", "--policy.device=cpu"),
@@ -206,7 +206,7 @@ def test_a_memory_camera_is_one_that_is_seen(tmp_path: Path) -> None:
 def test_no_memory_makes_no_feature_cache(size: str, tmp_path: Path) -> None:
     robot = Foreign()
     root = robot.write(tmp_path / "data")
-    policy, *pipelines = loaded(train(root, tmp_path / "run", "--policy.memory_fusion=none", size=size))
+    policy, *pipelines = loaded(train(root, tmp_path / "run", "--policy.memory=none", size=size))
     assert act(robot, policy, *pipelines).isfinite().all()
     # Eyes keep what they see of present pictures, with or without a memory; nothing is kept to be remembered.
     assert [file.name.split("-")[1] for file in root.glob("feature_cache/*/")] == (

@@ -29,7 +29,12 @@ def start(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = TrainPipelineConfig(
         dataset=DatasetConfig(repo_id="memobench/synthetic", root=str(dataset_root)),
         policy=MemobenchMemConfig(
-            device="cpu", push_to_hub=False, chunk_size=6, n_action_steps=6, num_inference_steps=2, memory_frames=8
+            device="cpu",
+            push_to_hub=False,
+            chunk_size=6,
+            n_action_steps=6,
+            num_inference_steps=2,
+            memory_settings={"frames": 8},
         ),
         output_dir=out,
         steps=1,

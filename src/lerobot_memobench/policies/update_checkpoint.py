@@ -1,9 +1,9 @@
-"""Rewrite a memobench_mem checkpoint of an earlier version: remove settings that this version does not have.
+"""Rewrite a memobench_mem checkpoint of an earlier version in this version's settings.
 
     python -m lerobot_memobench.policies.update_checkpoint CHECKPOINT ...
 
-All of these settings concern training alone, so the policy acts as before. A training can be resumed if it used the
-values that remain.
+The weights are not changed. A note is printed for each removed setting whose value differs from this version's
+behaviour.
 """
 
 from __future__ import annotations
@@ -14,43 +14,102 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from safetensors import safe_open
+
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
-from lerobot_memobench.policies.checkpoint import CONFIG_FILE, REMOVED_FIELDS, checkpoint_folder, read_json
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import ALIGN_WEIGHTS, SHUFFLE_SEED, SIZES
+from lerobot_memobench.policies.checkpoint import (
+    CONFIG_FILE,
+    PREPROCESSOR_FILE,
+    REMOVED_FIELDS,
+    WEIGHTS_FILE,
+    Processor,
+    checkpoint_folder,
+    read_json,
+    undamaged,
+)
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
+    ALIGN_WEIGHTS,
+    SHUFFLE_SEED,
+    SIZES,
+    TOKENS_PER_FRAME,
+)
 
-TRAIN_CONFIG = "train_config.json"
-REMAINING: Mapping[str, Callable[[Mapping[str, Any]], tuple[Any, ...]]] = {
-    "feature_cache_dir": lambda saved: (saved["feature_cache_dir"],),
+TRAIN_CONFIG, PHASE_WEIGHT = "train_config.json", "model.memory.pool.phase.weight"
+BEHAVIOUR: Mapping[str, Callable[[Mapping[str, Any]], tuple[Any, ...]]] = {
     "shuffle_seed": lambda saved: (SHUFFLE_SEED,) if saved.get("shuffle_subgoals") else (saved["shuffle_seed"],),
     "align_weight": lambda saved: (ALIGN_WEIGHTS[saved.get("align", "none")], None, 0.0),
     "min_lr_ratio": lambda saved: (SIZES[saved.get("size", "tiny")].final_learning_rate, None),
+    "open_gate": lambda _: (False,),
+    "full_chunk_when_stalled": lambda saved: (saved.get("perception") == "objects",),
 }
-"""Removed field -> its values that mean what this version does."""
+"""Removed setting -> the values that equal this version's behaviour, which is the first."""
 
 
 def update_checkpoint(folder: Path) -> list[str]:
-    """Remove the fields of earlier versions from a checkpoint's files.
+    """Rewrite the settings in a checkpoint's files.
 
     Returns:
-        A note for each field whose value differed from what this version trains with.
+        A note for each setting whose value differs from this version's behaviour.
+
+    Raises:
+        MemobenchError: this version cannot act as the checkpoint was trained.
     """
-    path, notes = folder / CONFIG_FILE, []
-    policy = read_json(path)
-    for name in sorted(REMOVED_FIELDS & policy.keys()):
-        values = REMAINING[name](policy)
-        if policy[name] not in values:
-            notes.append(f"{name} was {policy[name]}; a training from this checkpoint goes on with {values[0]}")
-    write_file(path, json.dumps(_current(policy), indent=4))
-    training = folder / TRAIN_CONFIG
+    path, training, processor = (folder / name for name in (CONFIG_FILE, TRAIN_CONFIG, PREPROCESSOR_FILE))
+    saved = read_json(path)
+    policy, notes = updated(saved, folder), []
+    for name, values in BEHAVIOUR.items():
+        if name in saved and saved[name] not in values(saved):
+            notes.append(f"{name} was {saved[name]}; this version continues with {values(saved)[0]}")
+    if processor.is_file():
+        content = read_json(processor, Processor)
+        for step in content.get("steps", []):
+            if step.get("registry_name") == "memobench_gather_memory":
+                settings: Any = step.get("config", {})
+                step["config"] = {name: one for name, one in settings.items() if name == "subgoals"}
+        write_file(processor, json.dumps(content, indent=2))
     if training.is_file():
         config = read_json(training)
-        write_file(training, json.dumps(config | {"policy": _current(config["policy"])}, indent=4))
+        config["policy"] = updated(config["policy"], folder)
+        write_file(training, json.dumps(config, indent=4))
+    write_file(path, json.dumps(policy, indent=4))  # last, so that an interrupted update is repeated
     return notes
 
 
-def _current(policy: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in policy.items() if name not in REMOVED_FIELDS}
+def updated(saved: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a policy's settings in the form of this version.
+
+    Raises:
+        MemobenchError: this version cannot act as the checkpoint was trained.
+    """
+    policy = {name: value for name, value in saved.items() if name not in REMOVED_FIELDS}
+    memory = saved.get("memory") or ("none" if saved.get("memory_fusion") == "none" else "frames")
+    settings = dict(saved.get("memory_settings") or {})
+    tokens = TOKENS_PER_FRAME[saved.get("perception", "pixels")]
+    unsupported = {
+        "memory_settings.time_codes": settings.pop("time_codes", True) is not True,
+        "visual_encoder=random": saved.get("visual_encoder") == "random",
+        "tokens_per_frame": saved.get("tokens_per_frame") not in (None, tokens),
+    }
+    for name, present in unsupported.items():
+        if present and memory != "none":
+            raise MemobenchError(
+                f"{folder} was trained with another value of {name} than this version's; use the version that "
+                "trained it, or train it again"
+            )
+    if memory in ("frames", "subgoal"):
+        settings = {"frames": saved.get("memory_frames", 32), "content": True} | settings
+    if memory == "none":
+        return policy | {"memory": memory, "memory_settings": {}, "memory_fusion": None}
+    if "memory_phase" not in saved and PHASE_WEIGHT in tensor_names(folder / WEIGHTS_FILE):  # once always recorded
+        policy["memory_phase"] = True
+    return policy | {"memory": memory, "memory_settings": settings}
+
+
+def tensor_names(file: Path) -> set[str]:
+    """Return the names of the tensors in a file."""
+    with undamaged(file), safe_open(file, framework="numpy") as tensors:
+        return set(tensors.keys())
 
 
 def main(names: Sequence[str]) -> None:

@@ -55,7 +55,6 @@ TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path
 OF_MEMORY: Mapping[str, object] = {
     "memory_stride": None,
     "memory_fusion": None,
-    "memory_frames": 32,
     "memory_phase": False,
     "subgoals": None,
 }
