@@ -30,7 +30,7 @@ def main() -> None:
     parts: dict[str, int] = {"encoder": 0, "memory_to_expert": 0, "modulators": 0}
     memory = model.memory_parameters()
     for name, parameter in memory.items():
-        part = "modulators" if ".modulator." in name else name.split(".")[0].replace("memory", "encoder", 1)
+        part = "modulators" if name.startswith("modulators.") else name.split(".")[0].replace("memory", "encoder", 1)
         parts["memory_to_expert" if name.startswith("memory_to_expert") else part] += parameter.numel()
     total = sum(parts.values())
     # The language heads are never asked, and on the meta device not even tied to the embeddings.

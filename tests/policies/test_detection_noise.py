@@ -82,8 +82,8 @@ def test_errors_are_larger_near_the_hand() -> None:
 
 
 def test_lifted_things_are_found_too_low() -> None:
-    stands, lifted = (scene(thing("butter", (0.0, 0.1, 0.909 + height))) for height in (0.0, 0.05))
-    off, higher = (errors(many(one, FAR), one).mean() for one in (stands, lifted))
+    level, lifted = (scene(thing("butter", (0.0, 0.1, 0.909 + height))) for height in (0.0, 0.05))
+    off, higher = (errors(many(one, FAR), one).mean() for one in (level, lifted))
     assert higher > off + 0.01
     seen = many(lifted, FAR)
     there = (field(seen, "present").squeeze(-1) > 0) & (field(seen, "class").squeeze(-1) == KIND["butter"])

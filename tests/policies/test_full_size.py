@@ -71,7 +71,7 @@ def _lerobots(policy: MemobenchMemPolicy) -> PI05Pytorch | MemoryPI05:
     own = dict(policy.model.named_parameters())
     for path, module in theirs.named_modules():
         for key, wanted in list(module.named_parameters(recurse=False)):
-            ours = own[policy.model.place_of(f"{path}.{key}")]
+            ours = own[f"{path}.{key}"]
             assert (ours.dtype, ours.shape) == (wanted.dtype, wanted.shape), f"{path}.{key}"
             setattr(module, key, ours)
     fill_buffers(theirs, torch.device("cpu"))
@@ -133,7 +133,7 @@ def _step(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> None:
 
 def _group(name: str) -> str:
     """Return the part of the model that a parameter belongs to."""
-    for part, word in (("modulators", ".modulator."), ("expert", ".gemma_expert."), ("memory", "model.memory")):
+    for part, word in (("modulators", "modulators."), ("expert", ".gemma_expert."), ("memory", "model.memory")):
         if word in name:
             return part
     return "projections of actions and time"

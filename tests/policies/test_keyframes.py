@@ -170,14 +170,14 @@ def test_high_level_learns_to_nominate_and_to_choose() -> None:
         optimizer.step()
     assert loss < 0.15
     mechanism.eval()
-    state, said = mechanism.init(1), []
+    state, chosen = mechanism.init(1), []
     with torch.no_grad():
         for number, frame in enumerate(marked.split(1)):
             state = mechanism.observe(state, frame, torch.tensor([number * STRIDE]), ALL)
-            said.append(int(state["said"]))
-    assert said[3:10] == [0] * 7
-    assert said[14:20] == [1] * 6
-    assert said[24:] == [2] * 10
+            chosen.append(int(state["text"]))
+    assert chosen[3:10] == [0] * 7
+    assert chosen[14:20] == [1] * 6
+    assert chosen[24:] == [2] * 10
     kept = [step // STRIDE for step, votes in zip(state["steps"][0], state["votes"][0], strict=False) if votes > 0]
     assert {min(abs(int(frame) - end) for end in (11, 21)) for frame in kept} <= {0, 1}
     assert kept

@@ -30,7 +30,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def acting(root: Path, **fields: Any) -> tuple[MemobenchMemPolicy, list[dict[str, Any]]]:
-    """Return a policy and observations of two rows, of which the second is six frames behind."""
+    """Return a policy and observations of two rows; the second is six frames behind."""
     policy, before, _, dataset = made_for_training(
         root, **{"perception": "objects", "size": "tiny", "memory_stride": 2, "frames": 4, **fields}
     )
@@ -123,7 +123,7 @@ def test_tokens_are_summed_per_entry() -> None:
     frames = chunk_reads([5, 9], MemoryTokens(tokens, mask, steps=steps), layers)
     assert [read["entries"] for read in frames] == [[0, 8], [-2, 0]]
     assert frames[0]["weights"] == pytest.approx([0.3, 0.7])
-    # Tokens that mix three entries, of which the third is padding.
+    # Tokens that mix three entries; the third is padding.
     shares = torch.tensor([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]).expand(2, -1, -1)
     sources = shares, torch.tensor([[0.0, 12.4, -1.0]] * 2)
     looked_up = chunk_reads([20, 30], MemoryTokens(tokens, mask, sources=sources), layers)

@@ -6,7 +6,7 @@ noise, and detections in pictures.
 
 from __future__ import annotations
 
-import shutil
+import functools
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.envs.observations import obs_type_of
 from lerobot_memobench.envs.settings import PIXELS
@@ -49,14 +50,15 @@ from lerobot_memobench.policies.memobench_mem.objects import (
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
 from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
 from lerobot_memobench.sim.object_slots import classes
-from lerobot_memobench.training.features import FOLDER
 from lerobot_memobench.training.sampler import task_weights
+from research.detector.labels import kinds
 from tests.support.memory import remembered, trained_on
 from tests.support.object_dataset import LENGTHS, make_object_dataset, slots_at, state_at
-from tests.support.picture_rollouts import STARTS, made_detector, pictures_of
 from tests.support.small_policy import batch_of, made_for_training, open_small_training, small_config
-from tests.support.synthetic_dataset import CAMERAS
+from tests.support.synthetic_dataset import CAMERAS, make_dataset
 
+FILMED = (12, 23, 9)
+"""Lengths of the episodes with pictures; the second has a prompt of 8 frames, as in the dataset of objects."""
 PROMPT_KEYS = ("observation.language.tokens", "observation.language.attention_mask")
 
 
@@ -88,6 +90,11 @@ class Case:
     root: Path
     fields: dict[str, Any]
 
+    @property
+    def starts(self) -> list[int]:
+        """First frames of the episodes."""
+        return np.cumsum([0, *(LENGTHS if self.of.needs == OBS_ENV_STATE else FILMED)]).tolist()
+
     @cached_property
     def shared(self) -> Any:
         """Policy, preprocessor, postprocessor and samples."""
@@ -100,24 +107,42 @@ class Case:
         """Return a rollout's observation at a frame of the dataset."""
         row = dataset.hf_dataset[index]
         numbers = {key: row[key][None] for key in (OBS_STATE, OBS_ENV_STATE) if key in row}
-        step = float(index - STARTS[int(np.searchsorted(STARTS, index, "right")) - 1])
+        step = float(index - max(start for start in self.starts if start <= index))
         clock = {
             "observation.step": torch.tensor([step]),
             "observation.phase": row["observation.phase"].reshape(1).float(),
         }
-        pictures = {} if OBS_ENV_STATE in row else pictures_of(self.root, index)
+        pictures = {} if OBS_ENV_STATE in row else self.pictures(index)
         return {**pictures, **numbers, **clock, "task": [dataset.meta.tasks.index[int(row["task_index"])]]}
+
+    def pictures(self, index: int) -> dict[str, Tensor]:
+        """Return the pictures of all cameras at a frame, (1, 3, H, W)."""
+        episode = int(np.searchsorted(self.starts, index, "right")) - 1
+        numbers = [index - self.starts[episode]]
+        return {camera: reader_of(self.root, camera)(episode, numbers) for camera in CAMERAS}
+
+
+reader_of = functools.cache(frame_reader)
+
+
+def made_detector(path: Path) -> Path:
+    """Write a detector with random weights that detects objects everywhere."""
+    torch.manual_seed(1)
+    detector = Detector(VisualEncoder().eval(), kinds())
+    torch.nn.init.zeros_(detector.fine_heads.heatmap.bias)
+    save_detector(detector, path)
+    return path
 
 
 @pytest.fixture(scope="module")
 def detector(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_detector(tmp_path_factory.mktemp("detector") / "detector.safetensors", 1)
+    return made_detector(tmp_path_factory.mktemp("detector") / "detector.safetensors")
 
 
 @pytest.fixture(scope="module")
-def cases(dataset_root: Path, detector: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
+def cases(detector: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     folder = tmp_path_factory.mktemp("perceptions")
-    pictures = shutil.copytree(dataset_root, folder / "pictures", ignore=shutil.ignore_patterns(FOLDER))
+    pictures = make_dataset(folder / "pictures", lengths=FILMED)
     objects = make_object_dataset(folder / "objects", records=True)
     shared = {"n_action_steps": 3, "memory_stride": 2}
     return {
@@ -147,9 +172,9 @@ def difference(one: Tensor, other: Tensor) -> float:
 def test_rollout_remembers_and_sees_what_training_reads(case: Case) -> None:
     policy, before, _, dataset = case.shared
     policy.eval().reset()
-    index = int(STARTS[1]) + 14
+    index = case.starts[1] + 14
     trained = before(batch_of(dataset, [index]))
-    for frame in range(int(STARTS[1]), index + 1):
+    for frame in range(case.starts[1], index + 1):
         acted = before(case.observed(dataset, frame))
         policy.observe(acted)
     ((frames, steps),), ((learned, learned_steps),) = remembered(policy, [0]), trained_on(trained)
@@ -165,7 +190,9 @@ def test_rollout_remembers_and_sees_what_training_reads(case: Case) -> None:
 
 def test_memory_is_trained_and_pictures_encoders_are_not(case: Case) -> None:
     policy, before, _, dataset = case.shared
-    policy.train().forward(before(batch_of(dataset, [10, 30, 50, 80])))[0].backward()
+    policy.train().forward(
+        before(batch_of(dataset, [10, case.starts[1] + 10, case.starts[1] + 20, case.starts[2] + 5]))
+    )[0].backward()
     assert all(parameter.grad is not None for parameter in policy.model.memory_parameters().values())
     learning = {name for name, parameter in policy.named_parameters() if parameter.requires_grad}
     assert not any("vision_tower" in name or "multi_modal_projector" in name for name in learning)
@@ -177,7 +204,7 @@ def test_observations_are_needed_for_memory_and_plans(case: Case) -> None:
     policy.eval().reset()
     found = []
     for step in range(6):
-        observation = case.observed(dataset, int(STARTS[2]) + step)
+        observation = case.observed(dataset, case.starts[2] + step)
         observation[OBS_STATE] = observation[OBS_STATE] + 0.1 * step  # a hand that does not stall
         policy.select_action(before(observation))
         found.append(policy.needs_observation())
@@ -187,7 +214,7 @@ def test_observations_are_needed_for_memory_and_plans(case: Case) -> None:
 def test_missing_input_is_refused(case: Case) -> None:
     policy, before, _, dataset = case.shared
     policy.reset()
-    observation = case.observed(dataset, int(STARTS[2]))
+    observation = case.observed(dataset, case.starts[2])
     del observation[case.of.needs]
     with pytest.raises(MemobenchError, match=rf"'{case.of.needs}'"):
         policy.select_action(before(observation))
@@ -205,7 +232,7 @@ def test_checkpoint_acts_as_its_policy(case: Case, tmp_path: Path) -> None:
     for actor, step in ((policy, before), (again, pre)):
         actor.reset()
         torch.manual_seed(0)
-        observations = [case.observed(dataset, int(STARTS[2]) + index) for index in range(5)]
+        observations = [case.observed(dataset, case.starts[2] + index) for index in range(5)]
         actions.append([actor.select_action(step(one)) for one in observations])
     assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*actions, strict=True))
     assert actions[0][-1].any()
@@ -214,26 +241,27 @@ def test_checkpoint_acts_as_its_policy(case: Case, tmp_path: Path) -> None:
 @pytest.mark.parametrize("case", ["visual encoder", "detections"], indirect=True)
 def test_samples_hold_features_and_decode_no_video(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, before, _, dataset = case.shared
-    decoded = torch.utils.data.default_collate([dataset.reader.get_item(45)])
+    first = case.starts[1] + 5
+    decoded = torch.utils.data.default_collate([dataset.reader.get_item(first)])
 
     def refuse(*_: Any, **__: Any) -> None:
         raise AssertionError("a video was opened")
 
     monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
-    sample = dataset[45]
+    sample = dataset[first]
     assert not set(CAMERAS) & sample.keys()
     assert set(policy.config.image_features) == set(CAMERAS)
-    batch = before(batch_of(dataset, [45, 50]))
+    batch = before(batch_of(dataset, [first, first + 5]))
     assert len(batch[FRAMES]) < (batch[PLACES] >= 0).sum(), "samples of an episode share frames"
     if "detector" in case.fields:
-        truth = policy.perception.detect(pictures_of(case.root, 45), batch[OBS_RAW_STATE][:1])
+        truth = policy.perception.detect(case.pictures(first), batch[OBS_RAW_STATE][:1])
         assert truth.any()
         assert torch.allclose(batch[DETECTED][:1], truth, rtol=2**-15, atol=1e-7)
     else:
         assert all(batch[encoded_key(camera)].shape == (2, GRID**2, WIDTH) for camera in CAMERAS)
         assert batch[FRAMES].shape[1:] == (POOLED**2, WIDTH)
     losses = []  # pictures in a batch of LeRobot's have no effect
-    for one in (decoded, {**decoded, **{name: 1 - decoded[name] for name in CAMERAS}}, batch_of(dataset, [45])):
+    for one in (decoded, {**decoded, **{name: 1 - decoded[name] for name in CAMERAS}}, batch_of(dataset, [first])):
         torch.manual_seed(0)
         losses.append(policy.train().forward(before(one))[0].item())
     assert losses == [losses[0]] * 3
@@ -252,7 +280,7 @@ def test_policies_of_objects_act_from_detections(cases: dict[str, Case], detecto
         config: Any = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=overrides)
         acting = MemobenchMemPolicy.from_pretrained(tmp_path, config=config)
         found.append((acting, make_pre_post_processors(acting.config, str(tmp_path))[0]))
-    (given, told), (seeing, looking) = found
+    (given, of_objects), (seeing, of_pictures) = found
     assert set(seeing.config.image_features) == {*VIEWS}
     assert obs_type_of(seeing.config) == PIXELS != obs_type_of(given.config)
     case = cases["detections"]
@@ -262,7 +290,7 @@ def test_policies_of_objects_act_from_detections(cases: dict[str, Case], detecto
         slots = seeing.perception.detect(batch, batch[OBS_STATE])
         objects = {key: value for key, value in batch.items() if key not in VIEWS} | {OBS_ENV_STATE: slots}
         noise = {OBS_ENV_STATE: torch.ones(1, SIZE)}
-        assert torch.equal(given.select_action(told(objects)), seeing.select_action(looking(batch | noise)))
+        assert torch.equal(given.select_action(of_objects(objects)), seeing.select_action(of_pictures(batch | noise)))
 
 
 def test_checkpoints_hold_encoders_and_name_detectors(cases: dict[str, Case], tmp_path: Path) -> None:

@@ -495,13 +495,20 @@ def test_base_weights_are_loaded_except_for_the_memory(trained: Any, tmp_path: P
     features = {name: getattr(trained[0].config, name) for name in ("input_features", "output_features")}
     policy = MemobenchMemPolicy(small_config(base_weights=str(tmp_path), **fields, **features))
     memory = policy.model.memory_names()
-    own = {
-        name.replace("post_attention_layernorm.norm.", "post_attention_layernorm."): tensor
-        for name, tensor in policy.model.named_parameters()
-        if name not in memory
-    }
+    own = {name: one for name, one in policy.model.named_parameters() if name not in memory}
     assert own.keys() == dict(plain.named_parameters()).keys()
     assert all(torch.equal(own[name], tensor) for name, tensor in plain.named_parameters())
+
+
+def nested(name: str) -> str:
+    """Return the earlier name of a tensor."""
+    norm = "model.paligemma_with_expert.gemma_expert.model.layers.{}.post_attention_layernorm."
+    if name.startswith("model.modulators."):
+        _, _, layer, rest = name.split(".", 3)
+        return norm.format(layer) + f"modulator.{rest}"
+    if ".gemma_expert." in name:
+        return name.replace("post_attention_layernorm.", "post_attention_layernorm.norm.")
+    return name
 
 
 OLD = {"memory_frames": 32, "tokens_per_frame": 2, "open_gate": False, "full_chunk_when_stalled": True}
@@ -519,8 +526,9 @@ OLD = {"memory_frames": 32, "tokens_per_frame": 2, "open_gate": False, "full_chu
         ),
         ({"memory_settings": {"time_codes": False, "content": True}}, [], "time_codes"),
         ({"tokens_per_frame": 3}, [], "tokens_per_frame"),
+        ({"visual_encoder": "random"}, [], "visual_encoder"),
     ],
-    ids=["usual", "notes", "no memory", "time_codes", "tokens"],
+    ids=["usual", "notes", "no memory", "time_codes", "tokens", "encoder"],
 )
 def test_checkpoints_of_earlier_versions_are_updated(
     trained: Any, tmp_path: Path, old: dict[str, Any], noted: list[str], refused: str | None
@@ -531,12 +539,18 @@ def test_checkpoints_of_earlier_versions_are_updated(
     step = next(one for one in content["steps"] if one["registry_name"] == "memobench_gather_memory")
     step["config"] = {"frames": 32, "align": "none", "shuffle_seed": 7}
     processor.write_text(json.dumps(content))
+    weights = load_file(folder / "model.safetensors")
+    save_file({nested(name): tensor for name, tensor in weights.items()}, folder / "model.safetensors")
+    (folder.parent / "training_state").mkdir()
     file.write_text(json.dumps(json.loads(file.read_text()) | OLD | {"memory_settings": {"content": True}} | old))
     if refused is not None:
         with pytest.raises(MemobenchError, match=refused):
             update_checkpoint(folder)
         return
     notes = update_checkpoint(folder)
+    assert not (folder.parent / "training_state").exists()
+    assert notes.pop().startswith("the training cannot be resumed")
+    assert load_file(folder / "model.safetensors").keys() == weights.keys()
     assert [any(one.startswith(name) for one in notes) for name in noted] == [True] * len(noted)
     assert bool(notes) == bool(noted)
     found: Any = PreTrainedConfig.from_pretrained(folder)

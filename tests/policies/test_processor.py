@@ -117,14 +117,14 @@ def test_oracle_memory_is_read_in_training_and_in_rollouts(tmp_path: Path) -> No
         root, size="small", perception="objects", memory="none", oracle_memory=True
     )
     batch = before(batch_of(dataset, [10, 50]))
-    told = dataset.hf_dataset[10]["memory"]
-    assert f"memory : {told}" in prompt_of(before, batch, 0)
+    memory = dataset.hf_dataset[10]["memory"]
+    assert f"memory : {memory}" in prompt_of(before, batch, 0)
     for part in (policy, before, after):
         part.save_pretrained(tmp_path / "it")
     again, _ = make_pre_post_processors(policy.config, pretrained_path=str(tmp_path / "it"))
     item = dataset[10]
     keys = ("observation.state", "observation.environment_state")
-    frame = {key: item[key][None] for key in keys} | {"task": [with_memory(item["task"], told)]}
+    frame = {key: item[key][None] for key in keys} | {"task": [with_memory(item["task"], memory)]}
     seen = again(frame)
     assert torch.equal(seen["observation.language.tokens"][0], batch["observation.language.tokens"][0])
     assert MemobenchMemPolicy.from_pretrained(tmp_path / "it").select_action(seen).isfinite().all()

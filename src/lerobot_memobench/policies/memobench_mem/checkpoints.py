@@ -28,7 +28,6 @@ from lerobot_memobench.policies.checkpoint import (
     undamaged,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.fusion import plain_name
 from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
@@ -80,13 +79,6 @@ def _head(policy: nn.Module) -> set[str]:
     return {name for name in policy.state_dict() if name.startswith("alignment.")}
 
 
-def name_here(policy: nn.Module, name: str, trained: MemobenchMemConfig) -> str:
-    """Return the name in a policy of a tensor of a checkpoint; another fusion nests pi0.5's modules differently."""
-    if name.startswith("model.") and has_another_memory(cast(MemobenchMemConfig, policy.config), trained):
-        name = f"model.{cast(MemoryPI05, policy.model).place_of(plain_name(name.removeprefix('model.')))}"
-    return name
-
-
 def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: MemobenchMemConfig) -> None:
     """Load the weights of checkpoint ``source`` into a policy of this kind; its alignment heads may be missing.
 
@@ -102,7 +94,7 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             f"--policy.{name}={asked} has no effect: it sets initial weights, and the weights of '{source}' "
             f"({name}={held}) replace them; leave {name} out, or train from scratch."
         )
-    weights = {name_here(policy, name, trained): tensor for name, tensor in read_tensors(path).items()}
+    weights = read_tensors(path)
     if has_another_memory(config, trained):
         logger.warning(
             "'%s' was trained with memory=%s, and this is memory=%s%s: %d tensors of the memory and its fusion keep "
@@ -125,7 +117,7 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
 
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
     """Load pi0.5's weights; the memory's parameters keep their initial values."""
-    placed = {model.place_of(plain_name(name.removeprefix("model."))): tensor for name, tensor in weights.items()}
+    placed = {name.removeprefix("model."): tensor for name, tensor in weights.items()}
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
 
 

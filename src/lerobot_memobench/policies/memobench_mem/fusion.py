@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import functools
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, cast
@@ -99,9 +98,11 @@ class MemoryFusion(ABC):
 
     Attributes:
         reports_reads: whether `Reading.shares` of a watched pass is implemented.
+        parts: names of the modules that it adds to the model, each with a dot.
     """
 
     reports_reads: ClassVar[bool] = False
+    parts: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
@@ -114,14 +115,6 @@ class MemoryFusion(ABC):
         Args:
             watched: collect attention weights for `Reading.shares`.
         """
-
-    def owns(self, name: str) -> bool:
-        """Return whether a parameter of the model belongs to this fusion and not to pi0.5."""
-        return False
-
-    def place_of(self, name: str) -> str:
-        """Return the name in this model of a parameter of plain pi0.5."""
-        return name
 
 
 # -- modulation -------------------------------------------------------------------------------------------------------
@@ -205,15 +198,6 @@ class MemoryModulator(nn.Module):
         return scale, shift
 
 
-class ModulatedNorm(nn.Module):
-    """LeRobot's norm before a feed-forward of the expert, and the memory's modulation after it."""
-
-    def __init__(self, norm: nn.Module, modulator: MemoryModulator) -> None:
-        super().__init__()
-        self.norm = norm
-        self.modulator = modulator
-
-
 class ModulatedReading(Reading):
     """A pass whose expert is scaled and shifted by memory of the expert's width W."""
 
@@ -238,44 +222,21 @@ class ModulatedReading(Reading):
 
 
 class Modulation(MemoryFusion):
-    """Project memory to the expert's width, and modulate each of the expert's layers.
-
-    Norms with a modulator are nested one level deeper than in plain pi0.5.
-    """
+    """Project memory to the expert's width, and modulate each of the expert's layers."""
 
     reports_reads = True
+    parts = ("memory_to_expert.", "modulators.")
 
     def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         self.model = model
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
-        for layer in model.paligemma_with_expert.gemma_expert.model.layers:
-            layer.post_attention_layernorm = ModulatedNorm(layer.post_attention_layernorm, MemoryModulator(expert_dim))
+        layers = model.paligemma_with_expert.gemma_expert.model.layers
+        model.modulators = nn.ModuleList(MemoryModulator(expert_dim) for _ in layers)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
         """Project the memory to the expert's width."""
         projected = memory.through(cast(nn.Linear, self.model.memory_to_expert))
-        return ModulatedReading(projected, self.modulators, watched)
-
-    @property
-    def modulators(self) -> list[MemoryModulator]:
-        """The modulators of the expert's layers."""
-        layers = self.model.paligemma_with_expert.gemma_expert.model.layers
-        return [layer.post_attention_layernorm.modulator for layer in layers]
-
-    def owns(self, name: str) -> bool:
-        """Return whether a parameter belongs to the projection or a modulator."""
-        return name.startswith("memory_to_expert.") or ".modulator." in name
-
-    def place_of(self, name: str) -> str:
-        """Return the nested name of a parameter of a norm."""
-        if ".gemma_expert." not in name:
-            return name
-        return re.sub(r"post_attention_layernorm\.(dense|weight)", r"post_attention_layernorm.norm.\1", name)
-
-
-def plain_name(name: str) -> str:
-    """Return the name in plain pi0.5 of a parameter of any fusion's model."""
-    return name.replace("post_attention_layernorm.norm.", "post_attention_layernorm.")
+        return ModulatedReading(projected, [*self.model.modulators], watched)
 
 
 # -- context ----------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ FEW_KEYS = 64
 
 @contextmanager
 def exact_products() -> Iterator[None]:
-    """Compute matrix products in float32 inside an update that rounds them (`training.speed.quick_products`).
+    """Compute matrix products in float32 inside an update that rounds them (`quick_products` of `training`).
 
     A memory that compares vectors then makes the same choices as in a rollout; and small products are faster so.
     """

@@ -83,7 +83,7 @@ from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # 
 logger = logging.getLogger(__name__)
 
 OWN_MODULES = (
-    *("model.memory", "model.memory_to_expert", "modulator", "alignment", "model.foresight", "model.subgoal"),
+    *("model.memory", "model.memory_to_expert", "model.modulators", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
 )
 """Suffixes of the names of modules that plain pi0.5 does not have; with adapters (``--peft…``), all their weights are

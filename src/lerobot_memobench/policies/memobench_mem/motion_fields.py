@@ -33,7 +33,7 @@ class MotionField(nn.Module, ABC):
     """Motion between two stored frames, and tokens of it; the layers of the tokens are trained.
 
     Attributes:
-        size: D', numbers of a stored frame. cells: C. numbers: K of a cell, of which the first ``moved`` are motion.
+        size: D', numbers of a stored frame. cells: C. numbers: K of a cell; the first ``moved`` are motion.
     """
 
     size: int

@@ -230,16 +230,8 @@ class MemoryPI05(nn.Module):
 
     def memory_names(self) -> set[str]:
         """Return the names of the tensors of the memory and of its fusion."""
-        fusion = self.fusion
-        return {
-            name
-            for name in self.state_dict()
-            if name.startswith("memory.") or (fusion is not None and fusion.owns(name))
-        }
-
-    def place_of(self, name: str) -> str:
-        """Return the name in this model of a parameter of plain pi0.5."""
-        return name if self.fusion is None else self.fusion.place_of(name)
+        parts = ("memory.",) if self.fusion is None else ("memory.", *self.fusion.parts)
+        return {name for name in self.state_dict() if name.startswith(parts)}
 
 
 def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) -> MemoryMechanism:

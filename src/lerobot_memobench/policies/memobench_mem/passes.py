@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lerobot_memobench.policies.memobench_mem.fusion import ModulatedNorm, Prefix, Reading
+from lerobot_memobench.policies.memobench_mem.fusion import Prefix, Reading
 from lerobot_memobench.policies.memobench_mem.layers import (
     attend,
     hidden,
@@ -80,8 +80,7 @@ def adaptive_norms(backbone: Any) -> Iterator[Any]:
     """Yield the expert's norms in the order in which a pass applies them."""
     expert = backbone.gemma_expert.model
     for layer in expert.layers:
-        after = layer.post_attention_layernorm
-        yield from (layer.input_layernorm, after.norm if isinstance(after, ModulatedNorm) else after)
+        yield from (layer.input_layernorm, layer.post_attention_layernorm)
     yield expert.norm
 
 

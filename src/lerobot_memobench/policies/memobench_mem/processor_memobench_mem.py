@@ -74,7 +74,7 @@ def make_memobench_mem_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Build both processors of a new policy (LeRobot's factory calls this when nothing saved is loaded).
+    """Build both processors of a new policy (LeRobot's factory calls this unless it loads saved ones).
 
     Args:
         dataset_stats: normalisation statistics of the training dataset.
@@ -415,7 +415,7 @@ def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> No
         )
     if len(spans) > max_length and f"cut {instruction}" not in _warned:
         logger.warning(
-            "the prompt of %r has %d tokens, of which the policy reads %d (policy.tokenizer_max_length of its "
+            "the prompt of %r has %d tokens; the policy reads %d (policy.tokenizer_max_length of its "
             "training); cut off: %r",
             instruction,
             len(spans),

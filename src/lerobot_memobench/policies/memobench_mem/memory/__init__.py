@@ -90,7 +90,7 @@ def settings_of(name: str) -> set[str]:
 
 
 def read_settings(name: str, given: Mapping[str, Any]) -> Any:
-    """Return the settings of a mechanism, its defaults where nothing is ``given``.
+    """Return the settings of a mechanism, with defaults for those that are not ``given``.
 
     Raises:
         MemobenchError: a setting is unknown, or has a wrong type or value.

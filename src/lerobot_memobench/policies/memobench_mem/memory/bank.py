@@ -165,7 +165,7 @@ class Stream(nn.Module):
         """Return the present fused with its retrieval from the entries, or from itself if there are no entries.
 
         Args:
-            present: (R, N, d). entries: (R, L, N, d), of which the first ``count`` (R,) are real. steps: (R, L).
+            present: (R, N, d). entries: (R, L, N, d); the first ``count`` (R,) are real. steps: (R, L).
             now: (R,) step of the present.
 
         Returns:

@@ -117,7 +117,7 @@ class Keyframes(MemoryMechanism):
             "frames": torch.zeros(frame, device=like.device),
             "steps": torch.full(frame[:2], -1, device=like.device),
             "votes": torch.zeros(rows, NOMINATED, dtype=torch.int64, device=like.device),
-            "said": torch.full((rows,), self.count, device=like.device),
+            "text": torch.full((rows,), self.count, device=like.device),
         }
 
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
@@ -143,7 +143,7 @@ class Keyframes(MemoryMechanism):
             "frames": torch.cat([kept, recent], dim=1),
             "steps": torch.cat([kept_at, recent_at], dim=1),
             "votes": votes[rows, latest],
-            "said": scores.argmax(dim=1),
+            "text": scores.argmax(dim=1),
         }
 
     def _shown(self, kept: Tensor, kept_at: Tensor, votes: Tensor, recent_at: Tensor) -> tuple[Tensor, Tensor]:
@@ -161,7 +161,7 @@ class Keyframes(MemoryMechanism):
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
         """Return the words of the text that the high level chose last."""
-        return MemoryTokens(*self.texts(state["said"]))
+        return MemoryTokens(*self.texts(state["text"]))
 
     # -- a training --------------------------------------------------------------------------------------------------
 

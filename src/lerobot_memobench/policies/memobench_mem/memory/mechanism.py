@@ -1,4 +1,4 @@
-"""Interface of memory mechanisms: what is kept of an episode, how it is read, and how training replays the past.
+"""Interface of memory mechanisms: how to keep an episode, how to read it, and how training replays it.
 
 A mechanism is a module with its own weights. In a rollout each row has a state: `write` updates it once per remembered
 frame, and `read` turns it into memory tokens once per action chunk. In training `replay` computes the same for the

@@ -83,6 +83,8 @@ class Foresight(MemoryFusion):
     The actions' positions are therefore shifted by `FORESIGHT` from those of plain pi0.5.
     """
 
+    parts = ("foresight.",)
+
     def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
         self.model = cast(Any, model)
         pool = self.model.memory.pool
@@ -91,10 +93,6 @@ class Foresight(MemoryFusion):
     def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
         """Begin a pass conditioned on this memory."""
         return ForesightReading(self.model.foresight, memory)
-
-    def owns(self, name: str) -> bool:
-        """Return whether a parameter belongs to `MotionExpert`."""
-        return name.startswith("foresight.")
 
 
 # -- hindsight --------------------------------------------------------------------------------------------------------

@@ -98,7 +98,7 @@ class NarrowReading(Reading):
     chooses it.
 
     Attributes:
-        said: (B,) index of the text in the prefix; S: the empty text.
+        chosen: (B,) index of the text in the prefix; S: the empty text.
     """
 
     watches = ("prefix",)
@@ -108,7 +108,7 @@ class NarrowReading(Reading):
         assert memory.query is not None
         self.model, self.memory, self.query = model, memory, memory.query
         self.choice = cast(SubgoalChoice, model.subgoal)
-        self.said: Tensor | None = None
+        self.chosen: Tensor | None = None
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
         """Append the memory, the text and the copy of the state."""
@@ -118,8 +118,8 @@ class NarrowReading(Reading):
         prefix = prefix.joined(memory.rows(), memory.mask).joined(ask, memory.mask.new_ones(len(own), 1))
         unread, none = prefix.tokens.shape[1], self.choice.score.out_features
         prefix = prefix._replace(asked=slice(unread - 1, unread))
-        said = self.said = self._chosen(prefix) if true is None else torch.where(true < 0, none, true)
-        text, of_text = self.choice.texts(said)
+        chosen = self.chosen = self._chosen(prefix) if true is None else torch.where(true < 0, none, true)
+        text, of_text = self.choice.texts(chosen)
         if self.model.instruction is not None:
             prefix = prefix._replace(instruction=self.model.instruction(text, of_text))
         whole = prefix.joined(text, of_text).joined(own, of_text.new_ones(own.shape[:2]))
@@ -151,8 +151,8 @@ class NarrowReading(Reading):
 
     def shares(self) -> list[Tensor]:
         """Return the share of the chosen text's attention on each memory token."""
-        assert self.said is not None
-        _, real = self.choice.texts(self.said)
+        assert self.chosen is not None
+        _, real = self.choice.texts(self.chosen)
         words, length = real.shape[1], self.memory.mask.shape[1]
         of_prefix, found = self.attention["prefix"], []
         for weights in of_prefix[len(of_prefix) // 2 :]:  # (B, heads, N, N), after the pass that chooses
@@ -166,6 +166,7 @@ class NarrowChannel(MemoryFusion):
     """Choose a text by prefix and memory; actions read only this text (`NarrowReading`)."""
 
     reports_reads = True
+    parts = ("subgoal.",)
 
     def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
         self.model = model
@@ -175,10 +176,6 @@ class NarrowChannel(MemoryFusion):
     def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
         """Begin a pass over this memory; its ``query`` holds the texts to choose from."""
         return NarrowReading(self.model, memory, watched)
-
-    def owns(self, name: str) -> bool:
-        """Return whether a parameter belongs to `SubgoalChoice`."""
-        return name.startswith("subgoal.")
 
 
 class Subgoal(Frames):
