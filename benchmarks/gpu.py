@@ -87,7 +87,7 @@ def equal(size: str, device: str, steps: int) -> dict[str, Any]:
     for place in ("cpu", device):
         torch.manual_seed(0)
         policy = random_policy(config("tiny", device="cpu"))
-        for modulator in policy.model.fusion.modulators:
+        for modulator in policy.model.modulators:
             modulator.modulation.reset_parameters()  # not zero, so that actions depend on the memory
         policy.config.device = place
         policy = policy.to(place).eval()

@@ -36,7 +36,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import CHOICES, M
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep, gathering
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from lerobot_memobench.protocol import CONTROL_HZ, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.training.loop import keep_freed_memory
@@ -136,7 +136,7 @@ def updater(settings: MemobenchMemConfig, steps: int) -> Callable[[], None]:
     rows = EPISODES * SAMPLES
     samples = torch.randint(steps // 3, steps, (EPISODES, SAMPLES)) + torch.arange(EPISODES)[:, None] * steps
     lookup: Any = Recorded(steps, settings.memory_stride or 1)
-    history = GatherMemoryProcessorStep(**gathering(settings)).gather(lookup, samples.flatten().tolist())
+    history = GatherMemoryProcessorStep(config=settings).gather(lookup, samples.flatten().tolist())
     actions = {ACTION: torch.rand(rows, settings.chunk_size, 7)}
     policy = MemobenchMemPolicy(settings)
     return updates(policy, policy_inputs(settings, rows) | actions | history)

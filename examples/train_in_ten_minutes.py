@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
-POLICIES = {"memory": (), "no_memory": ("policy.memory_fusion=none",)}
+POLICIES = {"memory": (), "no_memory": ("policy.memory=none",)}
 """Name -> settings of its training, in addition to the shared ones."""
 
 

@@ -390,7 +390,7 @@ def check_python(line: list[str]) -> None:
     [
         "lerobot eval env=memobench episode=10",
         "lerobot-eval --env.type=memobench --env.tusks=object",
-        "lerobot train policy=memobench_mem memory_frames=3",
+        "lerobot train policy=memobench_mem memory_strides=3",
         "memobench generate --task object",
         "lerobot-dataset-viz --episode 0",
         "memobench no_such",

@@ -49,8 +49,8 @@ def test_ten_minutes_commands_are_valid(tmp_path: Path, monkeypatch: pytest.Monk
     runpy.run_path(str(EXAMPLES / "train_in_ten_minutes.py"), run_name="__main__")
     (tmp_path / "data").mkdir()
     trainings = [line for command, verb, *line in typed if (command, verb) == ("lerobot", "train")]
-    fusions = [read_arguments("train", split_arguments(line)).get("policy.memory_fusion") for line in trainings]
-    assert fusions == [None, "none"]
+    memories = [read_arguments("train", split_arguments(line)).get("policy.memory") for line in trainings]
+    assert memories == [None, "none"]
     evaluations = [line for command, verb, *line in typed if (command, verb) == ("lerobot", "eval")]
     for line in evaluations:
         take_run_options(split_arguments([word for word in line if not word.startswith("policy=")]))
@@ -148,7 +148,7 @@ def test_openpi_server_returns_the_actions_of_the_policy() -> None:
     episodes = [[observation_at(step, rng) for step in range(steps)] for steps in (26, 9)]
     answered = [[remote.select_action(observation) for observation in episode] for episode in episodes]
     server.shutdown()
-    served.policy.config.n_action_steps, served.policy.config.full_chunk_when_stalled = 8, False
+    served.policy.config.n_action_steps = 8
     for episode, actions in zip(episodes, answered, strict=True):
         served.begin()
         local = [served.after(served.policy.select_action(served.before(dict(observation)))) for observation in episode]

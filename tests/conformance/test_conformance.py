@@ -30,7 +30,7 @@ from tests.support.tiny_paligemma import shrink_paligemma
 EXAMPLE = ("policy=window", "policy.width=32", "policy.frames=8", "policy.stride=2")
 MEM = (
     *("policy=memobench_mem", "policy.size=tiny", "policy.perception=objects", "policy.memory_stride=2"),
-    *("policy.memory_frames=8", "policy.chunk_size=4", "policy.num_inference_steps=1"),
+    *("policy.memory_settings={frames: 8}", "policy.chunk_size=4", "policy.num_inference_steps=1"),
 )
 
 

@@ -1,9 +1,11 @@
-"""Alignment objectives against the paper's formulas, written out in numpy with loops."""
+"""Alignment objectives against the paper's formulas, written as loops; levels and shuffling of subgoals."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +13,17 @@ import torch
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import (
+    SHUFFLED_ALONE,
     FramewiseAlignment,
+    WordTextEncoder,
     make_alignment,
     retrieval_accuracy,
+    shuffled_subgoals,
+    text_rows,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import OURS
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.task import LEVELS
 from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, made_for_training
 
@@ -43,7 +50,7 @@ def _pooled(module: torch.nn.Module, memory: torch.Tensor, mask: torch.Tensor) -
 def test_semantic() -> None:
     memory, mask = _inputs()
     text = torch.randn(B, T)
-    module = make_alignment("semantic", D, T, F, P)
+    module = make_alignment("semantic", D, T, P)
     assert module is not None
     z = _pooled(module, memory, mask)
     expected = np.mean([1 - z[b] @ _unit(text[b].numpy()) for b in range(B)])
@@ -54,7 +61,7 @@ def test_contrastive_counts_repeated_subgoals_as_positives() -> None:
     memory, mask = _inputs()
     text = torch.randn(B, T)
     text[3] = 2.5 * text[0]  # the same direction is the same text
-    module = make_alignment("contrastive", D, T, F, P)
+    module = make_alignment("contrastive", D, T, P)
     assert module is not None
     assert module.log_temperature.exp().item() == pytest.approx(0.07)
     module.log_temperature.data.fill_(math.log(0.3))
@@ -72,11 +79,10 @@ def test_contrastive_counts_repeated_subgoals_as_positives() -> None:
     assert module(memory, mask, text).item() == pytest.approx(0.5 * (to_text + to_memory), abs=1e-5)
 
 
-def test_contrastive_of_equal_memories_and_one_text_is_at_rest() -> None:
-    """Were repeats negatives, a batch of one subgoal would push its equal memories about."""
+def test_contrastive_loss_of_equal_memories_has_no_gradient() -> None:
     memory, mask = _inputs()
     memory, mask = memory[:1].expand(B, -1, -1), mask[:1].expand(B, -1)
-    module = make_alignment("contrastive", D, T, F, P)
+    module = make_alignment("contrastive", D, T, P)
     assert module is not None
     loss = module(memory, mask, torch.randn(1, T).expand(B, T))
     loss.backward()
@@ -88,8 +94,8 @@ def test_framewise() -> None:
     memory, mask = _inputs()
     text, text_mask = torch.randn(B, F, T), torch.ones(B, F, dtype=torch.bool)
     text_mask[0, 1] = False
-    text[0, 1] = float("nan")  # a frame without text may hold anything
-    module = make_alignment("framewise", D, T, F, P)
+    text[0, 1] = float("nan")  # the embedding of a frame without text
+    module = make_alignment("framewise", D, T, P)
     assert module is not None
     weight, bias = module.project.weight.detach().numpy(), module.project.bias.detach().numpy()
     above = below = 0.0
@@ -104,6 +110,10 @@ def test_framewise() -> None:
     assert loss.item() == pytest.approx(above / below, abs=1e-5)
     loss.backward()
     assert torch.isfinite(module.project.weight.grad).all()
+    shorter = module.usable(memory, mask, text[:, :2], text_mask[:, :2])
+    text_mask[:, 2] = False
+    assert module(*shorter).item() == pytest.approx(module(memory, mask, text, text_mask).item(), abs=1e-6)
+    assert module(memory, torch.zeros_like(mask), text, text_mask).item() == 0.0
 
 
 def test_framewise_weights() -> None:
@@ -112,17 +122,10 @@ def test_framewise_weights() -> None:
     assert FramewiseAlignment.weights(valid).tolist() == expected
 
 
-def test_nothing_to_align_is_zero_and_not_nan() -> None:
-    memory, mask = _inputs()
-    module = make_alignment("framewise", D, T, F, P)
-    assert module is not None
-    assert module(memory, torch.zeros_like(mask), torch.randn(B, F, T), torch.ones(B, F)).item() == 0.0
-
-
 def test_gradient_reaches_memory() -> None:
     memory, mask = _inputs()
     for name in ("semantic", "contrastive", "framewise"):
-        module = make_alignment(name, D, T, F, P)
+        module = make_alignment(name, D, T, P)
         assert module is not None
         tokens = memory.clone().requires_grad_()
         text = torch.randn(B, F, T) if name == "framewise" else torch.randn(B, T)
@@ -140,10 +143,6 @@ def test_retrieval_accuracy() -> None:
     assert retrieval_accuracy(torch.zeros(0, 3), torch.zeros(0, 3)) == 0.0
 
 
-def test_none_is_no_objective() -> None:
-    assert make_alignment("none", D, T, F, P) is None
-
-
 @pytest.fixture(scope="module")
 def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
@@ -157,12 +156,8 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 @pytest.mark.slow
-def test_every_memory_learns_to_tell_its_subgoal(memory: str, align: str, objects: Path) -> None:
-    """Few updates on one batch: the loss falls, and the weights of what is remembered take part in it.
-
-    The contrastive loss of equal texts cannot come near zero.
-    """
-    fields = {"size": "small", "perception": "objects", "memory_frames": 32}
+def test_every_memory_learns_an_alignment(memory: str, align: str, objects: Path) -> None:
+    fields = {"size": "small", "perception": "objects", "frames": 32}
     policy, before, _, dataset = made_for_training(objects, memory=memory, align=align, **fields)
     batch = before(batch_of(dataset, [10, 30, 50, 56, 75, 90]))
     optimizer, found = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3), []
@@ -172,11 +167,90 @@ def test_every_memory_learns_to_tell_its_subgoal(memory: str, align: str, object
         optimizer.step()
         optimizer.zero_grad()
         found.append(logged)
-    assert found[-1]["align_loss"] < 0.9 * found[0]["align_loss"]
+    assert found[-1]["align_loss"] < 0.9 * found[0]["align_loss"]  # of equal texts it cannot reach zero
     assert all(logged["align_grad_norm"] > 0 for logged in found)
 
 
-@pytest.mark.parametrize("align", ["semantic", "contrastive", "framewise"])
-def test_a_memory_that_reads_the_text_itself_is_not_aligned_with_it(align: str) -> None:
-    with pytest.raises(MemobenchError, match="memory=keyframes learns from that text already"):
-        MemobenchMemConfig(device="cpu", memory="keyframes", align=align)
+# -- subgoals ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("align", "level", "column"),
+    [
+        ("semantic", "coarse", "coarse_subgoal"),
+        ("framewise", "intermediate", "simple_subgoal"),
+        ("semantic", "fine", "grounded_subgoal"),
+    ],
+)
+def test_subgoal_level_chooses_the_column(objects: Path, align: str, level: str, column: str) -> None:
+    fields = {"size": "small", "perception": "objects", "align": align, "subgoal_level": level}
+    _, before, _, dataset = made_for_training(objects, **fields)
+    found = before(batch_of(dataset, [30]))["memory.text"][0]
+    found = found[-1] if align == "framewise" else found
+    torch.testing.assert_close(found, WordTextEncoder(64)([dataset.hf_dataset[30][column]])[0])
+
+
+def test_shuffled_texts_are_those_of_the_batch(objects: Path) -> None:
+    fields = {"size": "small", "perception": "objects", "align": "contrastive"}
+    found = []
+    for shuffle in (False, True):
+        _, before, _, dataset = made_for_training(objects, shuffle_subgoals=shuffle, **fields)
+        batches = [before(batch_of(dataset, [10, 75]))["memory.text"] for _ in range(2)]
+        assert torch.equal(*batches), "equal in every epoch"
+        found.append(batches[0])
+    assert (found[0] != found[1]).any(dim=1).all()
+
+
+def test_shuffled_subgoals_move_within_their_episode() -> None:
+    rows = np.array([0, 0, 1, 2, -1, 5, 5, 7], np.int32)
+    episodes = np.array([0, 5, 7, 8])
+    shuffled, elsewhere = shuffled_subgoals(rows, episodes)
+    assert set(shuffled[:4]) == {0, 1, 2}
+    assert (shuffled[:4] != rows[:4]).all()
+    assert shuffled[4] == -1
+    assert elsewhere == 2, "episodes with one subgoal"
+    assert shuffled[5] == shuffled[6] in {0, 1, 2, 7}
+    assert shuffled[7] in {0, 1, 2, 5}
+    assert shuffled[0] == shuffled[1]
+    assert np.array_equal(shuffled, shuffled_subgoals(rows, episodes)[0])
+    others = [shuffled_subgoals(rows, episodes, seed)[0][:4].tolist() for seed in range(8)]
+    assert len({tuple(other) for other in others}) == 2, "three subgoals can all move in two ways"
+
+
+def most_frequent_share(rows: np.ndarray, shuffled: np.ndarray) -> float:
+    """Return the largest share of a subgoal's frames with one text; 1 if a subgoal is only renamed."""
+    counts = (np.unique(shuffled[rows == row], return_counts=True)[1] for row in np.unique(rows))
+    return float(max(count.max() / count.sum() for count in counts))
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_shuffled_subgoals_are_not_renamed(level: str) -> None:
+    """In all tasks together, and in each task alone; a subgoal is one frame of each episode."""
+    repeats = 60
+    texts = [
+        [checkpoint.language[LEVELS.index(level)] for checkpoint in get_task(name).checkpoints]
+        for name in task_names(suite=None)
+    ]
+    number = {text: row for row, text in enumerate(dict.fromkeys(text for of_task in texts for text in of_task))}
+    own = [[number[text] for text in dict.fromkeys(of_task)] for of_task in texts]
+    assert any(len(rows) < SHUFFLED_ALONE for rows in own)
+
+    def shuffle(tasks: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
+        rows = np.array([row for subgoals in tasks for row in subgoals * repeats])
+        lengths = [len(subgoals) for subgoals in tasks for _ in range(repeats)]
+        return rows, shuffled_subgoals(rows, np.r_[0, np.cumsum(lengths)])[0]
+
+    rows, shuffled = shuffle(own)
+    ends = np.cumsum([repeats * len(subgoals) for subgoals in own])
+    for end, subgoals in zip(ends, own, strict=True):
+        here = slice(end - repeats * len(subgoals), end)
+        assert most_frequent_share(rows[here], shuffled[here]) < 0.7
+        assert len(subgoals) == 1 or most_frequent_share(*shuffle([subgoals])) < 0.75
+
+
+def test_one_subgoal_cannot_be_shuffled() -> None:
+    cache: Any = SimpleNamespace(
+        texts=["put it down"], text_rows=lambda _: np.zeros(5, int), episodes=np.array([0, 5]), root="here"
+    )
+    with pytest.raises(MemobenchError, match="shuffle_subgoals"):
+        text_rows(cache, "coarse", "semantic", True)

@@ -83,7 +83,7 @@ def train(root: Path, out: Path, *flags: str, size: str | None = "tiny") -> Path
     """Train two updates; return the checkpoint."""
     own = [] if size is None else ["--policy.type=memobench_mem", f"--policy.size={size}"]
     own += ["--policy.num_inference_steps=2"] if size == "tiny" else []
-    own += [] if "--policy.memory_fusion=none" in flags else ["--policy.memory_frames=4"]
+    own += [] if "--policy.memory=none" in flags else ["--policy.memory_settings={frames: 4}"]
     usual = [
         *("--dataset.repo_id=somebody/robot", f"--dataset.root={root}", f"--output_dir={out}"),
         *("--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", "--policy.device=cpu"),
@@ -190,7 +190,7 @@ def test_memory_camera_is_an_input() -> None:
 def test_no_memory_makes_no_cache_of_it(size: str, tmp_path: Path) -> None:
     robot = Foreign()
     root = robot.write(tmp_path / "data")
-    policy, *pipelines = loaded(train(root, tmp_path / "run", "--policy.memory_fusion=none", size=size))
+    policy, *pipelines = loaded(train(root, tmp_path / "run", "--policy.memory=none", size=size))
     assert act(robot, policy, *pipelines).isfinite().all()
     # The visual encoder's tokens of present pictures are cached, with or without a memory.
     assert [file.name.split("-")[1] for file in root.glob("feature_cache/*/")] == (

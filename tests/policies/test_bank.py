@@ -1,4 +1,4 @@
-"""MemoryVLA's bank: its formulas, token by token; which entries are merged; what was read of them."""
+"""MemoryVLA's bank: its formulas token by token, merging of entries, and shares of entries."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ D, P, STRIDE, LENGTH, FRAMES = 8, 2, 24, 3, 12
 
 def made(**changed: Any) -> Bank:
     torch.manual_seed(0)
-    spec = MemorySpec(dim=D, tokens=P, width=6, expert=6, frames=32, grid=0, stride=STRIDE)
+    spec = MemorySpec(dim=D, tokens=P, width=6, expert=6, grid=0, stride=STRIDE)
     return Bank(spec, torch.nn.Identity(), read_settings("bank", {"length": LENGTH, **changed})).eval()
 
 
@@ -29,9 +29,6 @@ def written(bank: Bank, frames: Tensor, stride: int = STRIDE) -> Any:
     for number, frame in enumerate(frames.split(1)):
         state = bank.write(state, frame, torch.tensor([number * stride]))
     return state
-
-
-# -- the formulas, literally ------------------------------------------------------------------------------------------
 
 
 def attend(block: Any, asking: Tensor, keys: Tensor, values: Tensor) -> Tensor:
@@ -88,7 +85,7 @@ def literal(bank: Bank, frames: Tensor, present: Tensor) -> tuple[Tensor, dict[s
 
 
 @pytest.mark.parametrize("count", [1, 2, LENGTH, FRAMES])
-def test_it_is_its_formula(count: int) -> None:
+def test_bank_equals_its_formula(count: int) -> None:
     bank = made()
     frames, present = torch.randn(count, P, D), torch.randn(1, P, D)
     with torch.no_grad():
@@ -99,34 +96,24 @@ def test_it_is_its_formula(count: int) -> None:
     kept = min(count, LENGTH)
     assert {name: state[f"{name}_steps"][0, :kept].tolist() for name in steps} == steps
     assert state["count"].tolist() == [kept]
+    if count == FRAMES:
+        assert steps["perceptual"] != steps["cognitive"], "streams merge independently"
 
 
-def test_streams_merge_apart() -> None:
-    with torch.no_grad():
-        state = written(made(), torch.randn(FRAMES, P, D))
-    assert not torch.equal(state["perceptual_steps"], state["cognitive_steps"])
-
-
-# -- what is kept -----------------------------------------------------------------------------------------------------
-
-
-def test_the_most_similar_neighbours_become_one() -> None:
-    """The middle of three, or the last with the new one; a row that is not full keeps all."""
+def test_two_most_similar_neighbours_are_merged() -> None:
+    """Rows: the middle of three; the last with the new entry; and a row that is not full."""
     east, north, west = torch.eye(4)[:3]
     entries = torch.stack([torch.stack([east, north, 2 * north]), torch.stack([east, north, west])])[:, :, None]
     entries = torch.cat([entries, entries[1:] * torch.tensor([1.0, 1.0, 0.0])[None, :, None, None]])
     steps, count, now = torch.tensor([[0.0, 8.0, 16.0]] * 2 + [[0.0, 8.0, 0.0]]), torch.tensor([3, 3, 2]), 24
     kept, times = append(entries, steps, count, (west * 3).expand(3, 1, -1), torch.full((3,), now))
-    assert torch.equal(kept[:, :, 0], torch.stack([
-        torch.stack([east, 1.5 * north, 3 * west]),
-        torch.stack([east, north, 2 * west]),
-        torch.stack([east, north, 3 * west]),
-    ]))  # fmt: skip
+    expected = [[east, 1.5 * north, 3 * west], [east, north, 2 * west], [east, north, 3 * west]]
+    assert torch.equal(kept[:, :, 0], torch.stack([torch.stack(row) for row in expected]))
     assert times.tolist() == [[0, 12, 24], [0, 8, 20], [0, 8, 24]]
 
 
-def test_training_merges_as_a_rollout_does_by_exact_products(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A merge is a choice: rounded products would make another."""
+def test_training_merges_with_exact_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounded products would choose other entries than a rollout."""
     bank, seen = made(), []
     products: Any = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # torch sets it late
     usual, write = products.fp32_precision, bank.write
@@ -146,20 +133,8 @@ def test_training_merges_as_a_rollout_does_by_exact_products(monkeypatch: pytest
     assert seen == ["ieee"] * 5
 
 
-@pytest.mark.parametrize("time_codes", [True, False])
-def test_time_is_told_by_its_codes_alone(time_codes: bool) -> None:
-    bank, frames = made(time_codes=time_codes), torch.randn(LENGTH, P, D)
-    asking = Query(torch.randn(1, P, D))
-    with torch.no_grad():
-        soon, late = (bank.read(written(bank, frames, stride), asking).rows() for stride in (8, 9))
-    assert torch.equal(soon, late) != time_codes
-
-
-# -- what was read ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [2, FRAMES])
-def test_tokens_say_of_which_entries_they_are(count: int) -> None:
+def test_shares_of_entries(count: int) -> None:
     bank = made()
     with torch.no_grad():
         state = written(bank, torch.randn(count, P, D))

@@ -364,7 +364,7 @@ def test_checkpoints_of_earlier_lerobots_are_refused(copied: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "fixed"),
     [
-        *(("memory_frames", 4, True), ("chunk_size", 2, True), ("align", "contrastive", True)),
+        *(("memory_stride", 4, True), ("chunk_size", 2, True), ("align", "contrastive", True)),
         *(("optimizer_lr", 1.0, True), ("n_action_steps", 2, False), ("device", "cpu", False)),
     ],
 )
@@ -379,7 +379,7 @@ def test_settings_of_training_cannot_change_at_evaluation(name: str, value: obje
 
 
 def test_evaluation_refuses_other_settings(memory_policy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for word in ("memory_frames=4", "align=contrastive"):
+    for word in ("memory_stride=4", "align=contrastive"):
         assert f"--policy.{word}" in refused(memory_policy, capsys, "obs_type=both", f"--policy.{word}")
 
 

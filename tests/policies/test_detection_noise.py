@@ -1,4 +1,4 @@
-"""Detection noise: how large it is, and that it is added in training alone."""
+"""Detection noise: its sizes, and that it is added in training only."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ FAR = torch.tensor([[0.0, -0.5, 1.3, 0.0, 0.0, 0.0]])
 
 
 def many(slots: torch.Tensor, hand: torch.Tensor, size: float = 1.0) -> torch.Tensor:
-    """Return what is found of a scene in 500 batches of eight."""
+    """Return the noisy slots of a scene in 150 batches of 24."""
     torch.manual_seed(3)
-    return torch.cat([with_detection_noise(slots.expand(8, -1, -1), hand.expand(8, -1), size) for _ in range(500)])
+    return torch.cat([with_detection_noise(slots.expand(24, -1, -1), hand.expand(24, -1), size) for _ in range(150)])
 
 
 def errors(seen: torch.Tensor, slots: torch.Tensor) -> torch.Tensor:
-    """Return how far things of one each are from where they are found, m, up to 5 cm."""
+    """Return the errors of places of things, m, up to 5 cm."""
     there = field(seen, "present").squeeze(-1) > 0
     kinds, places = field(seen, "class").squeeze(-1)[there], field(seen, "position")[there]
     real = slots[field(slots, "present").squeeze(-1) > 0]
@@ -59,12 +59,12 @@ def errors(seen: torch.Tensor, slots: torch.Tensor) -> torch.Tensor:
     return found[found < 0.05]
 
 
-def test_without_errors_level_things_are_what_they_were() -> None:
+def test_size_zero_changes_nothing() -> None:
     assert torch.equal(with_detection_noise(TABLE, FAR, 0.0), TABLE)
 
 
-def test_things_are_found_as_eyes_find_them() -> None:
-    """Median and 90th percentile of 0.16 and 0.8 cm, found 99 times of 100, as at the moments they were measured."""
+def test_errors_have_the_measured_sizes() -> None:
+    """Median and 90th percentile of 1.6 and 8 mm; 99 of 100 things are found."""
     seen = many(TABLE, FAR)
     median, ninetieth = np.percentile(errors(seen, TABLE), [50, 90])
     assert 0.0013 < median < 0.0025
@@ -74,17 +74,16 @@ def test_things_are_found_as_eyes_find_them() -> None:
     assert found / 4 == pytest.approx(1 - MISSED - KIND_MISSED, abs=0.02)
 
 
-def test_near_the_hand_things_are_found_worse() -> None:
+def test_errors_are_larger_near_the_hand() -> None:
     one = scene(thing("butter", (0.0, 0.1, 0.9)))
     near = torch.tensor([[0.0, 0.1, 0.95, 0.0, 0.0, 0.0]])
     far_off, at_hand = (errors(many(one, hand), one).median() for hand in (FAR, near))
     assert at_hand > 1.3 * far_off
 
 
-def test_what_is_lifted_is_found_too_low() -> None:
-    """Along the third-person camera's line of sight, by up to all of its height."""
-    stands, lifted = (scene(thing("butter", (0.0, 0.1, 0.909 + height))) for height in (0.0, 0.05))
-    off, higher = (errors(many(one, FAR), one).mean() for one in (stands, lifted))
+def test_lifted_things_are_found_too_low() -> None:
+    level, lifted = (scene(thing("butter", (0.0, 0.1, 0.909 + height))) for height in (0.0, 0.05))
+    off, higher = (errors(many(one, FAR), one).mean() for one in (level, lifted))
     assert higher > off + 0.01
     seen = many(lifted, FAR)
     there = (field(seen, "present").squeeze(-1) > 0) & (field(seen, "class").squeeze(-1) == KIND["butter"])
@@ -93,7 +92,7 @@ def test_what_is_lifted_is_found_too_low() -> None:
     assert x / -z == pytest.approx(-0.6586 / (1.6103 - 0.959), rel=0.2)
 
 
-def test_how_things_lie_is_what_eyes_take_them_to() -> None:
+def test_rotations_are_those_that_a_detector_can_see() -> None:
     tilted = (0.0, 0.6, 0.8, 1.0, 0.0, 0.0)  # x axis to the side and up
     behind = (-0.8, 0.6, 0.0, -0.6, -0.8, 0.0)
     slots = scene(
@@ -103,25 +102,25 @@ def test_how_things_lie_is_what_eyes_take_them_to() -> None:
         thing("milk", (-0.1, 0.2, 0.95), tilted),
     )
     axes = field(with_detection_noise(slots, FAR, 0.0), "rotation")[0]
-    told = {name: axes[slots[0, :, 1] == KIND[name]][0].tolist() for name in ("akita_black_bowl", "butter", "drawer")}
-    assert told["akita_black_bowl"] == [1.0, 0.0, 0.0, 0.0, 1.0, 0.0], "round"
-    assert told["butter"] == pytest.approx([0.8, -0.6, 0.0, 0.6, 0.8, 0.0]), "its front away from the robot"
-    assert told["drawer"] == pytest.approx([-0.8, 0.6, 0.0, -0.6, -0.8, 0.0]), "its front to the robot"
+    seen = {name: axes[slots[0, :, 1] == KIND[name]][0].tolist() for name in ("akita_black_bowl", "butter", "drawer")}
+    assert seen["akita_black_bowl"] == [1.0, 0.0, 0.0, 0.0, 1.0, 0.0], "round"
+    assert seen["butter"] == pytest.approx([0.8, -0.6, 0.0, 0.6, 0.8, 0.0])
+    assert seen["drawer"] == pytest.approx([-0.8, 0.6, 0.0, -0.6, -0.8, 0.0])
     milk = axes[slots[0, :, 1] == KIND["milk"]][0]
     assert milk[2] == 0
     assert milk[:2].norm() == pytest.approx(1.0)
 
 
-def test_slots_stay_in_order_and_empty_ones_empty() -> None:
+def test_slots_are_sorted_and_empty_slots_stay_empty() -> None:
     seen = many(TABLE, FAR, 3.0)
     there = field(seen, "present").squeeze(-1) > 0
     assert not seen[~there].any()
-    assert (there.int().diff(dim=1) <= 0).all(), "things first"
+    assert (there.int().diff(dim=1) <= 0).all()
     order = (field(seen, "class").squeeze(-1) + field(seen, "position")[..., 0].clamp(-4, 4) / 10).masked_fill(
         ~there, torch.inf
     )
     assert (order.diff(dim=1).nan_to_num() >= 0).all()
-    assert with_detection_noise(torch.zeros(2, SLOTS, WIDTH), FAR.expand(2, -1), 1.0).eq(0).all(), "of nothing, nothing"
+    assert with_detection_noise(torch.zeros(2, SLOTS, WIDTH), FAR.expand(2, -1), 1.0).eq(0).all()
 
 
 def _batch() -> dict[str, torch.Tensor]:
@@ -129,19 +128,19 @@ def _batch() -> dict[str, torch.Tensor]:
     other = scene(thing("butter", (0.2, 0.1, 0.9)))
     slots = torch.cat([TABLE, TABLE, other]).reshape(3, SIZE)
     found = {OBS_ENV_STATE: slots, OBS_RAW_STATE: FAR.expand(3, -1)}
-    return {**found, FRAMES: ObjectEncoder(classes(), 2, 32).remember(found, [1])}
+    return {**found, FRAMES: ObjectEncoder(classes(), 32).remember(found, [1])}
 
 
-def test_each_frame_of_a_batch_has_one_draw_of_errors() -> None:
+def test_errors_are_drawn_once_per_frame() -> None:
     batch = _batch()
-    perception = ObjectEncoder(classes(), 2, 32, 1.0).train()
+    perception = ObjectEncoder(classes(), 32, 1.0).train()
     first, second = perception.observed(batch), perception.observed(batch)
     for seen in (first, second):
         present = seen[OBS_ENV_STATE]
         assert torch.equal(present[0], present[1])
         assert torch.equal(present[0], seen[FRAMES][0, 0, :SIZE])
-        assert torch.equal(seen[FRAMES][0, 0, SIZE:], batch[FRAMES][0, 0, SIZE:]), "hand and phase are known"
-        assert torch.equal(seen[EXACT], batch[FRAMES]), "labels are of what there was"
+        assert torch.equal(seen[FRAMES][0, 0, SIZE:], batch[FRAMES][0, 0, SIZE:])
+        assert torch.equal(seen[EXACT], batch[FRAMES])
         assert not (present == batch[OBS_ENV_STATE]).all(dim=1).any()
     assert not torch.equal(first[FRAMES], second[FRAMES])
     without = {name: one for name, one in batch.items() if name != FRAMES}
@@ -149,14 +148,13 @@ def test_each_frame_of_a_batch_has_one_draw_of_errors() -> None:
 
 
 @pytest.mark.parametrize(("noise", "learns"), [(1.0, False), (0.0, True)])
-def test_only_what_learns_with_errors_sees_them(noise: float, learns: bool) -> None:
+def test_noise_is_added_in_training_only(noise: float, learns: bool) -> None:
     batch = _batch()
-    assert ObjectEncoder(classes(), 2, 32, noise).train(learns).observed(batch) is batch
+    assert ObjectEncoder(classes(), 32, noise).train(learns).observed(batch) is batch
 
 
 @pytest.mark.parametrize("memory", ["bank", "motion"])
-def test_one_detector_looks_at_a_training_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, memory: str) -> None:
-    """Sixteen samples of frame 16, read with what came before: each frame is drawn once, the present ones too."""
+def test_frames_share_their_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, memory: str) -> None:
     drawn: list[int] = []
 
     def counted(slots: torch.Tensor, hand: torch.Tensor, size: float) -> torch.Tensor:
@@ -164,7 +162,7 @@ def test_one_detector_looks_at_a_training_batch(tmp_path: Path, monkeypatch: pyt
         return with_detection_noise(slots, hand, size)
 
     monkeypatch.setattr(objects, "with_detection_noise", counted)
-    settings = {"size": "small", "perception": "objects", "memory_frames": 32, "memory_stride": 8}
+    settings = {"size": "small", "perception": "objects", "memory_stride": 8}
     policy, before, _, dataset = made_for_training(
         make_object_dataset(tmp_path / "data"), memory=memory, detection_noise=1.0, **settings
     )

@@ -1,4 +1,4 @@
-"""Fast weights: the inner step is autograd's, each row, head and token by the formula; what a chunk reads."""
+"""Fast weights: the inner step equals autograd's, and the outputs that a chunk reads."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from lerobot_memobench.policies.memobench_mem.memory.fast_weights import (
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories, MemorySpec
 
-SPEC = MemorySpec(dim=12, tokens=3, width=12, expert=16, frames=32, grid=0, stride=16)
+SPEC = MemorySpec(dim=12, tokens=3, width=12, expert=16, grid=0, stride=16)
 
 
 def made(std: float = 0.5, **changed: Any) -> FastWeights:
-    """Build one in float64, whose weights are large enough to matter."""
+    """Build a mechanism in float64 with large weights."""
     torch.manual_seed(0)
     mechanism = FastWeights(SPEC, torch.nn.Identity(), read_settings("fast_weights", changed)).double()
     for name, weight in mechanism.named_parameters():
@@ -34,7 +34,7 @@ def made(std: float = 0.5, **changed: Any) -> FastWeights:
 
 
 def normed(x: Tensor, norm: torch.nn.LayerNorm) -> Tensor:
-    """Return a vector (D,) as `norm` leaves it."""
+    """Return the layer norm of a vector (D,)."""
     return (x - x.mean()) / (x.var(unbiased=False) + 1e-6).sqrt() * norm.weight + norm.bias
 
 
@@ -76,8 +76,8 @@ def written(
 
 
 @pytest.mark.parametrize("std", [0.5, 1.5])
-def test_weights_are_written_by_the_formula(std: float) -> None:
-    """The inner loss is minimised by autograd here, token by token; with large weights steps are shortened."""
+def test_weights_equal_their_formula(std: float) -> None:
+    """Autograd computes the step on the inner loss here; with large weights steps are shortened."""
     mechanism, count = made(std), FRAMES_READ + 2
     frames, steps = torch.randn(count, 2, 3, 12, dtype=torch.float64), torch.arange(count) * 16
     with torch.no_grad():
@@ -103,7 +103,7 @@ def test_weights_are_written_by_the_formula(std: float) -> None:
     assert (shortened > 0) == (std > 1)
 
 
-def test_the_first_frames_are_read_alone() -> None:
+def test_missing_frames_are_masked() -> None:
     mechanism = made()
     state = mechanism.write(mechanism.init(1), torch.randn(1, 3, 12, dtype=torch.float64), torch.tensor([0]))
     read = mechanism.read(state)
@@ -112,16 +112,16 @@ def test_the_first_frames_are_read_alone() -> None:
 
 
 def test_gradients_pass_through_the_weights() -> None:
-    """A frame that no chunk reads any more still learns, by what it wrote; one behind the bound does not."""
+    """A frame whose output is dropped still gets a gradient by the weights, up to ``gradient_frames``."""
     mechanism, count = made(gradient_frames=10), 13
     frames = torch.randn(count, 3, 12, dtype=torch.float64, requires_grad=True)
     histories = Histories(frames, torch.arange(count) * 16, torch.arange(count)[None])
-    mechanism.replay(histories).each[:, -3:].square().sum().backward()  # of the last frame alone
+    mechanism.replay(histories).each[:, -3:].square().sum().backward()  # of the last frame
     assert frames.grad is not None
     assert frames.grad.flatten(1).any(dim=1).tolist() == [False] * 3 + [True] * 10
 
 
-def test_the_rate_begins_at_its_base() -> None:
+def test_initial_rate() -> None:
     torch.manual_seed(0)
     mechanism = FastWeights(SPEC, torch.nn.Identity(), read_settings("fast_weights", {}))
     assert softplus(mechanism.rate.bias).tolist() == pytest.approx([BASE_RATE] * HEADS)

@@ -30,7 +30,12 @@ def start(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = TrainPipelineConfig(
         dataset=DatasetConfig(repo_id="memobench/synthetic", root=str(dataset_root)),
         policy=MemobenchMemConfig(
-            device="cpu", push_to_hub=False, chunk_size=6, n_action_steps=6, num_inference_steps=2, memory_frames=8
+            device="cpu",
+            push_to_hub=False,
+            chunk_size=6,
+            n_action_steps=6,
+            num_inference_steps=2,
+            memory_settings={"frames": 8},
         ),
         output_dir=out,
         steps=1,
@@ -113,17 +118,17 @@ def test_settings_that_saved_processors_lack_are_refused(go_on: Any, start: Path
         MemobenchMemPolicy.from_pretrained(start, config=config)
 
 
-@pytest.mark.parametrize("memory_fusion", ["modulation", "none"])
-def test_adapters_leave_memory_and_heads_whole(dataset_root: Path, memory_fusion: str, tmp_path: Path) -> None:
-    align = "none" if memory_fusion == "none" else "contrastive"
-    policy, before, _, dataset = made_for_training(dataset_root, memory_fusion=memory_fusion, align=align)
+@pytest.mark.parametrize("memory", ["frames", "none"])
+def test_adapters_leave_memory_and_heads_whole(dataset_root: Path, memory: str, tmp_path: Path) -> None:
+    align = "none" if memory == "none" else "contrastive"
+    policy, before, _, dataset = made_for_training(dataset_root, memory=memory, align=align)
     names = policy._get_default_peft_targets()["modules_to_save"]  # peft compares the ends of names
     modules = [name for name, _ in policy.named_modules() if any(name.endswith(end) for end in names)]
     whole = {name for name, _ in policy.named_parameters() if any(name.startswith(f"{one}.") for one in modules)}
     own = {f"model.{name}" for name in policy.model.memory_parameters()}
     assert whole == own | {name for name, _ in policy.named_parameters() if name.startswith("alignment.")}
-    assert bool(whole) == (memory_fusion != "none")
-    if memory_fusion == "none":
+    assert bool(whole) == (memory != "none")
+    if memory == "none":
         return
     policy.save_pretrained(tmp_path)
     policy.config.pretrained_path = str(tmp_path)
@@ -132,6 +137,6 @@ def test_adapters_leave_memory_and_heads_whole(dataset_root: Path, memory_fusion
     loss, _ = wrapped.forward(before(batch_of(dataset, [3, 50, 80])))
     loss.backward()
     learning = {name for name, p in wrapped.named_parameters() if p.requires_grad and p.grad is not None}
-    for part in ("lora_A", "model.memory.", "modulator", "memory_to_expert", "alignment"):
+    for part in ("lora_A", "model.memory.", "modulators", "memory_to_expert", "alignment"):
         assert any(part in name for name in learning), part
     assert begin_average(policy) is None

@@ -1,4 +1,4 @@
-"""pi0.5 with its memory, really run: at full size (slow, 24 GiB), and by the same steps at the small one."""
+"""pi0.5 with its memory is built, plans and trains: at full size (slow, 24 GiB) and at the tiny size."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.rollout import Row
+from tests.support.small_policy import draw_modulation
 
 CAMERA = "observation.images.image"
 FRAMES, PROMPT, CHUNK = 32, 60, 50
@@ -28,7 +29,7 @@ MACHINE_GIB = 24
 
 
 def _config(size: str) -> MemobenchMemConfig:
-    """The VLM frozen, bfloat16; 32 frames are remembered."""
+    """Return a configuration with a frozen VLM in bfloat16."""
     config = MemobenchMemConfig(size=size, device="cpu", push_to_hub=False, dtype="bfloat16", train_expert_only=True)
     side = config.image_size[0]
     config.input_features = {
@@ -40,7 +41,7 @@ def _config(size: str) -> MemobenchMemConfig:
 
 
 def _batch(config: MemobenchMemConfig) -> dict[str, Tensor]:
-    """One preprocessed training sample whose memory is full."""
+    """Return one preprocessed training sample with a full memory."""
     torch.manual_seed(1)
     length = config.tokenizer_max_length
     assert length is not None
@@ -59,17 +60,18 @@ def _batch(config: MemobenchMemConfig) -> dict[str, Tensor]:
 
 
 def _lerobots(policy: MemobenchMemPolicy) -> PI05Pytorch | MemoryPI05:
-    """LeRobot's own model over the policy's weights: a second set would not fit."""
+    """Return LeRobot's model with the policy's weights; a second copy would not fit into memory."""
     config = policy.config
     with torch.device("meta"):
         if config.size == "pi05":
             theirs = PI05Pytorch(PI05Config(device="cpu", dtype="bfloat16", train_expert_only=True))
         else:
-            theirs = MemoryPI05(dataclasses.replace(config, memory_fusion="none", align="none"))
+            without = {"memory": "none", "memory_fusion": None, "memory_settings": {}, "memory_stride": None}
+            theirs = MemoryPI05(dataclasses.replace(config, align="none", **without))  # type: ignore[arg-type]
     own = dict(policy.model.named_parameters())
     for path, module in theirs.named_modules():
         for key, wanted in list(module.named_parameters(recurse=False)):
-            ours = own[policy.model.place_of(f"{path}.{key}")]
+            ours = own[f"{path}.{key}"]
             assert (ours.dtype, ours.shape) == (wanted.dtype, wanted.shape), f"{path}.{key}"
             setattr(module, key, ours)
     fill_buffers(theirs, torch.device("cpu"))
@@ -105,7 +107,7 @@ def _equals_lerobots(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> No
 
 
 def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:
-    """The actions planned in the middle of an episode of which 32 frames are remembered."""
+    """Return a plan in the middle of an episode with 32 remembered frames."""
     seen = _memory(batch)
     kept = [Frame(int(step), stored) for step, stored in zip(seen.steps, seen.frames, strict=True)]
     policy.reset()
@@ -118,11 +120,8 @@ def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:
 
 
 def _step(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> None:
-    """One update of memory and action expert; the gradients stay."""
-    with torch.no_grad():
-        for name, parameter in policy.named_parameters():
-            if ".modulation." in name:
-                parameter.normal_(std=0.02)  # at zero, the encoder behind it would get no gradient
+    """Update memory and action expert once, and keep the gradients."""
+    draw_modulation(policy, std=0.02)
     policy.train()
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     loss, _ = policy.forward(batch)
@@ -133,8 +132,8 @@ def _step(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> None:
 
 
 def _group(name: str) -> str:
-    """Which of the trained parts a parameter belongs to."""
-    for part, word in (("modulators", ".modulator."), ("expert", ".gemma_expert."), ("memory", "model.memory")):
+    """Return the part of the model that a parameter belongs to."""
+    for part, word in (("modulators", "modulators."), ("expert", ".gemma_expert."), ("memory", "model.memory")):
         if word in name:
             return part
     return "projections of actions and time"
@@ -145,8 +144,8 @@ def _peak_gib() -> float:
 
 
 @pytest.mark.parametrize("size", ["tiny", pytest.param("pi05", marks=pytest.mark.slow)])
-def test_it_is_built_equals_pi05_plans_and_trains(size: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """One test, because two workers would hold two policies. Prints seconds and peak memory of each part."""
+def test_policy_equals_pi05_plans_and_trains(size: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """One test, so that only one worker holds the policy. Prints seconds and peak memory of each part."""
     started, found = time.perf_counter(), []
 
     def note(what: str) -> None:

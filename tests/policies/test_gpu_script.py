@@ -1,4 +1,4 @@
-"""``benchmarks/gpu.py`` on a CPU: it ends with a table, and goes on where it ended."""
+"""``benchmarks/gpu.py`` on a CPU prints a table and resumes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
-def test_every_part_runs_at_the_tiny_size_and_is_measured_once(tmp_path: Path) -> None:
+def test_parts_are_measured_once(tmp_path: Path) -> None:
     out = tmp_path / "gpu.jsonl"
     parts = ["equal", "plan", "update", "update, DDP of one"]
     command = [sys.executable, "benchmarks/gpu.py", "--size", "tiny", "--device", "cpu", "--steps", "1"]
@@ -27,8 +27,8 @@ def test_every_part_runs_at_the_tiny_size_and_is_measured_once(tmp_path: Path) -
 
     ran(*parts[:1])
     out.write_text(out.read_text() + '{"part": "pl')  # cut off by a kill
-    said = ran(*parts)
-    found = [json.loads(line) for line in said if line.startswith("{")]
-    assert [line["part"] for line in found] == parts[1:], "the first one was there"
+    printed = ran(*parts)
+    found = [json.loads(line) for line in printed if line.startswith("{")]
+    assert [line["part"] for line in found] == parts[1:]
     assert not any("error" in line for line in found)
-    assert sum(line.startswith("| ") for line in said) == 2 + len(parts)
+    assert sum(line.startswith("| ") for line in printed) == 2 + len(parts)

@@ -37,23 +37,23 @@ def pi05(**memory: Any) -> Any:
     return PI05Policy(PI05Config(**FEATURES, **SIZES, **MEMORY, **memory))
 
 
-def test_it_trains_on_our_data_and_rolls_out(tmp_path: Path) -> None:
+def test_training_and_rollout(tmp_path: Path) -> None:
     data = tmp_path / "data"
     assert memobench(["generate", "--tasks", TASK, "--episodes", "1", "--out", str(data)]) == 0
     words = {**SIZES, **MEMORY, "use_visual_memory": "true", "tokenizer_max_length": 64}
     train_and_roll_out(data, tmp_path, "policy=pi05", *(f"policy.{name}={value}" for name, value in words.items()))
 
 
-def test_a_picture_of_every_control_step_is_drawn_for_it() -> None:
+def test_visual_memory_needs_every_picture() -> None:
     check(pi05(use_visual_memory=True), execution, range(STEPS))
 
 
-def test_a_history_of_states_needs_no_picture_between_two_chunks() -> None:
+def test_memory_of_states_needs_no_pictures() -> None:
     check(pi05(use_proprioceptive_memory=True), execution, range(0, STEPS, PLAN))
 
 
 def histories(policy: Any, rows: Sequence[Row], of: slice = slice(None)) -> list[Tensor]:
-    """Return the pictures (rows, frames, C, H, W) that the policy is given at each step of some rows."""
+    """Return the policy's pictures (rows, frames, C, H, W) at each step of some rows."""
     policy.reset()
     found = []
     for time in range(STEPS):
@@ -62,8 +62,7 @@ def histories(policy: Any, rows: Sequence[Row], of: slice = slice(None)) -> list
     return found
 
 
-def test_a_row_of_a_batch_has_the_history_that_it_has_alone() -> None:
-    """In a rollout of LeRobot's, which forgets once and then begins all rows."""
+def test_rows_have_independent_histories() -> None:
     policy, rows = pi05(use_visual_memory=True), execution(0)
     both = histories(policy, rows)
     for row in range(len(rows)):

@@ -1,4 +1,4 @@
-"""A policy that says it does not look at the next observation acts the same whatever pictures that one holds."""
+"""`needs_observation`: observations that a policy does not need have no effect on its actions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Row = tuple[int, int]
 
 
 def observation(rows: Sequence[Row], time: int, **more: Any) -> dict[str, Any]:
-    """What LeRobot's loop hands a policy; other pictures at each step."""
+    """Return an observation as LeRobot's loop does, with new pictures at each step."""
     generator = torch.Generator().manual_seed(time)
     return {
         **{key: torch.rand(len(rows), 3, 96, 96, generator=generator) for key in CAMERAS},
@@ -53,9 +53,11 @@ def observation(rows: Sequence[Row], time: int, **more: Any) -> dict[str, Any]:
 def acted(
     policy: Any, clock: Callable[[int], Sequence[Row]], blind: bool, before: Callable[[Any], Any] = lambda batch: batch
 ) -> tuple[Tensor, list[int]]:
-    """Return a rollout's actions (time, rows, 7), and when the policy looked; what it does not look at is nonsense.
+    """Return a rollout's actions (time, rows, 7), and the times of needed observations.
 
-    As the environment does it, the first frame of an episode and that of its execution are shown in any case.
+    Args:
+        blind: replace pictures that are not needed by NaN. The first frames of an episode and of its execution are
+            always shown.
     """
     torch.manual_seed(0)
     policy.reset()
@@ -84,12 +86,12 @@ def check(policy: Any, clock: Callable[[int], Sequence[Row]], looked: Sequence[i
 
 
 def execution(time: int) -> list[Row]:
-    """Two environments that act at once."""
+    """Return the clocks of two environments without prompt."""
     return [(time, 1), (time, 1)]
 
 
 def prompts(time: int) -> list[Row]:
-    """Two environments with prompts of 3 and 5 steps, of which the first ends at step 8."""
+    """Return the clocks of two environments with prompts of 3 and 5 steps; the first ends at step 8."""
     return [(min(time, 8), int(time >= 3)), (time, int(time >= 5))]
 
 
@@ -138,8 +140,7 @@ def test_smolvla(tiny_smolvlm: Path) -> None:  # noqa: F811 - the fixture
     check(policy, execution, EVERY_PLAN)
 
 
-def test_diffusion_looks_at_every_step() -> None:
-    """It keeps pictures of two steps: what it saw last but one is part of a plan."""
+def test_diffusion_needs_every_observation() -> None:
     from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
@@ -149,25 +150,25 @@ def test_diffusion_looks_at_every_step() -> None:
     assert acted(policy, execution, blind=True)[1] == list(range(STEPS))
 
 
-def test_who_acts_in_a_way_of_its_own_always_looks() -> None:
+def test_unknown_policies_need_every_observation() -> None:
     class Watchful(type(act())):  # type: ignore[misc]
         def select_action(self, batch: dict[str, Tensor]) -> Tensor:
             return super().select_action(batch)  # type: ignore[no-any-return]
 
     policy = act()
-    assert not looking_after_a_plan(policy)
+    assert not needs_after_a_plan(policy)
     policy.__class__ = Watchful
-    assert looking_after_a_plan(policy)
+    assert needs_after_a_plan(policy)
     assert needs_observation(object())()
 
 
-def looking_after_a_plan(policy: Any) -> bool:
+def needs_after_a_plan(policy: Any) -> bool:
     policy.reset()
     policy.select_action(observation(execution(0), 0))
     return needs_observation(policy)()
 
 
-def test_the_expert_and_the_random_policy_never_look() -> None:
+def test_baselines_need_no_observations() -> None:
     check(MemobenchExpertPolicy(MemobenchExpertConfig()), prompts, [0, 3, 5])
     policy = MemobenchRandomPolicy(MemobenchRandomConfig())
     assert acted(policy, prompts, blind=True)[1] == [0, 3, 5]
@@ -177,15 +178,14 @@ def test_the_expert_and_the_random_policy_never_look() -> None:
     ("fields", "looked"),
     [
         ({"memory_stride": 1}, range(STEPS)),
-        # Every fourth frame is remembered. Plans begin at 3 and 5, the first frames of execution, and last three steps.
-        # At 9 row 0 would plan again: that its episode has ended is known only then.
+        # Every fourth frame is remembered. Plans begin at 3 and 5 and last three steps; row 0 would replan at 9.
         ({"memory_stride": 4}, [0, 3, 4, 5, 6, 8, 9]),
-        ({"memory_fusion": "none"}, [0, 3, 5, 6, 8, 9]),
+        ({"memory": "none"}, [0, 3, 5, 6, 8, 9]),
     ],
     ids=["stride1", "stride4", "none"],
 )
-def test_a_memory_looks_at_what_it_stores_and_plans_from(
-    fields: dict[str, Any], looked: Sequence[int], dataset_root: Path, tmp_path: Path
+def test_memory_needs_stored_frames_and_plans(
+    fields: dict[str, Any], looked: Sequence[int], dataset_root: Path
 ) -> None:
     policy, before, _, _ = made_for_training(dataset_root, n_action_steps=PLAN, **fields)
     check(policy, prompts, looked, before=before)
@@ -201,7 +201,7 @@ def test_a_memory_looks_at_what_it_stores_and_plans_from(
     ],
     ids=["openpi", "openpi-blind", "robomme", "robomme-blind"],
 )
-def test_a_server_is_sent_what_it_is_asked_about(fields: dict[str, Any], looked: Sequence[int]) -> None:
+def test_servers_get_needed_observations(fields: dict[str, Any], looked: Sequence[int]) -> None:
     with PolicyServer(counting) as one, PolicyServer(counting) as other:
         servers = f"127.0.0.1:{one.port},127.0.0.1:{other.port}"
         policy = make(one, servers=servers, n_action_steps=PLAN, **fields)

@@ -1,4 +1,4 @@
-"""The network: LeRobot's numbers at tiny dimensions, modulation by memory, the image tower."""
+"""The network: equality with LeRobot's pi0.5, modulation by memory, the image tower."""
 
 from __future__ import annotations
 
@@ -20,14 +20,13 @@ from lerobot_memobench.policies.memobench_mem.passes import adaptive_norms
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from tests.support.lerobots_passes import lerobots_passes
 from tests.support.memory import histories
-from tests.support.small_policy import small_config
+from tests.support.small_policy import draw_modulation, small_config
 
 CHUNK, BATCH, FRAMES = 6, 2, 5
 
 
 def _config(**fields: object) -> MemobenchMemConfig:
-    frames = {} if fields.get("memory_fusion") == "none" else {"memory_frames": FRAMES}
-    return small_config(**frames, **fields)
+    return small_config(frames=FRAMES, **fields)  # type: ignore[arg-type]
 
 
 def _inputs(config: MemobenchMemConfig, device: str = "cpu", batch: int = BATCH) -> dict[str, object]:
@@ -83,26 +82,18 @@ def _pair(memory_fusion: str = "modulation") -> tuple[MemoryPI05, MemoryPI05]:
     """LeRobot's model at tiny dimensions with random weights, and the memory model with the same weights."""
     config = _config(memory_fusion=memory_fusion)
     torch.manual_seed(0)
-    plain, ours = MemoryPI05(_config(memory_fusion="none")).eval(), MemoryPI05(config).eval()
+    plain, ours = MemoryPI05(_config(memory="none")).eval(), MemoryPI05(config).eval()
     with torch.no_grad():
         for parameter in plain.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))  # some of pi0.5's start at zero and hide errors
+            parameter.add_(0.05 * torch.randn_like(parameter))  # zeros would hide errors
     weights = plain.state_dict()
-    missing, unexpected = ours.load_state_dict(
-        {
-            name.replace("post_attention_layernorm.", "post_attention_layernorm.norm.")
-            if ".gemma_expert." in name and memory_fusion == "modulation"
-            else name: tensor
-            for name, tensor in weights.items()
-        },
-        strict=False,
-    )
+    missing, unexpected = ours.load_state_dict(weights, strict=False)
     assert not unexpected
     assert set(missing) <= set(ours.memory_parameters())
     return plain, ours
 
 
-def test_without_modulation_the_policy_is_pi05_output_for_output() -> None:
+def test_initial_policy_equals_pi05() -> None:
     plain, ours = _pair()
     inputs = _inputs(ours.config)
     memory = _read(ours, *_memory(ours.config))
@@ -113,21 +104,21 @@ def test_without_modulation_the_policy_is_pi05_output_for_output() -> None:
 @pytest.mark.parametrize(
     "fields",
     [
-        {"memory_fusion": "none"},
+        {"memory": "none"},
         {"memory_fusion": "modulation"},
         {"memory_fusion": "context"},
         {"memory": "motion", "perception": "objects", "size": "small", "objective": "flow_matching"},
-        {"memory_fusion": "none", "size": "small", "perception": "objects", "objective": "flow_matching"},
+        {"memory": "none", "size": "small", "perception": "objects", "objective": "flow_matching"},
     ],
 )
-def test_passes_are_lerobots_to_rounding(fields: dict[str, object]) -> None:
+def test_passes_equal_lerobots(fields: dict[str, object]) -> None:
     """Losses, gradients and actions of LeRobot's own passes over the same weights."""
     torch.manual_seed(0)
     ours = MemoryPI05(small_config(**fields)).train()
     with torch.no_grad():
         for name, parameter in ours.named_parameters():
             if "vision_tower" not in name:
-                parameter.add_(0.05 * torch.randn_like(parameter))  # some start at zero and hide errors
+                parameter.add_(0.05 * torch.randn_like(parameter))  # zeros would hide errors
     inputs = _inputs(ours.config)
     if ours.state_token is not None:
         shown = torch.arange(SLOTS) < torch.tensor([[5], [3]])
@@ -150,57 +141,33 @@ def test_passes_are_lerobots_to_rounding(fields: dict[str, object]) -> None:
         expected = [theirs.sample_actions(**observed), *gradients(theirs.forward(**inputs))]
     assert sum(one is not None for one in found) > 20
     for one, other in zip(found, expected, strict=True):
-        if one is None:  # last states of the prefix, which none reads
+        if one is None:  # unread last states of the prefix
             assert other is None or not other.any()
         else:
             torch.testing.assert_close(one, other, rtol=1e-3, atol=2e-6)
 
 
-def test_modulation_reaches_both_paths() -> None:
-    plain, ours = _pair()
-    with torch.no_grad():
-        for name, parameter in ours.memory_parameters().items():
-            if ".modulation." in name:
-                parameter.normal_(std=0.2)
-    inputs = _inputs(ours.config)
-    tokens, steps, mask = _memory(ours.config)
-    memory = _read(ours, tokens, steps, mask)
-    losses, actions = _losses(ours, inputs, memory), _actions(ours, inputs, memory)
-    assert not torch.allclose(losses, _losses(plain, inputs))
-    assert not torch.allclose(actions, _actions(plain, inputs))
-    # Padding says nothing, real tokens and their times do.
-    changed = torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0))
-    torch.testing.assert_close(_actions(ours, inputs, _read(ours, changed, steps, mask)), actions)
-    assert not torch.allclose(_actions(ours, inputs, _read(ours, tokens, steps + 40, mask)), actions)
-
-
 @pytest.mark.parametrize("memory_fusion", ["modulation", "context"])
-def test_all_masked_memory_is_finite(memory_fusion: str) -> None:
-    _, ours = _pair(memory_fusion)
-    ours.train()
+def test_memory_changes_actions_and_padding_does_not(memory_fusion: str) -> None:
+    plain, ours = _pair(memory_fusion)
+    draw_modulation(ours)
     inputs = _inputs(ours.config)
     tokens, steps, mask = _memory(ours.config)
-    memory = _read(ours, tokens, steps, torch.zeros_like(mask))
-    loss = _losses(ours, inputs, memory).mean()
-    loss.backward()
-    assert torch.isfinite(loss)
+    actions = _actions(ours, inputs, _read(ours, tokens, steps, mask))
+    assert not torch.allclose(actions, _actions(plain, inputs))
+    padded = torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0))
+    torch.testing.assert_close(_actions(ours, inputs, _read(ours, padded, steps, mask)), actions)
+    for other in (_read(ours, -tokens, steps, mask), _read(ours, tokens, steps + 40, mask)):
+        assert not torch.allclose(_actions(ours, inputs, other), actions)
+    memory = _read(ours.train(), tokens, steps, torch.zeros_like(mask))  # fully masked
+    _losses(ours, inputs, memory).mean().backward()
     assert all(torch.isfinite(p.grad).all() for p in ours.parameters() if p.grad is not None)
     assert torch.isfinite(_actions(ours, inputs, memory)).all()
 
 
-def test_context_memory_joins_the_prefix_and_padding_says_nothing() -> None:
-    _, ours = _pair("context")
-    inputs = _inputs(ours.config)
-    tokens, steps, mask = _memory(ours.config)
-    actions = _actions(ours, inputs, _read(ours, tokens, steps, mask))
-    padded = torch.where(mask[:, :, None, None], tokens, torch.full_like(tokens, 50.0))
-    torch.testing.assert_close(_actions(ours, inputs, _read(ours, padded, steps, mask)), actions)
-    assert not torch.allclose(_actions(ours, inputs, _read(ours, -tokens, steps, mask)), actions)
-
-
 @pytest.mark.parametrize("few", [0, 99])
 def test_heads_share_keys(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scores that are kept, and torch's kernel: what is read, and every gradient, is that of each head by itself."""
+    """Attention with stored scores and by torch's kernel equals attention per head, with its gradients."""
     monkeypatch.setattr(layers, "FEW_KEYS", few)
     torch.manual_seed(0)
     parts = [torch.randn(shape, requires_grad=True) for shape in ((2, 5, 8, 4), (2, 7, 4), (2, 7, 4))]
@@ -218,15 +185,15 @@ def test_heads_share_keys(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_passes_are_captured_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a break, by a backend that needs no compiler: actions and gradients are the same."""
+def test_passes_compile_without_graph_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
     original = torch.compile
     monkeypatch.setattr(torch, "compile", lambda part, mode, **how: original(part, backend="aot_eager", **how))
     network.compiled.cache_clear()
     found = []
     for compiles in (False, True):
         torch.manual_seed(0)
-        ours = MemoryPI05(_config(compile_model=compiles, open_gate=True))
+        ours = MemoryPI05(_config(compile_model=compiles))
+        draw_modulation(ours)
         inputs = _inputs(ours.config)
         with torch.no_grad():
             memory = _read(ours, *_memory(ours.config))
@@ -239,7 +206,7 @@ def test_passes_are_captured_whole(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.testing.assert_close(plain, captured, rtol=1e-4, atol=1e-6)
 
 
-def test_the_instruction_conditions_the_experts_norms_and_its_padding_does_not() -> None:
+def test_instruction_conditions_norms_without_its_padding() -> None:
     config = _config(size="small", perception="objects")
     torch.manual_seed(0)
     model = MemoryPI05(config)
@@ -255,35 +222,29 @@ def test_the_instruction_conditions_the_experts_norms_and_its_padding_does_not()
         (modulation, *_) = model.modulations(torch.ones(2), prefix.instruction, reading)
         return modulation.flatten(1)
 
-    told = condition(tokens)
-    assert torch.equal(told, condition(torch.where(short, tokens, 3)))
+    found = condition(tokens)
+    assert torch.equal(found, condition(torch.where(short, tokens, 3)))
     other = condition(torch.where(torch.arange(12) == 4, tokens + 1, tokens))
-    assert (other != told).any(dim=1).all()
+    assert (other != found).any(dim=1).all()
 
 
-def test_gradients_reach_memory_expert_and_vlm_but_not_the_tower() -> None:
+def test_gradients_reach_all_but_the_tower() -> None:
     _, ours = _pair()
-    with torch.no_grad():
-        for name, parameter in ours.memory_parameters().items():
-            if ".modulation." in name:
-                parameter.normal_(std=0.2)
+    draw_modulation(ours)
     ours.train()
     _losses(ours, _inputs(ours.config), _read(ours, *_memory(ours.config))).mean().backward()
     with_gradient = {name for name, p in ours.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
     trained = {name for name, p in ours.named_parameters() if p.requires_grad}
-    # The last layer of the language model is only read through its keys and values.
+    # Only keys and values of the language model's last layer are read.
     idle = trained - with_gradient
     last = f"language_model.layers.{ours.config.dimensions.vlm.depth - 1}."
     assert all(last in name or "language_model.norm" in name for name in idle), idle
     assert not any("vision_tower" in name or "multi_modal_projector" in name for name in trained)
 
 
-def test_gradient_checkpointing_gives_the_same_gradients() -> None:
+def test_gradient_checkpointing_keeps_gradients() -> None:
     _, ours = _pair()
-    with torch.no_grad():
-        for name, parameter in ours.memory_parameters().items():
-            if ".modulation." in name:
-                parameter.normal_(std=0.2)
+    draw_modulation(ours)
     ours.train()
 
     def gradients() -> list[torch.Tensor]:
@@ -297,20 +258,16 @@ def test_gradient_checkpointing_gives_the_same_gradients() -> None:
         torch.testing.assert_close(a, b)
 
 
-def test_full_size_is_pi05_plus_the_stated_memory() -> None:
+def test_full_size_is_pi05_plus_the_memory() -> None:
     config = MemobenchMemConfig(size="pi05", device="cpu")
     with torch.device("meta"):
         ours = MemoryPI05(config)
         lerobots = PI05Pytorch(PI05Config(device="cpu"))
     memory = ours.memory_parameters()
-    own = {
-        name.replace("post_attention_layernorm.norm.", "post_attention_layernorm."): p.shape
-        for name, p in ours.named_parameters()
-        if name not in memory
-    }
+    own = {name: p.shape for name, p in ours.named_parameters() if name not in memory}
     assert own == {name: p.shape for name, p in lerobots.named_parameters()}
     assert 85e6 < sum(p.numel() for p in memory.values()) < 95e6
-    layers = [sum(p.numel() for n, p in memory.items() if f"layers.{i}." in n) for i in range(18)]
+    layers = [sum(p.numel() for n, p in memory.items() if f"modulators.{i}." in n) for i in range(18)]
     assert all(4.7e6 < count < 4.75e6 for count in layers)
 
 
@@ -326,7 +283,7 @@ def test_full_size_runs_in_shape(memory_fusion: str) -> None:
     assert _losses(ours, _inputs(config, "meta"), memory).shape == (BATCH, CHUNK, 32)
 
 
-def test_the_tower_without_weights_is_the_same_every_time() -> None:
+def test_tower_without_weights_is_reproducible() -> None:
     torch.manual_seed(5)
     first = MemoryPI05(_config()).paligemma_with_expert.perception
     torch.manual_seed(6)
@@ -337,7 +294,7 @@ def test_the_tower_without_weights_is_the_same_every_time() -> None:
     assert tokens.shape == (3, 16, 128)
     assert tokens.dtype == torch.bfloat16
     assert torch.equal(tokens, second(images))
-    assert tokens.float().std(dim=0).mean() > 0.05  # images are told apart
+    assert tokens.float().std(dim=0).mean() > 0.05  # images differ
 
 
 # -- modulation -------------------------------------------------------------------------------------------------------
@@ -354,35 +311,7 @@ def _modulated(modulator: MemoryModulator, actions: torch.Tensor, memory: Memory
     return modulator(layers.rms_norm(actions), memory, modulator.keys(memory))
 
 
-def test_modulator_starts_at_zero() -> None:
-    memory = MemoryTokens(torch.randn(2, 7, 32), torch.ones(2, 7, dtype=torch.bool))
-    scale, shift = _modulated(MemoryModulator(32), torch.randn(2, 5, 32), memory)
-    assert not scale.any()
-    assert not shift.any()
-
-
-@pytest.mark.parametrize("opened", [False, True])
-def test_memory_gets_gradients_from_the_first_update_on_where_the_gate_is_open(opened: bool) -> None:
-    ours = MemoryPI05(_config(size="tiny", open_gate=opened))
-    tokens, *rest = _memory(ours.config)
-    _losses(ours, _inputs(ours.config), _read(ours, tokens.requires_grad_(), *rest)).mean().backward()
-    assert tokens.grad is not None
-    assert tokens.grad.any() == opened
-
-
-def test_modulator_sees_only_unmasked_memory() -> None:
-    modulator, actions, memory = _modulator(), torch.randn(1, 5, 32), torch.randn(1, 6, 32)
-    mask = torch.tensor([[True, True, True, True, False, False]])
-    changed = memory.clone()
-    changed[:, 4:] = 1e4
-    seen = _modulated(modulator, actions, MemoryTokens(memory, mask))
-    for a, b in zip(seen, _modulated(modulator, actions, MemoryTokens(changed, mask)), strict=True):
-        torch.testing.assert_close(a, b)
-    all_seen = _modulated(modulator, actions, MemoryTokens(memory, torch.ones_like(mask)))
-    assert not torch.allclose(all_seen[0], seen[0])
-
-
-def test_all_masked_memory_is_finite_and_reads_zero() -> None:
+def test_fully_masked_rows_read_zero() -> None:
     modulator, actions = _modulator(), torch.randn(2, 5, 32, requires_grad=True)
     memory = torch.randn(2, 6, 32, requires_grad=True)
     mask = torch.zeros(2, 6, dtype=torch.bool)
@@ -397,15 +326,6 @@ def test_all_masked_memory_is_finite_and_reads_zero() -> None:
     assert not memory.grad[0].any()
 
 
-def test_positions_matter_to_the_modulator() -> None:
-    modulator, actions, memory = _modulator(), torch.randn(1, 5, 32), torch.randn(1, 6, 32)
-    mask = torch.ones(1, 6, dtype=torch.bool)
-    seen, flipped = (
-        _modulated(modulator, actions, MemoryTokens(tokens, mask))[0] for tokens in (memory, memory.flip(1))
-    )
-    assert not torch.allclose(seen, flipped)
-
-
 def test_keys_are_computed_once_per_memory_and_only_without_gradients() -> None:
     modulator, calls = _modulator(), list[int]()
     keys = modulator.keys
@@ -413,7 +333,7 @@ def test_keys_are_computed_once_per_memory_and_only_without_gradients() -> None:
     normed, memory = torch.randn(2, 5, 32), MemoryTokens(torch.randn(2, 9, 32), torch.ones(2, 9, dtype=torch.bool))
     learning = ModulatedReading(memory, [modulator], watched=False)
     expected = [learning.feed_forward(0, normed, normed).detach() for _ in range(2)]
-    assert len(calls) == 2  # with gradients: every time, as checkpointing runs layers again
+    assert len(calls) == 2  # with gradients: in every pass, because checkpointing repeats layers
     with torch.no_grad():
         acting = ModulatedReading(memory, [modulator], watched=False)
         for _ in range(3):
@@ -421,8 +341,7 @@ def test_keys_are_computed_once_per_memory_and_only_without_gradients() -> None:
     assert len(calls) == 3
 
 
-def test_memory_that_rows_share_is_read_as_their_own() -> None:
-    """What is read, and every gradient."""
+def test_shared_frames_equal_copies() -> None:
     modulator, actions = _modulator(), torch.randn(3, 5, 32)
     frames, places = torch.randn(4, 2, 32), torch.tensor([[0, 1, 2], [1, 2, 3], [3, 3, 0]])
     mask = torch.ones(3, 6, dtype=torch.bool)
@@ -442,7 +361,7 @@ def test_memory_that_rows_share_is_read_as_their_own() -> None:
 # -- image tower ------------------------------------------------------------------------------------------------------
 
 
-def test_pooling_is_the_mean_of_blocks() -> None:
+def test_pooling_averages_blocks() -> None:
     tokens = torch.randn(2, 256, 3)
     pooled = pool_tokens(tokens)
     grid = tokens.reshape(2, 16, 16, 3)
@@ -451,14 +370,8 @@ def test_pooling_is_the_mean_of_blocks() -> None:
         pool_tokens(torch.randn(1, 36, 3))
 
 
-def test_pooling_is_bit_for_bit_the_one_that_caches_were_made_with() -> None:
-    tokens = torch.randn(5, 64, 7, generator=torch.Generator().manual_seed(0))
-    expected = tokens.reshape(5, 4, 2, 4, 2, 7).mean(dim=(2, 4)).reshape(5, 16, 7)
-    assert torch.equal(pool_tokens(tokens), expected)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_the_prefix_is_lerobots(dtype: torch.dtype) -> None:
+def test_prefix_equals_lerobots(dtype: torch.dtype) -> None:
     backbone = make_backbone(MemobenchMemConfig(device="cpu"))
     pictures = (torch.rand(2, 3, 96, 96, generator=torch.Generator().manual_seed(0)) * 2 - 1).to(dtype)
     with torch.no_grad():
@@ -466,8 +379,7 @@ def test_the_prefix_is_lerobots(dtype: torch.dtype) -> None:
         assert torch.equal(backbone.perception.prefix(pictures), expected)
 
 
-def test_positions_of_a_rollout_serve_a_training() -> None:
-    """They are kept, and a rollout makes them in inference mode."""
+def test_cached_positions_of_a_rollout_have_gradients() -> None:
     with torch.inference_mode():
         rotate_from(torch.ones(1, 3, 8), 1234)
     keys = torch.ones(1, 3, 8, requires_grad=True)

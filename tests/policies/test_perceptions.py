@@ -1,12 +1,12 @@
-"""What every perception keeps: a rollout remembers what training reads, and a checkpoint acts as its policy did.
+"""Perceptions: training, rollouts and checkpoints agree for each of them; slots of objects; samples of tasks.
 
-The five: pi0.5's image tower, tokens of the visual encoder, privileged object state, that with detection noise, and
-detections in images.
+The five perceptions are pi0.5's image tower, the visual encoder, privileged object state, the same with detection
+noise, and detections in pictures.
 """
 
 from __future__ import annotations
 
-import shutil
+import functools
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,30 +15,61 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
+from lerobot_memobench.datasets.frames import frame_reader
+from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
+from lerobot_memobench.envs.observations import obs_type_of
+from lerobot_memobench.envs.settings import PIXELS
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.perception.detector import Detector
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
+from lerobot_memobench.perception.weights import save_detector
+from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.fusion import Reading
+from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, Histories, MemorySpec
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.training.features import FOLDER
+from lerobot_memobench.policies.memobench_mem.objects import (
+    DETECTED,
+    FEATURES,
+    OBS_RAW_STATE,
+    VIEWS,
+    ObjectEncoder,
+    ObjectPool,
+    SlotEncoder,
+    frame_row,
+    rotation,
+    slot_features,
+)
+from lerobot_memobench.sim.object_layout import SIZE, SLOTS
+from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
+from lerobot_memobench.sim.object_slots import classes
+from lerobot_memobench.training.sampler import task_weights
+from research.detector.labels import kinds
 from tests.support.memory import remembered, trained_on
-from tests.support.object_dataset import make_object_dataset
-from tests.support.picture_rollouts import STARTS, made_detector, pictures_of
-from tests.support.small_policy import batch_of, losses_in_training, made_for_training
-from tests.support.synthetic_dataset import CAMERAS
+from tests.support.object_dataset import LENGTHS, make_object_dataset, slots_at, state_at
+from tests.support.small_policy import batch_of, made_for_training, open_small_training, small_config
+from tests.support.synthetic_dataset import CAMERAS, make_dataset
 
-WORDS = ("observation.language.tokens", "observation.language.attention_mask")
+FILMED = (12, 23, 9)
+"""Lengths of the episodes with pictures; the second has a prompt of 8 frames, as in the dataset of objects."""
+PROMPT_KEYS = ("observation.language.tokens", "observation.language.attention_mask")
 
 
 @dataclass(frozen=True)
 class Perception:
-    """A way to perceive: the policy's settings, what of the observation it needs, and how far roundings may go."""
+    """Settings of a policy, the observation that it needs, and the rounding between training and rollout."""
 
     fields: dict[str, Any]
     needs: str
     rounding: float = 0.0
-    """Largest difference between training and rollout, as a share of the largest number."""
+    """Largest difference, as a share of the largest number."""
 
 
 OBJECTS = {"size": "small", "perception": "objects"}
@@ -53,39 +84,66 @@ PERCEPTIONS = {
 
 @dataclass
 class Case:
-    """A perception with a dataset for it, whose caches are made once."""
+    """A perception with a dataset for it, whose features are computed once."""
 
     of: Perception
     root: Path
     fields: dict[str, Any]
 
+    @property
+    def starts(self) -> list[int]:
+        """First frames of the episodes."""
+        return np.cumsum([0, *(LENGTHS if self.of.needs == OBS_ENV_STATE else FILMED)]).tolist()
+
     @cached_property
     def shared(self) -> Any:
-        """Policy, preprocessor, postprocessor and dataset, for all tests that do not mind its weights."""
+        """Policy, preprocessor, postprocessor and samples."""
         return self.made()
 
     def made(self, **more: Any) -> Any:
-        """The same, new, with other settings."""
         return made_for_training(self.root, **self.fields | more)
 
     def observed(self, dataset: Any, index: int) -> dict[str, Any]:
-        """A rollout's observation at a frame of the dataset."""
+        """Return a rollout's observation at a frame of the dataset."""
         row = dataset.hf_dataset[index]
         numbers = {key: row[key][None] for key in (OBS_STATE, OBS_ENV_STATE) if key in row}
-        step = float(index - STARTS[int(np.searchsorted(STARTS, index, "right")) - 1])
+        step = float(index - max(start for start in self.starts if start <= index))
         clock = {
             "observation.step": torch.tensor([step]),
             "observation.phase": row["observation.phase"].reshape(1).float(),
         }
-        pictures = {} if OBS_ENV_STATE in row else pictures_of(self.root, index)
+        pictures = {} if OBS_ENV_STATE in row else self.pictures(index)
         return {**pictures, **numbers, **clock, "task": [dataset.meta.tasks.index[int(row["task_index"])]]}
+
+    def pictures(self, index: int) -> dict[str, Tensor]:
+        """Return the pictures of all cameras at a frame, (1, 3, H, W)."""
+        episode = int(np.searchsorted(self.starts, index, "right")) - 1
+        numbers = [index - self.starts[episode]]
+        return {camera: reader_of(self.root, camera)(episode, numbers) for camera in CAMERAS}
+
+
+reader_of = functools.cache(frame_reader)
+
+
+def made_detector(path: Path) -> Path:
+    """Write a detector with random weights that detects objects everywhere."""
+    torch.manual_seed(1)
+    detector = Detector(VisualEncoder().eval(), kinds())
+    torch.nn.init.zeros_(detector.fine_heads.heatmap.bias)
+    save_detector(detector, path)
+    return path
 
 
 @pytest.fixture(scope="module")
-def cases(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
+def detector(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_detector(tmp_path_factory.mktemp("detector") / "detector.safetensors")
+
+
+@pytest.fixture(scope="module")
+def cases(detector: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     folder = tmp_path_factory.mktemp("perceptions")
-    pictures = shutil.copytree(dataset_root, folder / "pictures", ignore=shutil.ignore_patterns(FOLDER))
-    objects, detector = make_object_dataset(folder / "objects"), made_detector(folder / "detector.safetensors", 1)
+    pictures = make_dataset(folder / "pictures", lengths=FILMED)
+    objects = make_object_dataset(folder / "objects", records=True)
     shared = {"n_action_steps": 3, "memory_stride": 2}
     return {
         name: Case(
@@ -102,95 +160,368 @@ def case(request: pytest.FixtureRequest, cases: dict[str, Case]) -> Case:
     return cases[request.param]
 
 
-def apart(one: torch.Tensor, other: torch.Tensor) -> float:
-    """The largest difference, as a share of the largest number."""
+def difference(one: Tensor, other: Tensor) -> float:
+    """Return the largest difference, as a share of the largest number."""
     one, other = one.detach().float(), other.detach().float()
     return float((one - other).abs().max() / other.abs().max())
 
 
-def test_a_rollout_perceives_and_remembers_what_training_reads(case: Case) -> None:
+# -- the contract --------------------------------------------------------------------------------------------------
+
+
+def test_rollout_remembers_and_sees_what_training_reads(case: Case) -> None:
     policy, before, _, dataset = case.shared
     policy.eval().reset()
-    index = int(STARTS[1]) + 14
+    index = case.starts[1] + 14
     trained = before(batch_of(dataset, [index]))
-    for frame in range(int(STARTS[1]), index + 1):
+    for frame in range(case.starts[1], index + 1):
         acted = before(case.observed(dataset, frame))
         policy.observe(acted)
     ((frames, steps),), ((learned, learned_steps),) = remembered(policy, [0]), trained_on(trained)
     assert steps == learned_steps
-    assert apart(frames, learned) <= case.of.rounding
-    assert apart(frames[0], frames[7]) > 4 * case.of.rounding, "moments differ"
+    assert difference(frames, learned) <= case.of.rounding
+    assert difference(frames[0], frames[7]) > 4 * case.of.rounding, "frames differ"
     prefixes = []
     for batch in (trained, acted):
-        prefix = policy.model.embed(policy._seen(batch | {key: trained[key] for key in WORDS}), Reading())
+        prefix = policy.model.embed(policy._seen(batch | {key: trained[key] for key in PROMPT_KEYS}), Reading())
         prefixes.append(prefix.tokens[prefix.real])
-    assert apart(*prefixes) <= 2 * case.of.rounding
+    assert difference(*prefixes) <= 2 * case.of.rounding
 
 
-@pytest.mark.parametrize("case", ["visual encoder", "detection noise"], indirect=True)
-@pytest.mark.slow
-def test_it_learns(case: Case) -> None:
-    policy, before, _, dataset = case.made(chunk_size=4, memory_frames=4)
-    losses = losses_in_training(policy, before(batch_of(dataset, [*range(8, 38, 4)])), updates=30)
-    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:5])
+def test_memory_is_trained_and_pictures_encoders_are_not(case: Case) -> None:
+    policy, before, _, dataset = case.shared
+    policy.train().forward(
+        before(batch_of(dataset, [10, case.starts[1] + 10, case.starts[1] + 20, case.starts[2] + 5]))
+    )[0].backward()
+    assert all(parameter.grad is not None for parameter in policy.model.memory_parameters().values())
+    learning = {name for name, parameter in policy.named_parameters() if parameter.requires_grad}
+    assert not any("vision_tower" in name or "multi_modal_projector" in name for name in learning)
+    policy.zero_grad()
 
 
-def needed(case: Case, made: Any) -> list[bool]:
-    """Whether a rollout's policy needs each of the observations 1 to 6."""
-    policy, before, _, dataset = made
+def test_observations_are_needed_for_memory_and_plans(case: Case) -> None:
+    policy, before, _, dataset = case.shared
     policy.eval().reset()
     found = []
     for step in range(6):
-        policy.select_action(before(case.observed(dataset, int(STARTS[2]) + step)))
+        observation = case.observed(dataset, case.starts[2] + step)
+        observation[OBS_STATE] = observation[OBS_STATE] + 0.1 * step  # a hand that does not stall
+        policy.select_action(before(observation))
         found.append(policy.needs_observation())
-    return found
+    assert found == [False, True, True, True, False, True]
 
 
-def test_it_needs_what_is_remembered_and_what_is_acted_upon(case: Case) -> None:
-    assert needed(case, case.shared) == [False, True, True, True, False, True]
-
-
-@pytest.mark.parametrize("case", ["privileged objects"], indirect=True)
-def test_without_a_memory_it_needs_what_is_acted_upon(case: Case) -> None:
-    assert needed(case, case.made(memory_fusion="none")) == [False, False, True, False, False, True]
-
-
-def test_an_observation_without_its_input_is_refused(case: Case) -> None:
+def test_missing_input_is_refused(case: Case) -> None:
     policy, before, _, dataset = case.shared
     policy.reset()
-    observation = case.observed(dataset, int(STARTS[2]))
+    observation = case.observed(dataset, case.starts[2])
     del observation[case.of.needs]
-    with pytest.raises(MemobenchError, match=rf"no '{case.of.needs}'"):
+    with pytest.raises(MemobenchError, match=rf"'{case.of.needs}'"):
         policy.select_action(before(observation))
 
 
-@pytest.mark.parametrize("case", ["visual encoder", "detections"], indirect=True)
-def test_pictures_in_a_batch_change_nothing(case: Case) -> None:
-    """LeRobot's own samples have them; the features of their frames count."""
-    policy, before, _, dataset = case.shared
-    decoded = torch.utils.data.default_collate([dataset.reader.get_item(45)])
-    assert set(CAMERAS) <= decoded.keys()
-    losses = []
-    for batch in (decoded, {**decoded, **{name: 1 - decoded[name] for name in CAMERAS}}, batch_of(dataset, [45])):
-        torch.manual_seed(0)
-        losses.append(policy.train().forward(before(batch))[0].item())
-    assert losses == [losses[0]] * 3
-
-
-def test_a_checkpoint_acts_as_its_policy(case: Case, tmp_path: Path) -> None:
+def test_checkpoint_acts_as_its_policy(case: Case, tmp_path: Path) -> None:
     policy, before, after, dataset = case.shared
-    policy.train().forward(before(batch_of(dataset, [10, 30])))
     for part in (policy, before, after):
         part.save_pretrained(tmp_path)
     again = MemobenchMemPolicy.from_pretrained(tmp_path)
     pre, _ = make_pre_post_processors(again.config, pretrained_path=str(tmp_path))
     assert again.perception.key == policy.perception.key
     policy.eval()
-    actions: list[list[torch.Tensor]] = []
+    actions: list[list[Tensor]] = []
     for actor, step in ((policy, before), (again, pre)):
         actor.reset()
         torch.manual_seed(0)
-        observations = [case.observed(dataset, int(STARTS[2]) + index) for index in range(5)]
+        observations = [case.observed(dataset, case.starts[2] + index) for index in range(5)]
         actions.append([actor.select_action(step(one)) for one in observations])
     assert all(torch.allclose(one, other, atol=1e-6) for one, other in zip(*actions, strict=True))
     assert actions[0][-1].any()
+
+
+@pytest.mark.parametrize("case", ["visual encoder", "detections"], indirect=True)
+def test_samples_hold_features_and_decode_no_video(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, before, _, dataset = case.shared
+    first = case.starts[1] + 5
+    decoded = torch.utils.data.default_collate([dataset.reader.get_item(first)])
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("a video was opened")
+
+    monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", refuse)
+    sample = dataset[first]
+    assert not set(CAMERAS) & sample.keys()
+    assert set(policy.config.image_features) == set(CAMERAS)
+    batch = before(batch_of(dataset, [first, first + 5]))
+    assert len(batch[FRAMES]) < (batch[PLACES] >= 0).sum(), "samples of an episode share frames"
+    if "detector" in case.fields:
+        truth = policy.perception.detect(case.pictures(first), batch[OBS_RAW_STATE][:1])
+        assert truth.any()
+        assert torch.allclose(batch[DETECTED][:1], truth, rtol=2**-15, atol=1e-7)
+    else:
+        assert all(batch[encoded_key(camera)].shape == (2, GRID**2, WIDTH) for camera in CAMERAS)
+        assert batch[FRAMES].shape[1:] == (POOLED**2, WIDTH)
+    losses = []  # pictures in a batch of LeRobot's have no effect
+    for one in (decoded, {**decoded, **{name: 1 - decoded[name] for name in CAMERAS}}, batch_of(dataset, [first])):
+        torch.manual_seed(0)
+        losses.append(policy.train().forward(before(one))[0].item())
+    assert losses == [losses[0]] * 3
+
+
+# -- detectors and visual encoders ---------------------------------------------------------------------------------
+
+
+def test_policies_of_objects_act_from_detections(cases: dict[str, Case], detector: Path, tmp_path: Path) -> None:
+    """A policy that never saw pictures acts by a detector as by its detections; the state has no effect then."""
+    policy, before, after, _ = cases["privileged objects"].shared
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path)
+    found = []
+    for overrides in ([], [f"--detector={detector}"]):
+        config: Any = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=overrides)
+        acting = MemobenchMemPolicy.from_pretrained(tmp_path, config=config)
+        found.append((acting, make_pre_post_processors(acting.config, str(tmp_path))[0]))
+    (given, of_objects), (seeing, of_pictures) = found
+    assert set(seeing.config.image_features) == {*VIEWS}
+    assert obs_type_of(seeing.config) == PIXELS != obs_type_of(given.config)
+    case = cases["detections"]
+    dataset = case.shared[3]
+    for frame in range(6):
+        batch = case.observed(dataset, frame)
+        slots = seeing.perception.detect(batch, batch[OBS_STATE])
+        objects = {key: value for key, value in batch.items() if key not in VIEWS} | {OBS_ENV_STATE: slots}
+        noise = {OBS_ENV_STATE: torch.ones(1, SIZE)}
+        assert torch.equal(given.select_action(of_objects(objects)), seeing.select_action(of_pictures(batch | noise)))
+
+
+def test_checkpoints_hold_encoders_and_name_detectors(cases: dict[str, Case], tmp_path: Path) -> None:
+    detecting = cases["detections"].shared[0]
+    assert not any("tower" in name for name in detecting.state_dict())
+    policy, before, after, _ = cases["visual encoder"].shared
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path)
+    config: Any = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--visual_encoder=gone"])
+    with pytest.raises(MemobenchError, match="visual_encoder"):
+        MemobenchMemPolicy.from_pretrained(tmp_path, config=config)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.pretrained_path, config.visual_encoder = tmp_path, policy.config.visual_encoder
+    training = open_small_training(cases["visual encoder"].root, config)
+    assert training.policy.perception.key == policy.perception.key
+
+
+@pytest.mark.parametrize("name", ["absent", "narrow"])
+def test_unusable_encoder_files_are_named(name: str, cases: dict[str, Case], tmp_path: Path) -> None:
+    file = tmp_path / f"{name}.safetensors"
+    if name == "narrow":
+        save_detector(Detector(VisualEncoder((4, 4, 8, 8, 16), (0, 0, 0, 1, 0)), ("cork",)), file)
+    with pytest.raises(MemobenchError, match=name):
+        made_for_training(cases["visual encoder"].root, size="small", visual_encoder=str(file))
+
+
+@pytest.mark.parametrize(
+    ("pictures", "fields", "named"),
+    [
+        (False, {"detector": "FILE"}, "pictures"),
+        (True, {"detector": "FILE"}, "wrist_image"),
+        (False, {"use_relative_actions": True}, "relative_action"),
+        (False, {"detector": "absent"}, "absent"),
+    ],
+)
+def test_unfit_datasets_are_refused(
+    pictures: bool, fields: dict[str, Any], named: str, detector: Path, tmp_path: Path
+) -> None:
+    root = make_object_dataset(tmp_path / "data", pictures=pictures)
+    given = {key: str(detector) if value == "FILE" else value for key, value in fields.items()}
+    with pytest.raises(MemobenchError, match=named):
+        made_for_training(root, **OBJECTS, **given)
+
+
+def test_datasets_without_objects_are_refused(dataset_root: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"observation\.environment_state"):
+        made_for_training(dataset_root, **OBJECTS)
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_objects_next_to_pictures_decode_no_video(
+    earlier: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their column has two names: that of this version and that of earlier datasets."""
+    folder = make_object_dataset(tmp_path / "filmed", pictures=True, earlier=earlier)
+    monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", None)
+    policy, before, _, dataset = made_for_training(folder, **OBJECTS)
+    assert set(policy.config.input_features) == {OBS_STATE, OBS_ENV_STATE}
+    assert before(batch_of(dataset, [10, 30]))[OBS_ENV_STATE].any()
+
+
+def test_weights_of_another_perception_are_refused(cases: dict[str, Case], tmp_path: Path) -> None:
+    policy, before, after, _ = cases["privileged objects"].shared
+    for part in (policy, before, after):
+        part.save_pretrained(tmp_path)
+    config = small_config(size="small", perception="pixels")
+    picture = PolicyFeature(FeatureType.VISUAL, (3, 48, 48))
+    config.input_features = {**policy.config.input_features, CAMERAS[0]: picture}
+    config.output_features = policy.config.output_features
+    with pytest.raises(MemobenchError, match=r"--policy\.perception=pixels"):
+        MemobenchMemPolicy.from_pretrained(tmp_path, config=config)
+
+
+# -- samples of tasks ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("weights", "expected"),
+    [({}, [1, 1]), ({"prompted": 3.0}, [3, 3]), ({"KIND": 2.0, "NAME": 5.0}, [5, 2])],
+)
+def test_weights_of_tasks(weights: dict[str, float], expected: list[float], cases: dict[str, Case]) -> None:
+    """A task's name counts before its memory type, and this before ``prompted``."""
+    root = cases["privileged objects"].root
+    records: list[Any] = [place.record for place in list_episodes(root)]
+    names = {"KIND": records[0].memory_type, "NAME": records[0].task_name}
+    phase = np.ones(sum(LENGTHS), int)
+    phase[np.cumsum([0, *LENGTHS])[:-1]] = 0
+    meta = LeRobotDatasetMetadata("here/data", root=root)
+    given = {names.get(key, key): weight for key, weight in weights.items()}
+    tasks, found = task_weights(meta, np.cumsum([0, *LENGTHS]), phase, given)
+    assert tasks.tolist() == [0, 1, 0], "episodes of one task"
+    assert found[tasks[[0, 1]]].tolist() == expected
+    for bad, named in (({"open it": 2.0}, "open it"), ({"prompted": 0.0}, "task_weights")):
+        with pytest.raises(MemobenchError, match=named):
+            task_weights(meta, np.cumsum([0, *LENGTHS]), phase, bad)
+
+
+def test_statistics_are_those_of_the_execution(cases: dict[str, Case]) -> None:
+    _, before, after, dataset = cases["privileged objects"].shared
+    hf = dataset.hf_dataset.with_format("numpy")
+    actions = np.asarray(hf["action"])[np.asarray(hf["observation.phase"]).reshape(-1) != 0]
+    for processor in (before, after):
+        step = next(step for step in processor.steps if type(step).__name__.endswith("ormalizerProcessorStep"))
+        held = step._tensor_stats["action"]
+        assert np.allclose(held["mean"], actions.mean(axis=0), atol=1e-5)
+        assert np.allclose(held["std"], actions.std(axis=0) + 0.01, atol=1e-4)
+
+
+# -- slots ---------------------------------------------------------------------------------------------------------
+
+KINDS = len(classes())
+WHERE = np.array([[0.0, 0.1, 0.9], [0.1, -0.1, 0.95], [-0.1, 0.0, 1.0]])
+
+
+def slots(places: np.ndarray = WHERE, lit: int | None = None, seed: int = 0) -> Tensor:
+    return torch.from_numpy(slots_at(np.random.default_rng(seed), places, lit))
+
+
+def hand(place: tuple[float, float, float] = (0.0, 0.0, 1.1)) -> Tensor:
+    return torch.from_numpy(state_at(np.array(place)))
+
+
+def test_rotations_equal_scipys() -> None:
+    turns = np.random.default_rng(1).normal(size=(20, 3)) * 2
+    expected = torch.from_numpy(Rotation.from_rotvec(turns).as_matrix()).float()
+    assert torch.allclose(rotation(torch.from_numpy(turns).float()), expected, atol=1e-5)
+    assert torch.equal(rotation(torch.zeros(1, 3))[0], torch.eye(3))
+
+
+def test_features_relative_to_the_hand_move_with_it() -> None:
+    """Features in the hand's frame do not change if hand and thing move together; features in the world do."""
+    turn, pose = Rotation.from_rotvec([0.2, -0.3, 1.0]), Rotation.from_rotvec([3.0, 0.3, 0.1])
+    thing = slots().reshape(SLOTS, SLOT_WIDTH)[1:2].double()
+    start = torch.tensor([[0.02, -0.08, 0.97, *pose.as_rotvec()]])
+    moved, gone = thing.clone(), np.array([0.1, 0.2, -0.1])
+    for first in (2, 5, 8):
+        shift = gone if first == 2 else 0.0
+        moved[0, first : first + 3] = torch.from_numpy(turn.apply(thing[0, first : first + 3].numpy()) + shift)
+    end = torch.tensor([[*(turn.apply(start[0, :3].numpy()) + gone), *(turn * pose).as_rotvec()]])
+    before, after = slot_features(thing.float(), start.float()), slot_features(moved.float(), end.float())
+    assert before.shape == (1, FEATURES)
+    own = [*range(12, 18), *range(24, 30)]  # fine offsets and axes in the hand's frame
+    assert torch.allclose(before[:, own], after[:, own], atol=1e-4)
+    assert (before[:, :12] - after[:, :12]).abs().max() > 0.1
+
+
+def test_millimetres_are_not_rounded() -> None:
+    perception = ObjectEncoder(classes(), 32)
+    pool = perception.pool()
+    moved = WHERE + np.array([0.001, 0, 0])
+    rows = [
+        perception.remember({OBS_ENV_STATE: one[None], OBS_RAW_STATE: hand()[None]}, [0])
+        for one in (slots(), slots(moved))
+    ]
+    assert rows[0].dtype == torch.float32
+    assert (rows[0] - rows[1]).abs().max() > 0.0009
+    assert not torch.equal(pool(rows[0]), pool(rows[1]))
+
+
+def test_empty_slots_are_no_tokens() -> None:
+    perception = ObjectEncoder(classes(), 32).eval()
+    noisy = slots().clone().reshape(SLOTS, SLOT_WIDTH)
+    noisy[3:, 1:] = 7.0
+    both = torch.stack([slots(), noisy.reshape(-1)])
+    batch = {OBS_ENV_STATE: both, OBS_RAW_STATE: hand().expand(2, -1)}
+    (part,), (mask,) = perception.present(batch)
+    tokens = perception.prefix(part)
+    assert mask.tolist() == [[True] * 3 + [False] * (SLOTS - 3)] * 2
+    assert torch.equal(tokens[0], tokens[1])
+    assert not tokens[0, 3:].any()
+    assert tokens[0, :3].abs().sum(dim=1).min() > 0
+    trained = [perception.train().present({**batch, OBS_ENV_STATE: one})[1][0].shape[1] for one in (both, 0 * both)]
+    assert trained == [3, 1], "training drops slots that are empty in the whole batch"
+    pool = ObjectPool(perception.order, perception.kinds, 32)
+    pooled = pool(perception.remember(batch, [0, 1])[:, 0])
+    assert torch.allclose(pooled[0], pooled[1], rtol=0, atol=1e-6)
+    assert pool(frame_row(torch.zeros(1, SIZE), hand()[None], torch.ones(1))[:, 0]).isfinite().all()
+
+
+@pytest.mark.parametrize("phase", [False, True])
+def test_pools_hold_highlight_and_phase_in_any_order(phase: bool) -> None:
+    pool = ObjectPool(range(KINDS), KINDS + 1, 32, phase=phase)
+
+    def pooled(one: Tensor, at: float) -> Tensor:
+        made: Tensor = pool(frame_row(one[None], hand()[None], torch.tensor([at])))
+        return made
+
+    lit = slots(lit=1)
+    shuffled = lit.reshape(SLOTS, SLOT_WIDTH)[torch.randperm(SLOTS)].reshape(-1)
+    assert torch.allclose(pooled(lit, 1.0), pooled(shuffled, 1.0), atol=1e-6)
+    assert (pooled(lit, 1.0) - pooled(slots(), 1.0)).abs().max() > 1e-4
+    assert torch.equal(pooled(lit, 1.0), pooled(lit, 0.0)) != phase
+
+
+@pytest.mark.parametrize("phase", [False, True])
+def test_a_clock_remembers_time_and_phase_only(phase: bool) -> None:
+    spec = MemorySpec(32, 2, 32, 32, 0, 8)
+    pool = ObjectPool(range(KINDS), KINDS + 1, 32, phase=phase)
+    memory = Frames(spec, pool, Frames.Settings(frames=4, content=False))
+
+    def read(seen: Tensor, begin: int) -> Tensor:
+        frames = frame_row(seen.expand(4, -1), hand().expand(4, -1), (torch.arange(4) >= begin).float())
+        state = memory.init(1)
+        for number, frame in enumerate(frames):
+            state = memory.write(state, frame[None], torch.tensor([8 * number]))
+        return memory.read(state).rows()
+
+    first = read(slots(), 2)
+    assert torch.equal(first, read(slots(lit=1), 2))
+    assert torch.equal(first, read(slots(), 1)) == (not phase)
+
+
+def test_shared_frames_are_encoded_once() -> None:
+    class Counting(ObjectPool):
+        count = 0
+
+        def forward(self, frames: Tensor) -> Tensor:
+            Counting.count += len(frames)
+            return super().forward(frames)
+
+    pool = Counting(range(KINDS), KINDS + 1, 16)
+    memory = Frames(MemorySpec(16, 2, 16, 16, 0, 8), pool, Frames.Settings(frames=4))
+    stored = torch.cat([frame_row(slots(seed=n)[None], hand()[None], torch.ones(1)) for n in range(5)])
+    memory.replay(Histories(stored, torch.arange(5) * 8, torch.tensor([[0, 1, 2, 3], [0, 2, 4, -1]])))
+    assert Counting.count == 5
+
+
+def test_classes_keep_their_embedding_by_name() -> None:
+    trained = [name for name in classes() if name != classes()[2]]
+    perception = ObjectEncoder(trained, 16)
+    assert [perception.order[classes().index(name)] for name in trained] == list(range(len(trained)))
+    assert perception.order[2] == len(trained), "a new class"
+    encoder = SlotEncoder(perception.order, perception.kinds, 8, 16)
+    assert encoder.kind.num_embeddings == len(trained) + 1

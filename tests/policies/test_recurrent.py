@@ -1,4 +1,4 @@
-"""Recurrence by slots: its formula, row by row and head by head; how far gradients reach; what it is set to."""
+"""Recurrence: its formula, row by row and head by head, and the reach of gradients."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory import read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories, MemorySpec
 from lerobot_memobench.policies.memobench_mem.memory.recurrent import HEADS, Recurrent
 
-SPEC = MemorySpec(dim=32, tokens=3, width=32, expert=16, frames=32, grid=0, stride=16)
+SPEC = MemorySpec(dim=32, tokens=3, width=32, expert=16, grid=0, stride=16)
 
 
 def made(**changed: Any) -> Recurrent:
-    """Build one in float64, whose weights are large enough to matter."""
+    """Build a mechanism in float64 with large weights."""
     torch.manual_seed(0)
     mechanism = Recurrent(SPEC, torch.nn.Identity(), read_settings("recurrent", changed)).double()
     for weight in mechanism.parameters():
@@ -27,7 +26,7 @@ def made(**changed: Any) -> Recurrent:
 
 
 def normed(x: Tensor, norm: torch.nn.LayerNorm) -> Tensor:
-    """Return a vector (D,) as `norm` leaves it."""
+    """Return the layer norm of a vector (D,)."""
     return (x - x.mean()) / (x.var(unbiased=False) + 1e-6).sqrt() * norm.weight + norm.bias
 
 
@@ -61,7 +60,7 @@ def written(mechanism: Recurrent, slots: list[Tensor], frame: Tensor, step: int)
 
 
 @torch.no_grad()
-def test_slots_are_written_by_the_formula() -> None:
+def test_slots_equal_their_formula() -> None:
     mechanism, frames = made(), torch.randn(4, 2, 3, 32, dtype=torch.float64)
     state, steps = mechanism.init(2), torch.tensor([[0, 16, 32, 48], [8, 24, 40, 56]])
     for number, frame in enumerate(frames):
@@ -77,7 +76,7 @@ def test_slots_are_written_by_the_formula() -> None:
 
 
 @pytest.mark.parametrize("reach", [1, 5])
-def test_gradients_reach_so_many_frames(reach: int) -> None:
+def test_gradients_reach_the_last_frames(reach: int) -> None:
     mechanism = made(gradient_frames=reach)
     frames = torch.randn(9, 3, 32, dtype=torch.float64, requires_grad=True)
     places = torch.arange(9)[None]
@@ -86,20 +85,6 @@ def test_gradients_reach_so_many_frames(reach: int) -> None:
     assert (frames.grad.flatten(1).any(dim=1)).tolist() == [False] * (9 - reach) + [True] * reach
 
 
-@torch.no_grad()
-def test_without_time_codes_the_step_does_not_matter() -> None:
-    for time_codes in (True, False):
-        mechanism, frame = made(time_codes=time_codes), torch.randn(1, 3, 32, dtype=torch.float64)
-        early, late = (mechanism.write(mechanism.init(1), frame, torch.tensor([step])) for step in (0, 160))
-        assert torch.equal(early["slots"], late["slots"]) != time_codes
-
-
-def test_slots_are_a_quarter_of_the_width_or_as_many_as_set() -> None:
+def test_number_of_slots() -> None:
     assert made().initial.shape == (8, 32)
     assert made(slots=5).read(made(slots=5).init(3)).each.shape == (3, 5, 32)
-
-
-@pytest.mark.parametrize("changed", [{"slots": 0}, {"gradient_frames": 0}])
-def test_what_cannot_be_is_refused(changed: dict[str, int]) -> None:
-    with pytest.raises(MemobenchError, match="must be at least 1"):
-        read_settings("recurrent", changed)

@@ -152,7 +152,7 @@ def test_a_card_tells_every_setting_that_is_not_the_sizes(script: ModuleType) ->
         "task_weights": {"prompted": 2.0},
         "chunk_size": 8,
         "memory_fusion": "context",
-        "memory_frames": 16,
+        "memory_settings": {"frames": 16},
     }
     usual = {"device": "cpu", "size": "small", "perception": "objects"}
     policy = encoded(MemobenchMemConfig(**usual, **given))

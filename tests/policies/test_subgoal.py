@@ -1,4 +1,4 @@
-"""The narrow channel: the text that is said is all that the action expert reads of the prefix."""
+"""The narrow channel: the chosen text is all that the action expert reads of the prefix."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.fusion import Prefix
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Query
-from lerobot_memobench.policies.memobench_mem.memory.subgoal import SCORES, NarrowReading
-from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
+from lerobot_memobench.policies.memobench_mem.memory.subgoal import SCORES, CheckpointTexts, NarrowReading, scored
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
 from lerobot_memobench.policies.memobench_mem.subgoals import choices
@@ -37,15 +35,15 @@ def model(request: pytest.FixtureRequest) -> MemoryPI05:
     made = MemoryPI05(config)
     with torch.no_grad():
         for parameter in made.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))  # some of pi0.5's start at zero and hide errors
+            parameter.add_(0.05 * torch.randn_like(parameter))  # zeros would hide errors
     return made.eval()
 
 
-def test_oracle_memory_behind_an_instruction_changes_no_choice() -> None:
-    """In a rollout the environment writes it there; in training it comes later."""
-    told = [with_memory(task, memory) for task, memory in zip(OF_TASKS, ("", "opened it"), strict=True)]
-    assert torch.equal(choices(OF_TASKS, told), choices(OF_TASKS, [*OF_TASKS]))
-    assert not choices(OF_TASKS, told).all(dim=1).any()
+def test_choices_are_the_tasks_texts_with_or_without_oracle_memory() -> None:
+    texts = [with_memory(task, memory) for task, memory in zip(OF_TASKS, ("", "opened it"), strict=True)]
+    own = [[True, True, False], [False, True, True]]
+    assert choices(OF_TASKS, [*OF_TASKS]).tolist() == choices(OF_TASKS, texts).tolist() == own
+    assert choices(OF_TASKS, "an unknown task").all()
 
 
 def inputs_of(model: MemoryPI05, seed: int = 1) -> Observation:
@@ -71,7 +69,7 @@ def remember(
     learns: bool = False,
     watched: bool = False,
 ) -> NarrowReading:
-    """Begin a pass over a history of three frames, with the true texts if they are given."""
+    """Begin a pass over a history of three frames, with or without true texts."""
     memory, chance = model.memory, torch.Generator().manual_seed(seed)
     assert memory is not None
     frames = torch.randn(B, 3, memory.spec.tokens, memory.spec.dim, generator=chance)
@@ -96,7 +94,7 @@ def planned(model: MemoryPI05, seen: Observation, reading: NarrowReading) -> Ten
 
 
 def attend_to_text_alone(patch: pytest.MonkeyPatch) -> None:
-    """Let the text attend to itself alone, so that its states are the same after any prefix."""
+    """Let the text attend only to itself, so that its states do not depend on the prefix."""
     attends = NarrowReading.attends
 
     def narrowed(reading: NarrowReading, prefix: Prefix, unread: int, copies: int) -> Tensor:
@@ -107,10 +105,10 @@ def attend_to_text_alone(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(NarrowReading, "attends", narrowed)
 
 
-def test_actions_read_the_text_alone(model: MemoryPI05) -> None:
-    """Another observation, instruction or history, of which the text's states are told nothing, changes no action."""
+def test_actions_read_only_the_text(model: MemoryPI05) -> None:
+    """If the text does not attend to the prefix, other observations, instructions and histories change no action."""
     actions = torch.randn(B, CHUNK, model.config.max_action_dim)
-    state = inputs_of(model).images[1:]  # none where it is no token
+    state = inputs_of(model).images[1:]  # empty without a state token
 
     def both(seed: int, text: list[int], state: list[Tensor]) -> Tensor:
         seen = inputs_of(model, seed)
@@ -123,13 +121,13 @@ def test_actions_read_the_text_alone(model: MemoryPI05) -> None:
         attend_to_text_alone(patch)
         found = both(1, [0, 2], state)
         assert torch.equal(found, both(5, [0, 2], state))
-        assert (found != both(1, [1, 2], state))[:, 0].any(-1).all(), "another text, of another row"
+        assert (found != both(1, [1, 2], state))[:, 0].any(-1).all()
         if state:
-            assert (found != both(1, [0, 2], [state[0] + 1])).any(-1).all(), "the state is read"
-    assert (both(1, [0, 2], state) != both(5, [0, 2], state)).any(-1).all(), "the text's states tell the rest"
+            assert (found != both(1, [0, 2], [state[0] + 1])).any(-1).all()
+    assert (both(1, [0, 2], state) != both(5, [0, 2], state)).any(-1).all()
 
 
-def test_gradients_flow_through_the_text_alone(model: MemoryPI05) -> None:
+def test_gradients_flow_only_through_the_text(model: MemoryPI05) -> None:
     model.train()
     actions = torch.randn(B, CHUNK, model.config.max_action_dim)
 
@@ -149,14 +147,14 @@ def test_gradients_flow_through_the_text_alone(model: MemoryPI05) -> None:
     reading, history, _ = learned()
     assert model.memory is not None
     loss = model.memory.losses(reading.outputs | {SUBGOAL: torch.tensor([0, -1])})["subgoal"]
-    assert loss[1] == 0, "a frame without a text teaches none"
+    assert loss[1] == 0
     loss.sum().backward()
     assert history.grad is not None
     assert history.grad[:1].any()
 
 
-def test_what_nobody_reads_is_left_out(model: MemoryPI05) -> None:
-    """Of the prefix's last states one is made; loss, scores and gradients are those of a pass that makes every one."""
+def test_unread_states_are_not_computed(model: MemoryPI05) -> None:
+    """Only one of the prefix's last states is computed; results equal those of a complete pass."""
     model.train()
     made = list[int]()
     last: Any = model.paligemma_with_expert.paligemma.model.language_model.layers[-1]
@@ -177,16 +175,16 @@ def test_what_nobody_reads_is_left_out(model: MemoryPI05) -> None:
     assert made[1] > model.config.chunk_size
 
 
-def test_both_paths_are_the_same(model: MemoryPI05) -> None:
-    """One step of denoising over cached keys ends where a training's pass of the same text has no error."""
+def test_acting_equals_training(model: MemoryPI05) -> None:
+    """One step of denoising ends at actions for which a training pass with the same text has no error."""
     reading = remember(model)
     actions = planned(model, inputs_of(model), reading)
-    assert reading.said is not None
-    true = remember(model, subgoal=reading.said.tolist())
+    assert reading.chosen is not None
+    true = remember(model, subgoal=reading.chosen.tolist())
     assert passed(model, inputs_of(model), actions, true).max() < 1e-8
 
 
-def test_it_tells_how_much_the_text_attends_to_each_token_of_memory(model: MemoryPI05) -> None:
+def test_shares_are_the_texts_attention_to_memory(model: MemoryPI05) -> None:
     reading = remember(model, watched=True)
     planned(model, inputs_of(model), reading)
     shares = torch.stack(reading.shares())
@@ -195,27 +193,27 @@ def test_it_tells_how_much_the_text_attends_to_each_token_of_memory(model: Memor
     assert torch.equal(shares > 0, reading.memory.mask.expand_as(shares))
 
 
-def test_it_says_one_of_its_tasks_texts_and_is_not_told_which(model: MemoryPI05) -> None:
+def test_choice_is_independent_of_the_true_text(model: MemoryPI05) -> None:
     inputs, scores = inputs_of(model), []
     for subgoal in ([0, 2], [1, 1], [-1, -1]):
         reading = remember(model, subgoal=subgoal)
         with torch.no_grad():
             passed(model, inputs, torch.zeros(B, CHUNK, model.config.max_action_dim), reading)
-        assert reading.said is not None
-        assert reading.said.tolist() == [TEXTS if text < 0 else text for text in subgoal]
+        assert reading.chosen is not None
+        assert reading.chosen.tolist() == [TEXTS if text < 0 else text for text in subgoal]
         scores.append(reading.outputs[SCORES])
     reading = remember(model)
     planned(model, inputs, reading)
-    assert reading.said is not None
+    assert reading.chosen is not None
     for other in scores:
         torch.testing.assert_close(other, reading.outputs[SCORES])
     first, second = reading.outputs[SCORES].argmax(dim=1).tolist()
-    assert reading.said.tolist() == [first, second]
+    assert reading.chosen.tolist() == [first, second]
     assert first in (0, 1)
     assert second in (1, 2)
 
 
-def test_texts_share_words_and_the_empty_one_is_said_where_no_other_may_be() -> None:
+def test_texts_share_words_and_rank_above_the_empty_text() -> None:
     texts = CheckpointTexts(("open it", "put it into the top drawer"), 5)
     tokens, real = texts(torch.tensor([0, 1, -1, 2]))
     assert real.sum(dim=1).tolist() == [3, 7, 1, 1]
@@ -224,13 +222,3 @@ def test_texts_share_words_and_the_empty_one_is_said_where_no_other_may_be() -> 
     scores = scored(torch.tensor([[5.0, -9.0], [5.0, -9.0]]), torch.tensor([[False, True], [False, False]]))
     assert scores.argmax(dim=1).tolist() == [1, 2]
     assert CheckpointTexts((), 5)(torch.tensor([0]))[1].tolist() == [[True]]
-
-
-def test_it_is_built_at_full_size_and_has_a_fusion_of_its_own() -> None:
-    with torch.device("meta"):
-        made = MemoryPI05(MemobenchMemConfig(device="cpu", size="pi05", memory="subgoal", subgoals=OF_TASKS))
-    assert {name for name in made.memory_names() if name.startswith("subgoal.")} == {
-        *("subgoal.ask", "subgoal.score.weight", "subgoal.score.bias", "subgoal.texts.embedding.weight")
-    }
-    with pytest.raises(MemobenchError, match="cannot be read by memory_fusion=context"):
-        MemobenchMemConfig(device="cpu", memory="subgoal", memory_fusion="context")

@@ -117,7 +117,7 @@ def test_it_is_asked_of_a_policy_with_a_memory() -> None:
     assert plan_line(LINE).options.memory_reads
     assert not plan_line([word for word in LINE if "reads" not in word]).options.memory_reads
     for policy, told in (("memobench_small_memoryless", "memory=none"), ("memobench_random", "memobench_random")):
-        with pytest.raises(MemobenchError, match=f"memory_reads=true asks .* {told} does not tell"):
+        with pytest.raises(MemobenchError, match=f"memory_reads=true .*{told}"):
             plan_line([*LINE[:-1], f"policy={policy}"])
     with pytest.raises(MemobenchError, match="memory_reads=yes: expected true or false"):
         plan_line([*LINE[:-2], "memory_reads=yes"])

@@ -313,7 +313,7 @@ OF_A_POLICY: dict[str, dict[str, st.SearchStrategy[str]]] = {
         "align": st.sampled_from(["none", "contrastive"]),
         "size": st.just("tiny"),
         "replan": st.integers(1, 50).map(str),
-        "policy.memory_frames": COUNT,
+        "policy.memory_stride": COUNT,
         "policy.base_weights": st.just("null"),
         "policy.optimizer_betas": st.just("[0.9, 0.99]"),
     },

@@ -113,11 +113,11 @@ def rolled(
 
 ACT = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
 ACT |= {"chunk_size": PLAN, "n_action_steps": PLAN, "latent_dim": 8, "pretrained_backbone_weights": None}
-MEMORY = {"chunk_size": PLAN, "n_action_steps": PLAN, "num_inference_steps": 1, "memory_frames": 4}
+MEMORY = {"chunk_size": PLAN, "n_action_steps": PLAN, "num_inference_steps": 1, "memory_settings": {"frames": 4}}
 FIRST, LAST = PROMPT, PROMPT + HORIZON
 """Of the execution, which are always drawn."""
 
-WITHOUT = {key: value for key, value in MEMORY.items() if not key.startswith("memory_")} | {"memory_fusion": "none"}
+WITHOUT = {key: value for key, value in MEMORY.items() if not key.startswith("memory_")} | {"memory": "none"}
 CASES: dict[str, tuple[str, dict[str, Any], list[int]]] = {
     "expert": ("memobench_expert", {}, [0, FIRST, LAST]),
     "random": ("memobench_random", {}, [0, FIRST, LAST]),

@@ -10,7 +10,13 @@ import torch
 from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import ModulatedNorm, ModulatedReading, Prefix, Reading
+from lerobot_memobench.policies.memobench_mem.fusion import (
+    MemoryModulator,
+    ModulatedReading,
+    Modulation,
+    Prefix,
+    Reading,
+)
 from lerobot_memobench.policies.memobench_mem.layers import rms_norm
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
@@ -45,9 +51,9 @@ class Passes(PI05Pytorch):
 class Norm(nn.Module):
     """LeRobot's norm before a feed-forward, and the memory's modulation after it."""
 
-    def __init__(self, ours: ModulatedNorm, passes: Passes) -> None:
+    def __init__(self, norm: nn.Module, modulator: MemoryModulator, passes: Passes) -> None:
         super().__init__()
-        self.norm, self.modulator, self.passes = ours.norm, ours.modulator, [passes]
+        self.norm, self.modulator, self.passes = norm, modulator, [passes]
 
     def forward(self, x: Tensor, cond: Tensor) -> tuple[Tensor, Tensor]:
         normed, gate = self.norm(x, cond=cond)
@@ -62,9 +68,9 @@ def lerobots_passes(ours: MemoryPI05, memory: MemoryTokens | None) -> Iterator[P
     """Yield a model that computes with the very parameters of ours, by LeRobot's passes, while this lasts."""
     layers: Any = ours.paligemma_with_expert.gemma_expert.model.layers
     norms, passes = [layer.post_attention_layernorm for layer in layers], Passes(ours, memory)
-    for layer, norm in zip(layers, norms, strict=True):
-        if isinstance(norm, ModulatedNorm):
-            layer.post_attention_layernorm = Norm(norm, passes)
+    if isinstance(ours.fusion, Modulation):
+        for layer, norm, modulator in zip(layers, norms, ours.modulators, strict=True):  # type: ignore[arg-type]
+            layer.post_attention_layernorm = Norm(norm, modulator, passes)
     try:
         yield passes
     finally:

@@ -31,7 +31,7 @@ class Learner(nn.Module):
     def __init__(self, align: str) -> None:
         super().__init__()
         self.encoder = nn.Linear(DIM, DIM)
-        self.alignment = make_alignment(align, DIM, DIM, FRAMES, TOKENS)
+        self.alignment = make_alignment(align, DIM, DIM, TOKENS)
 
     def forward(self, seen: Tensor, text: Tensor, has_text: Tensor) -> tuple[Tensor, Tensor]:
         memory = self.encoder(seen)

@@ -16,17 +16,29 @@ from lerobot_memobench.training.loop import train
 CHUNK = 6
 
 
-def small_config(**fields: Any) -> MemobenchMemConfig:
-    """Return a configuration of few actions, and where they are read, of few denoising steps and remembered frames."""
-    if "none" in (fields.get("memory"), fields.get("memory_fusion")):
+def small_config(frames: int = 8, **fields: Any) -> MemobenchMemConfig:
+    """Return a configuration with short chunks, few denoising steps and, in memories of frames, few frames.
+
+    Args:
+        frames: number of frames that a chunk reads.
+    """
+    if fields.get("memory") == "none":
         fields.pop("memory_stride", None)
     read = MemobenchMemConfig(device="cpu", **fields)
     usual: dict[str, Any] = {"chunk_size": CHUNK, "n_action_steps": CHUNK}
     if read.objective == FLOW_MATCHING:
         usual["num_inference_steps"] = 2
     if read.memory in ("frames", "subgoal"):
-        usual["memory_frames"] = 8
+        usual["memory_settings"] = {"frames": frames}
     return MemobenchMemConfig(device="cpu", push_to_hub=False, **usual | fields)
+
+
+def draw_modulation(module: torch.nn.Module, std: float = 0.2) -> None:
+    """Draw the layers of a memory's modulation, which start at zero, so that memory has an effect."""
+    with torch.no_grad():
+        for name, parameter in module.named_parameters():
+            if ".modulation." in name:
+                parameter.normal_(std=std)
 
 
 def train_config(root: Path, config: MemobenchMemConfig, **settings: Any) -> TrainPipelineConfig:
@@ -50,13 +62,13 @@ def open_small_training(root: Path, config: MemobenchMemConfig) -> Training:
 
 
 def made_for_training(root: Path, **fields: Any):  # type: ignore[no-untyped-def]
-    """Policy, preprocessor, postprocessor and samples, as `lerobot train` makes them."""
+    """Return policy, preprocessor, postprocessor and samples, as `lerobot train` makes them."""
     training = open_small_training(root, small_config(**fields))
     return training.policy, *training.processors, Samples(training)
 
 
 class Samples:
-    """The samples of a training by their global indices, with pictures as floats; else LeRobot's dataset."""
+    """Samples of a training by global index, with pictures as floats; otherwise LeRobot's dataset."""
 
     def __init__(self, training: Training) -> None:
         self._dataset, self._samples = training.dataset, training.samples()
@@ -73,19 +85,6 @@ class Samples:
         if name.startswith("__"):
             raise AttributeError(name)
         return getattr(self._dataset, name)
-
-
-def losses_in_training(policy: Any, batch: dict[str, Any], updates: int = 40) -> list[float]:
-    """Train a policy on one batch; return the action loss before each update."""
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-3)
-    losses = []
-    for _ in range(updates):
-        loss, logged = policy.train().forward(batch)
-        loss.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        losses.append(logged["action_loss"])
-    return losses
 
 
 def batch_of(samples: Any, indices: list[int]) -> dict[str, Any]:

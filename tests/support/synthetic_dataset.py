@@ -26,8 +26,14 @@ def clock_at(t: int, prompt: int) -> dict[str, np.ndarray]:
     return {name: np.array([value], np.float32) for name, value in zip(CLOCK, values, strict=True)}
 
 
-def make_dataset(root: Path, seed: int = 0, repeats: int = 1, cameras: tuple[str, str] = CAMERAS) -> Path:
-    """Write a LeRobotDataset with this project's columns: three short episodes of coloured squares that move.
+def make_dataset(
+    root: Path,
+    seed: int = 0,
+    repeats: int = 1,
+    cameras: tuple[str, str] = CAMERAS,
+    lengths: tuple[int, int, int] = LENGTHS,
+) -> Path:
+    """Write a LeRobotDataset with this project's columns: three short episodes of moving coloured squares.
 
     With ``repeats`` each of the three tasks has that many episodes, one task after the other.
     """
@@ -52,7 +58,7 @@ def make_dataset(root: Path, seed: int = 0, repeats: int = 1, cameras: tuple[str
         },
     )
     rng = np.random.default_rng(seed)
-    kinds = list(zip(LENGTHS, PROMPTS, SUBGOALS, TASKS, strict=True))
+    kinds = list(zip(lengths, PROMPTS, SUBGOALS, TASKS, strict=True))
     for length, prompt, subgoals, task in [kind for kind in kinds for _ in range(repeats)]:
         colour = rng.integers(60, 255, 3)
         drift = rng.normal(size=7)

@@ -15,7 +15,7 @@ from lerobot_memobench.policies.memobench_mem.losses import counted_actions, mea
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
 from tests.support import rank_case
 from tests.support.fork_server import ForkServer
-from tests.support.small_policy import CHUNK, batch_of, made_for_training, open_small_training, small_config
+from tests.support.small_policy import CHUNK, batch_of, draw_modulation, made_for_training, small_config
 
 
 @pytest.mark.parametrize("memory", ["none", "frames"])
@@ -74,10 +74,10 @@ def test_mean_losses_without_padding_is_the_mean() -> None:
 @pytest.mark.parametrize("memory", ["subgoal", "keyframes"])
 def test_evaluation_loss_uses_the_memorys_own_choice(objects: Path, memory: str) -> None:
     policy, before, _, dataset = made_for_training(
-        objects, memory=memory, memory_frames=32, perception="objects", size="small"
+        objects, memory=memory, frames=32, perception="objects", size="small"
     )
     if memory == "keyframes":
-        policy.model.fusion.open_gate()  # so that actions depend on the memory
+        draw_modulation(policy.model)  # so that actions depend on what it reads
     batch = before(batch_of(dataset, [10, 30, 50]))
     others = {name: (batch[name] + 1) % len(policy.config.subgoal_texts) for name in (SUBGOAL, SUBGOALS)}
     with torch.no_grad():

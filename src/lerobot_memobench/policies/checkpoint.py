@@ -29,7 +29,10 @@ RANDOM_IF_MISSING = ("pi0", "pi05", "pi0_fast")
 ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
-REMOVED_FIELDS = {"align_weight", "feature_cache_dir", "min_lr_ratio", "shuffle_seed"}
+REMOVED_FIELDS = {
+    *("align_weight", "feature_cache_dir", "full_chunk_when_stalled", "memory_frames", "min_lr_ratio", "open_gate"),
+    *("shuffle_seed", "tokens_per_frame"),
+}
 """Fields of memobench_mem in checkpoints of earlier versions (`update_checkpoint`)."""
 
 

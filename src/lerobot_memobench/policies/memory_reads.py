@@ -1,4 +1,4 @@
-"""Memory reads: how much each action chunk reads of each remembered frame, keyframe or slot.
+"""Memory reads: the share of each remembered frame, keyframe or slot in the attention of an action chunk.
 
 ``memory_reads=true`` writes ``memory_reads/<task>.<episode>.json.gz`` next to the log as each episode ends. Rates do
 not need these files; the HTML report draws them.
@@ -35,11 +35,11 @@ class Chunk(TypedDict):
     """The reads of one action chunk.
 
     Attributes:
-        step: control step at which it was planned. The policy counts from its first observation, which is the
-            execution's first where the prompt plays in ``reset``.
-        entries: control steps of the frames that it could read, in ascending order; -1, -2, ... for entries without a
-            frame, such as slots.
-        weights: how much of each, as shares of attention; they sum to one where attention goes to memory alone.
+        step: control step of the plan, counted from the policy's first observation; this is the execution's first if
+            the prompt plays in ``reset``.
+        entries: control steps of the readable frames, ascending; -1, -2, ... for entries without a frame, such as
+            slots.
+        weights: share of attention on each entry; the sum is one if only memory is attended to.
     """
 
     step: Count
@@ -51,10 +51,9 @@ class EpisodeReads(TypedDict):
     """The content of a file.
 
     Attributes:
-        seed: that of episode 0 + the episode's number; the log has the scene's, which several episodes share where each
-            scene is run with each variant.
-        referent: of the episode, as in its line of the log.
-        chunks: in the order in which they were planned.
+        seed: the seed of episode 0 plus the episode's number. The log has the scene's seed, shared by its variants.
+        referent: of the episode, as in the log.
+        chunks: in the order of their plans.
     """
 
     seed: Whole
@@ -66,11 +65,11 @@ class EpisodeReads(TypedDict):
 
 
 def chunk_reads(steps: list[int], memory: MemoryTokens, layers: list[Tensor]) -> list[Chunk]:
-    """Return the reads of the chunks of B rows, which are planned at these control steps.
+    """Return the reads of the chunks of B rows that are planned at these control steps.
 
     Args:
-        layers: how much was read of each token in each layer and pass, (B, L) each. They are averaged, and summed over
-            the tokens of an entry, or over its shares of tokens (`MemoryTokens.sources`).
+        layers: attention on each token in each layer and pass, (B, L) each. They are averaged, and summed over the
+            tokens of an entry, or over its shares of tokens (`MemoryTokens.sources`).
     """
     import torch
     from einops import einsum
@@ -121,12 +120,12 @@ class ReadLog:
 
     @contextmanager
     def noting(self, task: str, policy: Any, seeds: Sequence[int]) -> Iterator[Callable[[NDArray[np.bool_]], None]]:
-        """Watch a batch of rollouts; the function that is yielded writes the reads of episodes that are over (rows,).
+        """Watch a batch of rollouts; the yielded function writes the reads of finished episodes, a mask (rows,).
 
-        An episode that the log held already observes and plans nothing, and keeps the file that it has.
+        Episodes that were already in the log are not planned and keep their files.
 
         Raises:
-            MemobenchError: the policy does not give its reads.
+            MemobenchError: the policy cannot report its reads.
         """
         policy.watch_memory()
         written = np.zeros(len(seeds), bool)
@@ -151,10 +150,10 @@ class ReadLog:
 def find_reads(
     folder: Path, records: Sequence[Mapping[str, Any]], protocol: Mapping[str, Any]
 ) -> tuple[dict[int, list[Chunk]], list[str]]:
-    """Return position of a rollout in ``records`` -> its chunks, and a note on files that are left out.
+    """Return index of a rollout in ``records`` -> its chunks, and a note about ignored files.
 
-    Steps are those of a report's timeline: the episode's, prompt included. A timeline leaves pauses out, so rollouts
-    with pauses have no chunks.
+    Steps count from the episode's beginning, prompt included, as in a report's timeline. Timelines have no pauses, so
+    rollouts with pauses have no chunks.
     """
     unseen = protocol.get("prompt_in") == RESET
     found: dict[int, list[Chunk]] = {}
@@ -168,11 +167,11 @@ def find_reads(
         except MemobenchError as error:
             misfits.append(str(error))
             continue
-        # The clock of a strict task counts its prompt, seen or not.
+        # The clock of a strict task counts its prompt, even if the policy did not see it.
         shift = int(record.get("prompt_steps") or 0) if unseen and record.get("suite", PUBLISHED) == PUBLISHED else 0
         chunks = [_later(chunk, shift) for chunk in reads["chunks"]]
         if not _is_of(reads, record) or not _fit(chunks, record):
-            misfits.append(f"{path} is not of the rollout in the log")
+            misfits.append(f"{path} does not belong to the rollout in the log")
         elif not record.get("paused_steps"):
             found[k] = chunks
     if not misfits:
@@ -193,7 +192,7 @@ def _is_of(reads: EpisodeReads, record: Mapping[str, Any]) -> bool:
 
 
 def _fit(chunks: Sequence[Chunk], record: Mapping[str, Any]) -> bool:
-    """Return whether chunks were planned within a rollout, each with one weight per entry, all of its past."""
+    """Return whether all chunks lie within the rollout, with one weight per entry and no future entries."""
     paused, steps = int(record.get("paused_steps") or 0), record.get("steps")
     end = None if steps is None else int(record.get("prompt_steps") or 0) + int(steps) + paused
     return all(

@@ -11,15 +11,15 @@ from lerobot_memobench.errors import MemobenchError
 
 PACKAGES = ("lerobot", "lerobot_memobench")
 PLUGIN = "lerobot_policy_"
-"""First part of the name of every package that LeRobot imports as a plugin."""
+"""Prefix of the packages that LeRobot imports as plugins."""
 NAMES_CODE = ("class", "registry_name", "_target_")
-"""Keys by which a nested mapping would ask for an object to be built."""
+"""Keys of nested mappings that would build an object."""
 REMOTE_CODE = {
     "action_tokenizer_name": "lerobot/fast-action-tokenizer",
     "paligemma_tokenizer_name": "google/paligemma-3b-pt-224",
     "model_name": "nvidia/Cosmos-Reason2-2B",
 }
-"""Settings of LeRobot's steps that name a repository whose Python code is run -> LeRobot's own values."""
+"""Settings of LeRobot's steps that run the Python code of a repository -> LeRobot's values."""
 
 
 def check_step(file: Path, step: Mapping[str, Any], kind: str | None) -> None:
@@ -55,11 +55,11 @@ def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
 
 
 def _registered(name: str, kind: str | None) -> type | None:
-    """Return the class of a step that the policy's module, or another one, registers; None where there is none."""
+    """Return the class of a registered step; None if no imported module registers it."""
     from lerobot.policies.factory import get_policy_class
     from lerobot.processor import ProcessorStepRegistry
 
-    with suppress(Exception):  # a policy whose packages are not installed
+    with suppress(Exception):  # packages of the policy may be missing
         get_policy_class(str(kind))
     with suppress(KeyError):
         return ProcessorStepRegistry.get(name)

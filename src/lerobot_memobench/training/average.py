@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import as_trained, checkpoint_file, undamaged
-from lerobot_memobench.policies.memobench_mem.checkpoints import name_here, read_tensors, restarted
+from lerobot_memobench.policies.memobench_mem.checkpoints import read_tensors, restarted
 
 logger = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ def begin_average(policy: Any) -> WeightAverage | None:
     trained: Any = as_trained(source, config, revision)
     with undamaged(path), safe_open(path, framework="pt") as file:
         metadata = file.metadata()
-    held = {name_here(policy, name, trained): one for name, one in states_of(read_tensors(path), metadata).items()}
+    held = states_of(read_tensors(path), metadata)
     states = {name: held[name] for name in held.keys() & average.parameters.keys() - restarted(policy, trained)}
     wrong = sorted(name for name, one in states.items() if one.weights.shape != average.parameters[name].shape)
     if wrong:

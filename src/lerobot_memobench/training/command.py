@@ -60,7 +60,6 @@ TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path
 MEMORY_DEFAULTS: Mapping[str, object] = {
     "memory_stride": None,
     "memory_fusion": None,
-    "memory_frames": 32,
     "memory_phase": False,
     "subgoals": None,
 }

@@ -1,12 +1,13 @@
-"""LeRobot's pair of transformers (PaliGemma and the action expert) at the dimensions of a policy.
+"""LeRobot's two transformers (PaliGemma and the action expert) at the dimensions of a policy, and their precision.
 
-LeRobot fixes vocabulary, image tower and widths inside its constructor. It runs here on the meta device (no memory, no
-time); the sized modules are then built at the policy's dimensions.
+LeRobot fixes vocabulary, image tower and widths in its constructor. The constructor runs here on the meta device, which
+takes no memory and no time; the modules are then built at the policy's dimensions.
 """
 
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -30,6 +31,36 @@ from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, O
 from lerobot_memobench.sim.object_slots import classes
 
 
+class Precision:
+    """Keep trainable parameters of a bfloat16 policy in float32 and frozen ones in bfloat16.
+
+    A bfloat16 weight near 1 has steps of 1/128, so updates at a learning rate of 5e-5 would round to zero. As in the
+    reference implementation of pi0.5, trained weights are float32 and autocast rounds them for each pass. Frozen
+    weights, and all weights of a policy that only acts, keep LeRobot's bfloat16.
+
+    Args:
+        parameters: all of the module's, as cast by LeRobot.
+    """
+
+    def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
+        self._narrow = [parameter for parameter in parameters if parameter.dtype == torch.bfloat16]
+
+    def settle(self) -> None:
+        """Convert trainable parameters to float32 and frozen ones to bfloat16."""
+        for parameter in self._narrow:
+            parameter.data = parameter.data.to(torch.float32 if parameter.requires_grad else torch.bfloat16)
+
+    def narrowed(self) -> dict[nn.Parameter, torch.dtype]:
+        """Return the parameters that are float32 now and bfloat16 in a policy that only acts, with that type."""
+        return {parameter: torch.bfloat16 for parameter in self._narrow if parameter.dtype == torch.float32}
+
+    def computing(self, device: torch.device) -> contextlib.AbstractContextManager[object]:
+        """Return the context of a pass: autocast to bfloat16 if weights are float32."""
+        if any(parameter.dtype == torch.float32 for parameter in self._narrow):
+            return torch.autocast(device.type, dtype=torch.bfloat16)
+        return contextlib.nullcontext()
+
+
 def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
     """Build LeRobot's module, with the encoder of observations as ``perception``.
 
@@ -49,7 +80,7 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
         vlm = _resize(backbone.paligemma.config, dims, image_size)
         expert = deepcopy(backbone.gemma_expert.config)
         expert.vocab_size = dims.vocabulary
-    # pi0.5's weights replace all of these.
+    # Loading pi0.5's weights replaces all of these.
     with no_init_weights() if config.base_weights else contextlib.nullcontext():
         backbone.paligemma = PaliGemmaForConditionalGenerationWithPiGemma(config=vlm)
         backbone.gemma_expert = PiGemmaForCausalLM(config=expert)
@@ -60,7 +91,7 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
     for module in (tower.vision_tower, tower.multi_modal_projector):
         seed_parameters(module, VISION_SEED)
     backbone._set_requires_grad()
-    # Cached tokens are projected ones, so the projection is frozen with the tower. pi0.5 never uses its language heads.
+    # Cached tokens are projected, so the projection is frozen with the tower. pi0.5 does not use its language heads.
     for module in (tower.multi_modal_projector, backbone.paligemma.lm_head, backbone.gemma_expert.lm_head):
         module.requires_grad_(False)
     backbone.perception = _perception(config, tower)
@@ -69,7 +100,7 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
 
 
 def embed_images(backbone: Any, images: list[Tensor]) -> list[Tensor]:
-    """Return prefix tokens (B, n, D) of each part of the observation; parts of equal shape are encoded in one batch."""
+    """Return the prefix tokens (B, n, D) of each part of the observation; parts of equal shape share one pass."""
     encode = backbone.perception.prefix
     if len({image.shape for image in images}) > 1:
         return [encode(image) for image in images]
@@ -77,9 +108,8 @@ def embed_images(backbone: Any, images: list[Tensor]) -> list[Tensor]:
 
 
 def _perception(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:
-    """Build the encoder of observations; one that is not pi0.5's image tower replaces it."""
+    """Build the encoder of observations; another encoder than pi0.5's image tower replaces the tower."""
     if config.uses_visual_encoder:
-        # The policy loads its weights.
         tower = vlm.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
         vlm.multi_modal_projector = nn.Identity()
         return VisualTokenEncoder(
@@ -99,16 +129,16 @@ def _perception(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:
         )
     vlm.vision_tower, vlm.multi_modal_projector = nn.Identity(), nn.Identity()
     config.object_classes = config.object_classes or list(classes())
-    slots = config.object_classes, config.tokens_per_frame, config.dimensions.vlm.width
+    slots = config.object_classes, config.dimensions.vlm.width
     if config.detector is not None:
-        # Noise is for privileged object state alone: a policy that was trained by it goes on without.
+        # Detection noise applies to privileged object state only.
         detect = ObjectsFromPictures(load_detector(config.detector))
         return DetectionEncoder(detect, *slots, config.memory_phase)
     return ObjectEncoder(*slots, config.detection_noise, config.memory_phase)
 
 
 def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:
-    """Return a copy of LeRobot's PaliGemma configuration with this size's vocabulary and image tower."""
+    """Return a copy of LeRobot's PaliGemma configuration with the vocabulary and image tower of ``dims``."""
     config = deepcopy(vlm)
     config._vocab_size = config.image_token_index = dims.vocabulary
     config.vocab_size = config.text_config.vocab_size = dims.vocabulary

@@ -1,4 +1,4 @@
-"""Encoders of pictures: present observations to prefix tokens, and remembered ones to a memory encoder's input.
+"""Encoders of pictures: present pictures to prefix tokens, remembered pictures to the input of a memory.
 
 `ObservationEncoder` is the interface. `ImageTowerEncoder` is pi0.5's frozen image tower; `VisualTokenEncoder` reads
 tokens of the frozen encoder of `lerobot_memobench.perception`. Encoders of objects are in `objects`.
@@ -27,43 +27,43 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRI
 if TYPE_CHECKING:
     from transformers.models.paligemma.modeling_paligemma import PaliGemmaMultiModalProjector
 
-LOUD = 8.0
-"""How much larger than a layer's output tokens are made; at 1 they learned slower."""
+TOKEN_SCALE = 8.0
+"""Factor of the tokens that trained encoders add to the prefix; with 1 they learned more slowly."""
 PrefixParts = tuple[list[Tensor], list[Tensor]]
-"""Present observations in the place of LeRobot's images: parts (B, ...), and masks of their real tokens: (B,) for all
-of a part, or (B, n)."""
+"""Present observations in place of LeRobot's images: parts (B, ...), and their masks: (B,) for a whole part, or (B, n)
+per token."""
 
 
 class ObservationEncoder(ABC):
-    """Encoder of present and remembered observations; training and rollouts use the same.
+    """Encoder of present and remembered observations, in training and in rollouts.
 
     Attributes:
-        memory_input: name of the observation of which a remembered frame is made.
-        dim: D, width of the tokens that the memory's encoder is given.
-        grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
-        pictures: whether it reads pictures, which an environment may repeat.
+        memory_input: name of the observation that is remembered.
+        dim: D, width of the memory's input tokens.
+        tokens_per_frame: P, number of the memory's input tokens.
+        grid: side of the square of a picture's tokens; 0 if tokens have no place in a picture.
     """
 
     memory_input: str
     dim: int
+    tokens_per_frame: int
     grid: int
-    pictures: bool
 
     @property
     @abstractmethod
     def key(self) -> str:
-        """Identity of the remembered tokens: with equal keys, equal frames have equal tokens."""
+        """Identity of the stored tokens: with equal keys, equal frames have equal tokens."""
 
     @abstractmethod
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the stored tokens (n, P, D') of some rows of an observation; nothing in them learns."""
+        """Return the stored tokens (n, P, D') of some rows of an observation, without trained weights."""
 
     def observed(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a batch as a policy observes it while it learns, with the errors of its sensors."""
+        """Return a training batch with simulated errors of the sensors."""
         return batch
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts | None:
-        """Return the parts of a batch of present observations; None where they are LeRobot's images."""
+        """Return the parts of a batch of present observations; None: LeRobot's images."""
         return None
 
     @abstractmethod
@@ -71,18 +71,17 @@ class ObservationEncoder(ABC):
         """Return the prefix tokens (B, n, d_vlm) of one part (B, ...)."""
 
     def pool(self) -> nn.Module:
-        """Return a new module from stored frames (N, P', D') to the tokens (N, P, D) that a memory is given."""
+        """Return a new module that maps stored frames (N, P', D') to the memory's input tokens (N, P, D)."""
         return nn.Identity()
 
 
-VISION_SEED = 20_250_705  # weights of an image tower for which none were given
+VISION_SEED = 20_250_705  # of an image tower without given weights
 
 
 def seed_parameters(module: nn.Module, seed: int) -> None:
-    """Draw a module's weights from a fixed seed, the same on every machine: matrices ~ N(0, 1/fan_in), biases 0.
+    """Draw a module's weights from a fixed seed, equal on every machine: matrices ~ N(0, 1/fan_in), biases 0, norms 1.
 
-    Norm weights are one. The image tower gets these when no weights are given, so a cache made today agrees with a
-    policy built tomorrow.
+    An image tower without given weights gets these, so that cached features match policies built later.
     """
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -113,14 +112,15 @@ def fingerprint(modules: dict[str, nn.Module]) -> str:
 THUMBNAIL = 64
 """Side of a thumbnail, pixels."""
 THUMBNAILS = f"grey-{THUMBNAIL}x{THUMBNAIL}"
-"""Identity of thumbnails: with equal keys, equal pictures have equal ones."""
+"""Identity of thumbnails in feature caches."""
 LUMA = (0.299, 0.587, 0.114)
 
 
 @torch.no_grad()
 def thumbnails(pictures: Tensor) -> Tensor:
-    """Return small grey copies (N, 1, THUMBNAIL^2) bfloat16, which holds 0 ... 255 exactly, of pictures (N, 3, H, W)
-    in [0, 1].
+    """Return small grey copies (N, 1, THUMBNAIL^2) of pictures (N, 3, H, W) in [0, 1].
+
+    Values are 0 ... 255, which bfloat16 holds exactly.
     """
     grey = (pictures.to(torch.float32) * pictures.new_tensor(LUMA, dtype=torch.float32)[:, None, None]).sum(dim=1)
     small = interpolate(grey.unsqueeze(1), (THUMBNAIL, THUMBNAIL), mode="area")
@@ -146,12 +146,11 @@ class ImageTowerEncoder(ObservationEncoder):
 
     Args:
         resolution: height and width of the tower's pictures, pixels.
-        camera: its pictures are remembered. thumbnails: as small grey copies.
+        camera: the remembered camera. thumbnails: remember small grey copies instead of tokens.
     """
 
     tokens_per_frame = MEMORY_GRID**2
     grid = MEMORY_GRID
-    pictures = True
 
     def __init__(
         self,
@@ -167,7 +166,7 @@ class ImageTowerEncoder(ObservationEncoder):
 
     @cached_property
     def key(self) -> str:
-        """Identity of the tokens this makes: weights, input size and pooling."""
+        """Identity of the tokens: weights, input size and pooling."""
         weights = fingerprint({"vision_tower": self.tower, "multi_modal_projector": self.projector})
         return f"{weights}-{self.resolution[0]}x{self.resolution[1]}-mean{self.tokens_per_frame}"
 
@@ -183,14 +182,14 @@ class ImageTowerEncoder(ObservationEncoder):
         images = images.to(device, torch.float32)
         if tuple(images.shape[-2:]) != tuple(self.resolution):
             images = resize_with_pad_torch(images, *self.resolution)
-        # Mixed precision would make rollout tokens differ from cached ones.
+        # With mixed precision, tokens of a rollout would differ from cached tokens.
         with torch.autocast(device.type, enabled=False):
             return pool_tokens(self.prefix(images * 2.0 - 1.0)).to(torch.bfloat16)
 
     def prefix(self, observed: Tensor) -> Tensor:
         """Return all patch tokens (B, g*g, D) of pictures (B, 3, H, W) in [-1, 1], in the pictures' precision.
 
-        The tower computes in float32 whatever the rest of the model does.
+        The tower always computes in float32.
         """
         return self.projector(self.tower(observed.to(torch.float32)).last_hidden_state).to(observed.dtype)
 
@@ -208,7 +207,7 @@ def encoded_key(camera: str) -> str:
 
 
 class PixelPool(nn.Module):
-    """The pooled tokens of a remembered picture at the policy's width, of unit size as those of `ObjectPool`."""
+    """Project the pooled tokens of a remembered picture to the policy's width, at unit size as in `ObjectPool`."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -221,17 +220,16 @@ class PixelPool(nn.Module):
 
 
 class VisualTokenEncoder(nn.Module, ObservationEncoder):
-    """Tokens of all cameras' present pictures by the frozen visual encoder; pooled ones of one camera are remembered.
+    """Encode the present pictures of all cameras by the frozen visual encoder; remember pooled tokens of one camera.
 
     Args:
-        tower: folded. It is the model's own part, as image towers are, and not registered here.
-        cameras: of the present. camera: of the memory. width: of the policy's tokens.
-        thumbnails: small grey copies are remembered, and no tokens.
+        tower: folded; registered as a part of the model and not here.
+        cameras: of the present. camera: the remembered one. width: of the policy's tokens.
+        thumbnails: remember small grey copies instead of tokens.
     """
 
     tokens_per_frame = POOLED**2
     grid = POOLED
-    pictures = True
 
     def __init__(
         self, tower: VisualEncoder, cameras: Sequence[str], camera: str, width: int, thumbnails: bool = False
@@ -271,16 +269,16 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
 
     @torch.no_grad()
     def pooled(self, tokens: Tensor) -> Tensor:
-        """Return pooled tokens (N, 16, WIDTH) bfloat16 of those that `encode` returns."""
+        """Return pooled tokens (N, 16, WIDTH) bfloat16 of the tokens of `encode`."""
         tower = self.tower
         with torch.autocast(tower.grid_position.device.type, enabled=False):
             return tower.pooled(tokens.to(tower.grid_position.device, torch.float32)).to(torch.bfloat16)
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return each camera's tokens (B, 64, WIDTH), all of them real: encoded in the batch, or of its pictures.
+        """Return each camera's tokens (B, 64, WIDTH): those in the batch, or encoded from its pictures.
 
         Raises:
-            MemobenchError: it has neither of a camera.
+            MemobenchError: the batch has neither for a camera.
         """
         parts = [self._tokens(batch, camera) for camera in self.cameras]
         return parts, [torch.ones(len(part), dtype=torch.bool) for part in parts]
@@ -293,7 +291,7 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         return self.encode(batch[camera])
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the pooled tokens (n, 16, WIDTH) of some rows' pictures, or of their tokens; or thumbnails."""
+        """Return pooled tokens (n, 16, WIDTH), or thumbnails, of some rows."""
         if self.thumbnails:
             return thumbnails(batch[self.memory_input][list(rows)])
         chosen = {
@@ -304,8 +302,8 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
     def prefix(self, observed: Tensor) -> Tensor:
         """Return prefix tokens (B, 64, d_vlm) of a camera's tokens."""
         made: Tensor = self.project(observed.to(self.project.weight.dtype))
-        return made * LOUD
+        return made * TOKEN_SCALE
 
     def pool(self) -> nn.Module:
-        """Return a projection of each frame's tokens."""
+        """Return a trained projection of each frame's tokens."""
         return PixelPool(self.dim)

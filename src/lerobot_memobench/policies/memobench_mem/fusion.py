@@ -1,13 +1,12 @@
-"""Ways in which actions read memory tokens: `MemoryFusion`, `Reading`, and the two general ones.
+"""How actions read memory tokens: the interface `MemoryFusion`, its `Reading`, and two general implementations.
 
-`Modulation` scales and shifts the input of every feed-forward of the action expert (RoboMME's modulator); `Context`
-appends memory to the prefix. Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
+`Modulation` scales and shifts the input of each feed-forward layer of the action expert (RoboMME's modulator);
+`Context` appends memory to the prefix. Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
 """
 
 from __future__ import annotations
 
 import functools
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, cast
@@ -25,10 +24,10 @@ class Prefix(NamedTuple):
 
     Attributes:
         tokens: (B, N, D). real: (B, N) bool, False for padding.
-        instruction: (B, W), added to the condition of the expert's norms; None: nothing is added.
-        attends: (B, N, N) bool, whether a token (first N) attends to another (last N); None: to all real ones.
+        instruction: (B, W), added to the condition of the expert's norms; None: no such term.
+        attends: (B, N, N) bool, whether a token (first N) attends to another (last N); None: to all real tokens.
         unread: number of leading tokens to which actions do not attend.
-        asked: the tokens whose last states `Reading.read_out` takes; None: none.
+        asked: tokens whose last states are passed to `Reading.read_out`; None: no tokens.
     """
 
     tokens: Tensor
@@ -39,28 +38,31 @@ class Prefix(NamedTuple):
     asked: slice | None = None
 
     def joined(self, tokens: Tensor, real: Tensor) -> Prefix:
-        """Append tokens to which all attend."""
+        """Append tokens that attend to all tokens, and to which all tokens attend."""
         more = tokens.to(self.tokens.dtype)
         return Prefix(torch.cat([self.tokens, more], dim=1), torch.cat([self.real, real], dim=1), self.instruction)
 
 
 class Reading:
-    """One memory as one pass of the model reads it. This base class is plain pi0.5, which reads none.
+    """The memory in one pass of the model. This base class is plain pi0.5, which reads no memory.
 
     Attributes:
-        outputs: results of the pass beyond actions, for `MemoryMechanism.losses`.
-        attention: attention weights (B, H, N, M) of each layer, of the prefix and of the actions; None: not collected.
+        watches: the parts of the model whose attention weights `shares` needs: ``prefix``, ``actions``, ``memory``.
+        outputs: results of the pass other than actions, for `MemoryMechanism.losses`.
+        attention: part -> the attention weights of its layers, if the pass is watched; else empty.
     """
+
+    watches: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, watched: bool = False) -> None:
         self.outputs: dict[str, Tensor] = {}
-        self.attention: tuple[list[Tensor], list[Tensor]] | None = ([], []) if watched else None
+        self.attention: dict[str, list[Tensor]] = {part: [] for part in self.watches} if watched else {}
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
         """Return the model's prefix, given pi0.5's.
 
         Args:
-            state: index of the token of the robot's state; None: there is none.
+            state: index of the token of the robot's state; None: no such token.
         """
         return prefix
 
@@ -81,24 +83,26 @@ class Reading:
         return inputs
 
     def read_out(self, states: Tensor) -> None:
-        """Take the last states (B, n, D) of the prefix's tokens that it asked for."""
+        """Receive the last states (B, n, D) of the tokens `Prefix.asked`."""
 
     def expert_states(self, states: Tensor) -> None:
-        """Take the expert's last states (B, T, W)."""
+        """Receive the expert's last states (B, T, W)."""
 
     def shares(self) -> list[Tensor]:
-        """Return how much the pass read of each memory token, (B, L) per layer, if it was watched."""
+        """Return the share of attention on each memory token in a watched pass, (B, L) per layer."""
         return []
 
 
 class MemoryFusion(ABC):
-    """A way in which actions read memory tokens; made once for a model, to which it may add parameters.
+    """How actions read memory tokens. It is built once per model and may add parameters to it.
 
     Attributes:
-        tells_reads: whether `Reading.shares` of a watched pass are known.
+        reports_reads: whether `Reading.shares` of a watched pass is implemented.
+        parts: names of the modules that it adds to the model, each with a dot.
     """
 
-    tells_reads: ClassVar[bool] = False
+    reports_reads: ClassVar[bool] = False
+    parts: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
@@ -109,16 +113,8 @@ class MemoryFusion(ABC):
         """Begin a pass over a memory of width ``memory_dim``.
 
         Args:
-            watched: collect how much of each token is read.
+            watched: collect attention weights for `Reading.shares`.
         """
-
-    def owns(self, name: str) -> bool:
-        """Return whether a parameter of the model belongs to this fusion and not to pi0.5."""
-        return False
-
-    def place_of(self, name: str) -> str:
-        """Return the name in this model of a parameter of plain pi0.5."""
-        return name
 
 
 # -- modulation -------------------------------------------------------------------------------------------------------
@@ -128,36 +124,36 @@ _ROPE_BASE = 10_000.0
 
 
 class RMSNorm(nn.Module):
-    """Root-mean-square norm with a learned scale that starts at one (Gemma's form)."""
+    """Root-mean-square norm with a learned scale that starts at one, as in Gemma."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Norm of x (..., W), in float32."""
+        """Normalise x (..., W), in float32."""
         return rms_norm(x) * (1.0 + self.weight)
 
 
 @functools.lru_cache(maxsize=64)
 def _places(begin: int, count: int, width: int, device: torch.device) -> Tensor:
     """Return the rotations of ``count`` positions from ``begin`` on, for vectors of this width."""
-    with torch.inference_mode(False):  # a training may use them after a rollout
+    with torch.inference_mode(False):  # training may use the cached tensors after a rollout
         frequencies = _ROPE_BASE ** -(torch.arange(width // 2, dtype=torch.float32, device=device) / (width // 2))
         return rotary(torch.arange(begin, begin + count, device=device), frequencies)
 
 
 def rotate_from(x: Tensor, begin: int) -> Tensor:
-    """Rotary position embedding of x (..., N, d), whose positions are ``begin``, ``begin`` + 1, ..."""
-    places = _places.__wrapped__ if torch.compiler.is_compiling() else _places  # else torch warns of the cache
+    """Apply rotary position embedding to x (..., N, d) at positions ``begin``, ``begin`` + 1, ..."""
+    places = _places.__wrapped__ if torch.compiler.is_compiling() else _places  # torch warns about the cache
     return rotate(x, places(begin, x.shape[-2], x.shape[-1], x.device))
 
 
 class MemoryModulator(nn.Module):
-    """Action tokens look into memory and come back with a scale and a shift for one feed-forward's input.
+    """Cross-attention of action tokens to memory, which returns scale and shift of one feed-forward's input.
 
     Multi-query attention: ``heads`` query heads of width W / heads, one key-value head; rotary positions 0 ... L-1 for
-    memory, L ... L+T-1 for actions. The last Linear starts at zero, so that training starts from plain pi0.5.
+    memory, L ... L+T-1 for actions. The last Linear starts at zero, so training starts from plain pi0.5.
     """
 
     def __init__(self, width: int, heads: int = 4) -> None:
@@ -174,7 +170,7 @@ class MemoryModulator(nn.Module):
         nn.init.zeros_(self.modulation.bias)
 
     def keys(self, memory: MemoryTokens) -> tuple[Tensor, Tensor]:
-        """Rotated keys and values, both (B, L, head_dim), of memory of width W."""
+        """Return rotated keys and values, both (B, L, head_dim), of memory of width W."""
         normed = memory.through(self.memory_norm)
         key, value = (normed.through(linear).rows() for linear in (self.key, self.value))
         return rotate_from(key, 0), value
@@ -184,16 +180,16 @@ class MemoryModulator(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return scale and shift, both (B, T, W), for actions (B, T, W) whose mean square is one.
 
-        A row whose memory is all masked reads zeros.
+        A row whose memory is fully masked reads zeros.
 
         Args:
-            memory: of width W. keys: those of this memory.
-            found: a list to which the share read of each memory token (B, L) is appended.
+            memory: of width W. keys: of `keys`.
+            found: a list to which the attention on each memory token (B, L) is appended.
         """
         weights: list[Tensor] | None = None if found is None else []
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
         query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
-        # A finite bias keeps the softmax of an all-masked row finite; its result is then set to zero.
+        # A finite bias keeps the softmax of a fully masked row finite; its result is then set to zero.
         read = attend(query, keys[0], keys[1].to(query.dtype), hidden(memory.mask)[:, None], weights)
         if found is not None and weights is not None:
             found.append(weights[0].mean(dim=(1, 2)) * memory.mask)
@@ -202,81 +198,45 @@ class MemoryModulator(nn.Module):
         return scale, shift
 
 
-class ModulatedNorm(nn.Module):
-    """Parameters of LeRobot's norm before an expert layer's feed-forward, and of the memory's modulation after it."""
-
-    def __init__(self, norm: nn.Module, modulator: MemoryModulator) -> None:
-        super().__init__()
-        self.norm = norm
-        self.modulator = modulator
-
-
 class ModulatedReading(Reading):
     """A pass whose expert is scaled and shifted by memory of the expert's width W."""
 
+    watches = ("memory",)
+
     def __init__(self, memory: MemoryTokens, modulators: Sequence[MemoryModulator], watched: bool) -> None:
-        super().__init__()
+        super().__init__(watched)
         self.memory, self.modulators = memory, modulators
-        self.found: list[Tensor] | None = [] if watched else None
-        # All denoising steps of a plan read the same keys. In training each layer runs once, or twice by checkpointing.
+        # All denoising steps of a plan share their keys. In training each layer runs once, or twice by checkpointing.
         self.keys = None if torch.is_grad_enabled() else [modulator.keys(memory) for modulator in modulators]
 
     def feed_forward(self, layer: int, normed: Tensor, inputs: Tensor) -> Tensor:
-        """Scale and shift pi0.5's input. The residual stays outside."""
+        """Scale and shift pi0.5's input; the residual is not changed."""
         modulator = self.modulators[layer]
         keys = modulator.keys(self.memory) if self.keys is None else self.keys[layer]
-        scale, shift = modulator(normed, self.memory, keys, self.found)
+        scale, shift = modulator(normed, self.memory, keys, self.attention.get("memory"))
         return torch.addcmul(shift, inputs, 1 + scale)
 
     def shares(self) -> list[Tensor]:
         """Return the modulators' attention to each token."""
-        return self.found or []
+        return self.attention["memory"]
 
 
 class Modulation(MemoryFusion):
-    """Memory at the expert's width, and a modulator in each of the expert's layers.
+    """Project memory to the expert's width, and modulate each of the expert's layers."""
 
-    Norms with a modulator are one level deeper than in plain pi0.5.
-    """
-
-    tells_reads = True
+    reports_reads = True
+    parts = ("memory_to_expert.", "modulators.")
 
     def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         self.model = model
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
-        for layer in model.paligemma_with_expert.gemma_expert.model.layers:
-            layer.post_attention_layernorm = ModulatedNorm(layer.post_attention_layernorm, MemoryModulator(expert_dim))
+        layers = model.paligemma_with_expert.gemma_expert.model.layers
+        model.modulators = nn.ModuleList(MemoryModulator(expert_dim) for _ in layers)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
         """Project the memory to the expert's width."""
         projected = memory.through(cast(nn.Linear, self.model.memory_to_expert))
-        return ModulatedReading(projected, self.modulators, watched)
-
-    @property
-    def modulators(self) -> list[MemoryModulator]:
-        """Those of the expert's layers."""
-        layers = self.model.paligemma_with_expert.gemma_expert.model.layers
-        return [layer.post_attention_layernorm.modulator for layer in layers]
-
-    def open_gate(self) -> None:
-        """Draw the layers that start at zero, so that memory gets gradients from the first update on."""
-        for modulator in self.modulators:
-            modulator.modulation.reset_parameters()
-
-    def owns(self, name: str) -> bool:
-        """Return whether a parameter is the projection's or a modulator's."""
-        return name.startswith("memory_to_expert.") or ".modulator." in name
-
-    def place_of(self, name: str) -> str:
-        """Return the name here of a parameter of a norm."""
-        if ".gemma_expert." not in name:
-            return name
-        return re.sub(r"post_attention_layernorm\.(dense|weight)", r"post_attention_layernorm.norm.\1", name)
-
-
-def plain_name(name: str) -> str:
-    """Return the name in plain pi0.5 of a parameter of any fusion's model."""
-    return name.replace("post_attention_layernorm.norm.", "post_attention_layernorm.")
+        return ModulatedReading(projected, [*self.model.modulators], watched)
 
 
 # -- context ----------------------------------------------------------------------------------------------------------
@@ -285,26 +245,30 @@ def plain_name(name: str) -> str:
 class ContextReading(Reading):
     """A pass whose prefix ends with the memory."""
 
+    watches = ("actions",)
+
     def __init__(self, memory: MemoryTokens, watched: bool) -> None:
         super().__init__(watched)
         self.memory = memory
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Append the memory, which attends and is attended like images and language."""
+        """Append the memory, which attends and is attended to like images and language."""
         return prefix.joined(self.memory.rows(), self.memory.mask)
 
     def shares(self) -> list[Tensor]:
-        """Return the share of the actions' attention that each memory token gets."""
+        """Return the share of the actions' attention on each memory token."""
         length = self.memory.mask.shape[1]
-        _, of_actions = self.attention or ([], [])
         # (B, heads, T, prefix and T), with memory at the prefix's end
-        return [weights[..., -weights.shape[2] - length : -weights.shape[2]].mean(dim=(1, 2)) for weights in of_actions]
+        return [
+            weights[..., -weights.shape[2] - length : -weights.shape[2]].mean(dim=(1, 2))
+            for weights in self.attention["actions"]
+        ]
 
 
 class Context(MemoryFusion):
-    """The whole prefix and the actions attend to memory tokens; nothing is added to the model."""
+    """Append memory tokens to the prefix, to which the actions attend; the model gets no further parameters."""
 
-    tells_reads = True
+    reports_reads = True
 
     def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         pass

@@ -1,27 +1,45 @@
-"""What layers of pi0.5 and of its memory are made of: norms, rotary positions, attention over one head of keys.
+"""Operations of pi0.5's layers and of its memory: norms, rotary positions, attention over one head of keys.
 
-They equal LeRobot's to rounding, and are quicker: fewer passes over the numbers, and fewer calls. Shapes: B rows,
-N queries, M keys, H heads of queries, d their width.
+They equal LeRobot's up to rounding and are faster. Shapes: B rows, N queries, M keys, H heads of queries of width d.
 """
 
 from __future__ import annotations
 
-import contextlib
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lerobot_memobench.policies.memobench_mem.products import exact_gradients, exact_products
-
 EPS = 1e-6
 FEW_KEYS = 64
-"""Up to here a CPU learns quicker by scores that are kept than by torch's kernel, which keeps none."""
+"""Up to this number of keys, attention with stored scores trains faster on a CPU than torch's fused kernel."""
+
+
+@contextmanager
+def exact_products() -> Iterator[None]:
+    """Compute matrix products in float32 inside an update that rounds them (`quick_products` of `training`).
+
+    A memory that compares vectors then makes the same choices as in a rollout; and small products are faster so.
+    """
+    products: Any = getattr(torch.backends.mkldnn, "matmul", None)  # torch >= 2.9
+    if products is None or products.fp32_precision != "bf16":
+        yield
+        return
+    fused = torch.backends.cuda.flash_sdp_enabled()
+    products.fp32_precision = "ieee"
+    torch.backends.cuda.enable_flash_sdp(True)
+    try:
+        yield
+    finally:
+        products.fp32_precision = "bf16"
+        torch.backends.cuda.enable_flash_sdp(fused)
 
 
 class _Normed(torch.autograd.Function):
-    """`rms_norm` with gradients in three passes; of torch's own, on a CPU, autograd makes ten."""
+    """`rms_norm` whose gradient takes three passes over the numbers; torch's own takes ten on a CPU."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -59,16 +77,16 @@ def modulated(x: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rotary(positions: Tensor, frequencies: Tensor) -> Tensor:
-    """Return the rotations (..., N, d / 2, 2) of positions (..., N): cosine and sine of each frequency (d / 2,)."""
+    """Return cosine and sine (..., N, d / 2, 2) of positions (..., N) at each frequency (d / 2,)."""
     angles = positions.unsqueeze(-1).to(torch.float32) * frequencies.to(torch.float32)
     return torch.stack([angles.cos(), angles.sin()], dim=-1)
 
 
 def rotate(x: Tensor, rotations: Tensor) -> Tensor:
-    """Return x (..., d) turned by rotations (..., d / 2, 2): halves are paired as in Gemma.
+    """Return x (..., d) rotated by cosines and sines (..., d / 2, 2); halves are paired as in Gemma.
 
-    The two numbers of a pair come to lie next to one another, in queries as in keys, whose products stay the same: a
-    product of complex numbers takes a fifth of the time on a CPU.
+    The result interleaves the two numbers of each pair, in queries and keys alike, so that their products stay the
+    same. Complex multiplication then takes a fifth of the time on a CPU.
     """
     first, second = x.chunk(2, dim=-1)
     if x.is_cpu and not torch.compiler.is_compiling():
@@ -79,18 +97,18 @@ def rotate(x: Tensor, rotations: Tensor) -> Tensor:
 
 
 def hidden(real: Tensor) -> Tensor:
-    """Return what is added to scores, given which tokens are read (bool): 0, or very low where none is to be read."""
+    """Return the bias of attention scores: 0 for tokens that are read (``real``), very low for all others."""
     return torch.where(real, 0.0, torch.finfo(torch.float32).min / 2)
 
 
 def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, found: list[Tensor] | None = None) -> Tensor:
-    """Return what queries (B, N, H, d) read of values, (B, N, H d).
+    """Return the attention output (B, N, H d) of queries (B, N, H, d) over keys and values (B, M, d).
 
-    All heads share keys and values (B, M, d), so that heads are queries as well: one product for all of them.
+    All heads share keys and values, so heads are computed as further queries in one product.
 
     Args:
-        bias: (B, 1, M), or (B, N, M) where queries differ, as `hidden` makes it.
-        found: takes how much is read of each (B, H, N, M), where somebody looks.
+        bias: (B, 1, M), or (B, N, M) if it differs between queries, as of `hidden`.
+        found: a list to which the attention weights (B, H, N, M) are appended.
     """
     rows, count, heads, width = query.shape
     flat, scale = query.reshape(rows, count * heads, width), width**-0.5
@@ -99,12 +117,9 @@ def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, found: list[
         bias = bias.repeat_interleave(heads, dim=1)
     many = torch.is_grad_enabled() and key.shape[1] > FEW_KEYS
     if found is None and (query.is_cuda or many):
-        exact = contextlib.nullcontext() if torch.compiler.is_compiling() else exact_products()
         mask = bias.expand(-1, count * heads, -1)[:, None]
-        with exact:
+        with nullcontext() if torch.compiler.is_compiling() else exact_products():
             read = F.scaled_dot_product_attention(flat[:, None], key[:, None], value[:, None], mask)
-        if not torch.compiler.is_compiling():
-            exact_gradients(read)
         return read.view(rows, count, heads * width)
     scores = torch.baddbmm(bias, flat, key.transpose(1, 2), alpha=scale)
     weights = scores.softmax(dim=-1, dtype=torch.float32)

@@ -1,12 +1,12 @@
 """The action loss, and sums over the ranks of a distributed training.
 
-Actions are learned by flow matching, as in pi0.5, or by regression, through the same passes of the same model. Flow
-matching learns the velocity ``noise - actions`` at every time between the two, and a chunk follows it from drawn noise.
-Regression asks at one place only, zero noise at time 1: the velocity there is minus the actions, and one Euler step
-ends at them.
+Actions are learned by flow matching, as in pi0.5, or by regression, with the same passes of the same model. Flow
+matching learns the velocity ``noise - actions`` at every time between noise and actions, and a chunk is integrated from
+drawn noise. Regression learns it only at zero noise and time 1, where the velocity is minus the actions, so that one
+Euler step yields the actions.
 
-LeRobot trains several processes with DDP, which averages gradients over them. All that ranks count together here is
-made for that average: it is then the gradient of the joint batch. Every rank must come by at the same time.
+DDP averages gradients over the ranks. The functions on ranks are scaled so that this average is the gradient of the
+joint batch; every rank must call them at the same time.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import PHASE
 
 _SMOOTH = 1e-6
-"""Square of the error below which the absolute error bends into its square: 0.001 of an action's deviation."""
+"""Squared error below which the absolute error becomes quadratic: 0.001 standard deviations of an action."""
 
 
 def noise_and_time(objective: str, model: Any, actions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return where a batch of actions (B, T, A) is learned: noise (B, T, A) and time (B,)."""
+    """Return noise (B, T, A) and time (B,) at which a batch of actions (B, T, A) is learned."""
     if objective == REGRESSION:
         return torch.zeros_like(actions), actions.new_ones(actions.shape[0])
     return (
@@ -38,12 +38,11 @@ def noise_and_time(objective: str, model: Any, actions: Tensor) -> tuple[Tensor,
 
 
 def losses_of(objective: str, squared: Tensor) -> Tensor:
-    """Return losses (B, T, A) of squared errors of the velocity: themselves, and for regression absolute errors with
-    them.
+    """Return losses (B, T, A) of squared errors of the velocity; regression adds the absolute errors.
 
-    Absolute errors make actions exact, and squared ones are what a memory is learned by: to have chosen another of
-    three bowls is a large error in few frames. After 800 updates 20 of 20 bowls were right by both, 15 by squared
-    ones, one by absolute ones.
+    Absolute errors make actions exact. Squared errors train the memory, because choosing a wrong object is a large
+    error in few frames. After 800 updates, 20 of 20 chosen bowls were right with both terms, 15 with squared errors
+    only, and one with absolute errors only.
     """
     return squared + (squared + _SMOOTH).sqrt() if objective == REGRESSION else squared
 
@@ -52,8 +51,11 @@ ACTION_IS_PAD = "action_is_pad"
 
 
 class ActionLoss(NamedTuple):
-    """Loss per sample (B,), 0 where none of its actions counts; its mean over samples that count; and per number of an
-    action (A,).
+    """Action loss.
+
+    Attributes:
+        per_sample: (B,), 0 for samples without counted actions. mean: over samples with counted actions.
+        per_dim: (A,), per dimension of an action.
     """
 
     per_sample: Tensor
@@ -62,9 +64,9 @@ class ActionLoss(NamedTuple):
 
 
 def counted_actions(batch: Mapping[str, Tensor], losses: Tensor) -> Tensor:
-    """Return (B, T) 1 for actions of a batch that count: of the execution, and no padding.
+    """Return a mask (B, T) of the actions that count: those of the execution, without padding.
 
-    LeRobot pads chunks that reach beyond the end of their episode, and says so by ``action_is_pad`` (B, T).
+    LeRobot pads chunks that reach beyond the end of their episode, and marks them by ``action_is_pad`` (B, T).
     """
     counted = torch.ones(losses.shape[:2], device=losses.device)
     if ACTION_IS_PAD in batch:
@@ -75,9 +77,9 @@ def counted_actions(batch: Mapping[str, Tensor], losses: Tensor) -> Tensor:
 
 
 def mean_losses(losses: Tensor, counted: Tensor) -> ActionLoss:
-    """Mean of losses (B, T, A) over the actions that count (B, T), each of which weighs the same.
+    """Average losses (B, T, A) over the counted actions (B, T), with equal weights.
 
-    With several ranks the average of their means is the mean of the joint batch.
+    The average of the means of several ranks is the mean of the joint batch.
     """
     numbers = torch.stack([counted.sum(), counted.any(dim=1).sum()])
     actions, samples = mean_over_ranks(numbers).clamp(min=1.0 / world_size())
@@ -90,14 +92,14 @@ def mean_losses(losses: Tensor, counted: Tensor) -> ActionLoss:
 
 
 def world_size() -> int:
-    """Return how many processes train together; 1 where none were started."""
+    """Return the number of processes of the training; 1 without torch.distributed."""
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
 def mean_over_ranks(value: Tensor) -> Tensor:
-    """Return the mean of a number over the ranks, without gradient: a sum's denominator.
+    """Return the mean of a number over the ranks, without gradient, as the denominator of a sum.
 
-    A rank's sum over this is its loss; the average of those losses is the joint sum over the joint count.
+    Each rank's loss is its sum divided by this mean; the average of these losses is the joint sum over the joint count.
     """
     value = value.detach().clone()
     if world_size() > 1:
@@ -106,16 +108,16 @@ def mean_over_ranks(value: Tensor) -> Tensor:
 
 
 def rank_of_world() -> tuple[int, int]:
-    """Return this process's rank and the number of processes that train together."""
+    """Return this process's rank and the number of processes of the training."""
     return (dist.get_rank(), dist.get_world_size()) if world_size() > 1 else (0, 1)
 
 
 def joint(rows: Tensor) -> Tensor:
     """Return the rows (n, D) of all ranks, (sum of n, D), in the order of the ranks; n may differ, and may be 0.
 
-    Gradients flow back to the rank that a row came from, summed over the ranks. Where each rank computes the same loss
-    of the joint rows, that is ``world_size`` times the loss's gradient, which DDP's average makes right again; what
-    every rank holds itself (a temperature) gets the same gradient everywhere and keeps it.
+    Gradients flow back to a row's rank, summed over the ranks. If each rank computes the same loss of the joint rows,
+    this sum is ``world_size`` times the loss's gradient, which DDP's average corrects. A parameter on every rank (a
+    temperature) gets the same gradient on all ranks.
     """
     if world_size() == 1:
         return rows

@@ -1,13 +1,12 @@
-"""``memobench_mem``: LeRobot's pi0.5 with a visual memory, trained with or without aligning it to subgoal texts.
+"""``memobench_mem``: LeRobot's pi0.5 with a visual memory, trained with or without alignment to subgoal texts.
 
-The policy from its construction to an update (``forward``) and to an action (``select_action``). Its network is in
-`network`, the rows of a rollout in `rollout`, parts of training in `training`, model checkpoints in `checkpoints`.
+This file is the policy: its construction, updates (``forward``) and actions (``select_action``). The network is in
+`network`, the rows of a rollout in `rollout`, checkpoints in `checkpoints`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import copy
 import logging
 import threading
 import time
@@ -22,7 +21,6 @@ from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
 from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
@@ -30,12 +28,13 @@ from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_weights
 from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
+from lerobot_memobench.policies.memobench_mem.backbone import Precision
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
+    has_another_memory,
     load_base_weights,
     load_weights,
     read_config,
     read_tensors,
-    remembers_otherwise,
     require_agreement,
     require_statistics,
     weights_file,
@@ -74,30 +73,30 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 )
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.precision import Precision
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
 from lerobot_memobench.policies.memory_reads import Chunk, chunk_reads
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
-# A saved pipeline is built right after its policy, by the names under which its steps register when imported.
+# Importing the processor registers the steps of saved pipelines, which are built after the policy.
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
 
 logger = logging.getLogger(__name__)
 
 OWN_MODULES = (
-    *("model.memory", "model.memory_to_expert", "modulator", "alignment", "model.foresight", "model.subgoal"),
+    *("model.memory", "model.memory_to_expert", "model.modulators", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
 )
-"""Ends of the names of modules that plain pi0.5 does not have; beside adapters (``--peft…``) they are trained whole."""
+"""Suffixes of the names of modules that plain pi0.5 does not have; with adapters (``--peft…``), all their weights are
+trained."""
 
 
 class MemobenchMemPolicy(PI05Policy):
-    """pi0.5 plus memory. ``forward`` trains, ``select_action`` acts; both read the same history at the same frame.
+    """pi0.5 with a memory. ``forward`` and ``select_action`` read the same history at the same frame.
 
     Attributes:
-        alignment: objective and head that tie memory to text; None without one.
-        precision: in which the weights are kept.
-        rollout: what is kept of the rows that it acts in.
+        alignment: objective and head that align memory with text; None without alignment.
+        precision: of the weights.
+        rollout: the rows of the present rollout.
     """
 
     config_class = MemobenchMemConfig
@@ -118,22 +117,20 @@ class MemobenchMemPolicy(PI05Policy):
 
         Args:
             dataset_meta: metadata of the dataset to train on; None: the policy only acts.
-            load_base: False if a checkpoint's weights follow.
-            draw: whether weights are drawn; False where all of them follow: at full size this takes two minutes.
+            load_base: False if a checkpoint's weights are loaded afterwards.
+            draw: False to skip the initialisation of weights, which takes two minutes at full size.
         """
-        # As PI05Policy.__init__, which names its model class.
+        # As PI05Policy.__init__, whose model class is fixed.
         PreTrainedPolicy.__init__(self, config)
         config.validate_features()
         self.init_rtc_processor()
         with contextlib.nullcontext() if draw else no_init_weights():
             self.model = MemoryPI05(config, rtc_processor=self.rtc_processor)
         dims = config.dimensions
-        self.alignment = make_alignment(
-            config.align, dims.vlm.width, dims.text_dim, config.memory_frames, config.tokens_per_frame
-        )
+        self.alignment = make_alignment(config.align, dims.vlm.width, dims.text_dim, config.tokens_per_frame)
         self.precision = Precision(list(self.parameters()))
         if dataset_meta is not None:
-            self.precision.settle()  # before weights are loaded, which may be finer than bfloat16
+            self.precision.settle()  # before loading weights, which may be float32
         if config.base_weights and load_base:
             source = config.base_weights
             path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
@@ -147,7 +144,7 @@ class MemobenchMemPolicy(PI05Policy):
         self.rollout = Rollout(self._remembers, config.memory_stride)
         self._watched = False
         self.reset()
-        self._thread: int | None = None  # whichever acts first
+        self._thread: int | None = None  # set by the first action
 
     @property
     def perception(self) -> ObservationEncoder:
@@ -168,7 +165,7 @@ class MemobenchMemPolicy(PI05Policy):
         return self.model.memory is not None
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> PrefixParts:
-        """Return what the model is given in the place of images: the observation's parts, and the state's token."""
+        """Return the model's inputs instead of images: the observation's parts, and the state if it has a token."""
         parts, masks = self.perception.present(batch) or super()._preprocess_images(batch)
         if self.config.state_token:
             state = pad_vector(batch[OBS_STATE], self.config.max_state_dim)
@@ -183,29 +180,29 @@ class MemobenchMemPolicy(PI05Policy):
     # -- training --------------------------------------------------------------------------------------------------
 
     def trained_parameters(self) -> dict[str, nn.Parameter]:
-        """Return the parameters that learn, by the names that they have in a checkpoint."""
+        """Return the trainable parameters by their names in a checkpoint."""
         return {name: parameter for name, parameter in self.named_parameters() if parameter.requires_grad}
 
     def get_optim_params(self) -> list[nn.Parameter]:
-        """Return the parameters that learn, in float32: all but the image tower and what pi0.5 never uses."""
+        """Return the trainable parameters in float32: all except the image tower and pi0.5's unused weights."""
         self.precision.settle()
         return list(self.trained_parameters().values())
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Return the loss of the actions plus the weighted alignment on a preprocessed training batch.
+        """Return the action loss, plus the memory's losses and the weighted alignment, of a preprocessed batch.
 
-        In a loss that is only measured (``eval_loss``: not training, no gradients) actions follow the subgoal that a
-        privileged memory chooses, and its own losses compare with the true one.
+        When the loss is only measured (``eval_loss``: evaluation mode without gradients), actions follow the subgoal
+        that a privileged memory chooses, and the memory's own losses compare the choice with the true one.
 
         Args:
-            batch: the inputs of LeRobot's pi0.5, and ``memory.*`` and ``phase`` as the preprocessor of a training adds
-                them. A policy without a memory takes batches of LeRobot's own trainer, too.
+            batch: the inputs of LeRobot's pi0.5, and ``memory.*`` and ``phase`` of the training's preprocessor. A
+                policy without memory also takes batches of LeRobot's own trainer.
             reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
 
         Returns:
-            The loss, and numbers to log: ``action_loss``, the memory's own losses, and with an alignment
-            ``align_loss`` (unweighted), ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and
-            ``align_top1`` (share of memory vectors whose nearest text in the batch is theirs).
+            The loss, and numbers to log: ``action_loss``, the memory's losses, and with an alignment ``align_loss``
+            (unweighted), ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and ``align_top1``
+            (share of memory vectors whose nearest text in the batch is their own).
 
         Raises:
             MemobenchError: the batch has no memory.
@@ -214,7 +211,7 @@ class MemobenchMemPolicy(PI05Policy):
         measures = not self.training and not torch.is_grad_enabled()
         with self.precision.computing(self._device):
             memory = self.read_memory(batch)
-            if measures and self.config.privileged_memory:  # whose losses are of the labels, and actions of its choice
+            if measures and self.config.privileged_memory:  # actions follow the memory's own choice
                 memory = self.read_memory(_without_labels(batch))
             reading = self.model.reading(memory)
             per_sample, total, logged = self._action_loss(batch, reading)
@@ -233,10 +230,10 @@ class MemobenchMemPolicy(PI05Policy):
         return (per_sample if reduction == "none" else total), logged
 
     def _with_phase(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a training batch with the phase of each sample, if the dataset records one.
+        """Return a training batch with the phase of each sample, if the dataset has phases.
 
         Raises:
-            MemobenchError: a policy with a memory gets a batch without one.
+            MemobenchError: the policy has a memory and the batch has none.
         """
         if self._remembers and FRAMES not in batch:
             raise MemobenchError(
@@ -259,10 +256,10 @@ class MemobenchMemPolicy(PI05Policy):
         return {} if memory is None else memory.losses({**batch, **reading.outputs})
 
     def _query(self, batch: dict[str, Tensor], rows: Sequence[int] | None = None, *, writes: bool = False) -> Query:
-        """Return the present of some rows of a batch as far as the memory asks for it.
+        """Return the present of some rows of a batch, as far as the memory needs it.
 
         Args:
-            rows: all of them where None. writes: a frame is written, whose own tokens are at hand.
+            rows: None: all. writes: whether the query is for writing, which has the frame's own tokens.
         """
         memory, device = self.model.memory, self._device
         assert memory is not None
@@ -276,7 +273,7 @@ class MemobenchMemPolicy(PI05Policy):
         return query
 
     def _action_loss(self, batch: dict[str, Tensor], reading: Reading) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Return the loss of the actions per sample (B,), its mean over the actions that count, and numbers to log."""
+        """Return the action loss per sample (B,), its mean over the counted actions, and numbers to log."""
         seen, actions = self._seen(batch), self.prepare_action(batch)
         drawn = noise_and_time(self.config.objective, self.model, actions)
         squared = self.model.forward(seen, actions, *drawn, reading)[:, :, : self._action_dim]
@@ -288,7 +285,7 @@ class MemobenchMemPolicy(PI05Policy):
     # -- acting ----------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Forget histories and planned actions. LeRobot calls it once per batch of episodes."""
+        """Clear histories and planned actions. LeRobot calls it once per batch of episodes."""
         super().reset()
         self.rollout.reset()
         self.rollout.late = self._rtc_enabled()
@@ -298,7 +295,7 @@ class MemobenchMemPolicy(PI05Policy):
         self._acting_rows: list[int] = []
 
     def drop_queued_actions(self) -> None:
-        """Plan anew at the next step, and keep the histories; LeRobot's main asks for it with a new instruction."""
+        """Replan at the next step and keep the histories; LeRobot's main branch calls it for a new instruction."""
         for row in self.rollout.rows:
             row.drop_chunk()
 
@@ -306,12 +303,12 @@ class MemobenchMemPolicy(PI05Policy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next action of every row (B, A), normalised.
 
-        Every row uses up its own chunk: ``n_action_steps`` of it, or all (``full_chunk_when_stalled``). A chunk is
-        planned from that row alone, so rows of a batch are independent, when the row's execution begins or its last
-        chunk is used up. In the prompt phase, where actions have no effect, and for frozen rows nothing is planned.
+        A row is replanned when its execution begins or its queue is empty (`Row.begin_chunk`). A chunk depends on its
+        own row only, so rows of a batch are independent. No chunk is planned in the prompt phase, in which actions have
+        no effect, and for frozen rows.
         """
         self._check_thread()
-        if self.training:  # a millisecond, if it were said at every step
+        if self.training:  # calling eval() at every step would take a millisecond
             self.eval()
         _, _, frozen = self.observe(batch)
         rows = self.rollout.rows
@@ -323,7 +320,7 @@ class MemobenchMemPolicy(PI05Policy):
         wanting = [number for number in acting if not rows[number].queue]
         if wanting:
             chunks = self.plan(batch, wanting, self._noise(wanting))
-            states = batch[OBS_RAW_STATE] if self.config.full_chunk_when_stalled else None
+            states = batch[OBS_RAW_STATE] if self.config.uses_objects else None
             for number, chunk in zip(wanting, chunks.float().cpu(), strict=True):
                 state = None if states is None else states[number]
                 rows[number].begin_chunk(chunk, self.config.n_action_steps, state)
@@ -333,20 +330,17 @@ class MemobenchMemPolicy(PI05Policy):
         return torch.stack([none if row.last is None else row.last for row in rows]).to(self._device)
 
     def _check_thread(self) -> None:
-        """Refuse to act in another thread than the one that began, as ``env.max_parallel_tasks`` makes LeRobot do.
-
-        Rollouts one after the other may come from any thread.
-        """
+        """Check that one thread runs the whole rollout; LeRobot's ``env.max_parallel_tasks`` would mix several."""
         if self._thread is None:
             self._thread = threading.get_ident()
         if self._thread != threading.get_ident():
             raise MemobenchError(
-                "Two threads act with one memobench_mem policy, whose memory of one rollout would then enter the "
-                "other; evaluate with --env.max_parallel_tasks=1, and more rows per task by --eval.batch_size."
+                "two threads act with one memobench_mem policy, which would mix the memories of their rollouts; "
+                "evaluate with --env.max_parallel_tasks=1, and more rows per task by --eval.batch_size."
             )
 
     def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
-        """Take the current frames of all rows into their histories.
+        """Add the present frames of all rows to their histories.
 
         Returns:
             Per row its control step since the episode began, whether a new episode began, and whether it is frozen.
@@ -354,7 +348,7 @@ class MemobenchMemPolicy(PI05Policy):
         name = self.perception.memory_input
         if name not in batch:
             what = f"'{name}'" if name else "picture"
-            raise MemobenchError(f"The observation has no {what}, which this policy remembers; {cure(name, batch)}")
+            raise MemobenchError(f"the observation has no {what}, which this policy remembers; {cure(name, batch)}")
         count = len(batch[name])
         steps = _column(batch, OBS_STEP) or [self._step()] * count
         phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
@@ -368,7 +362,7 @@ class MemobenchMemPolicy(PI05Policy):
         return steps, started, frozen
 
     def _step(self) -> int:
-        """Return the control step since `reset` where observations show none: one for each call, or by real time."""
+        """Return the control step since `reset` if observations have no clock: by calls, or in real time with RTC."""
         if not self._rtc_enabled():
             return self._calls
         now = time.monotonic()
@@ -382,14 +376,14 @@ class MemobenchMemPolicy(PI05Policy):
         assert memory is not None
         frames = self.perception.remember(batch, rows).to(self._device)
         with self.precision.computing(self._device):
-            for row, frame in zip(rows, frames.split(1), strict=True):  # one by one: no row depends on others
+            for row, frame in zip(rows, frames.split(1), strict=True):  # one by one, so that rows are independent
                 held = self.rollout.rows[row]
                 query = self._query(batch, [row], writes=True)
                 state = memory.init(1) if held.memory is None else held.memory
                 held.memory = memory.observe(state, frame, torch.tensor([held.position], device=self._device), query)
 
     def remembered(self, batch: dict[str, Tensor], rows: Sequence[int]) -> MemoryTokens:
-        """Return the memory tokens that chunks of some rows of the batch read now."""
+        """Return the memory tokens that chunks of some rows of the batch would read now."""
         memory = self.model.memory
         assert memory is not None
         return memory.read(memory.join([self.rollout.rows[row].memory for row in rows]), self._query(batch, rows))
@@ -402,10 +396,10 @@ class MemobenchMemPolicy(PI05Policy):
         training: bool = False,
         **kwargs: Any,
     ) -> Tensor:
-        """Return action chunks (n, chunk, A) of some rows of the batch, with their histories and sampling noise.
+        """Return action chunks (n, chunk, A) of some rows of the batch, given their histories and sampling noise.
 
         Args:
-            training: whether it is a training batch, which brings its histories; true subgoals are not read.
+            training: whether the batch is a training batch, which has its own histories; labels are not read.
         """
         inputs = [*self._inputs, *(key for key in batch if key.startswith(ENCODED))]
         part = {key: batch[key][rows] for key in inputs if key in batch}
@@ -424,24 +418,24 @@ class MemobenchMemPolicy(PI05Policy):
         return actions[:, :, : self._action_dim]
 
     def _keep_reads(self, rows: Sequence[int], memory: MemoryTokens, reading: Reading) -> None:
-        """Keep how much the chunks of some rows read of their memory."""
+        """Store the memory reads of the chunks of some rows."""
         held = [self.rollout.rows[row] for row in rows]
         found = chunk_reads([row.position for row in held], memory, reading.shares())
         for row, read in zip(held, found, strict=True):
             row.reads.append(read)
 
     def watch_memory(self, watched: bool = True) -> None:
-        """Keep from now on how much each chunk reads of what is remembered, for `memory_reads`; or keep it no more."""
+        """Start or stop recording how much each chunk reads of the remembered entries, for `memory_reads`."""
         self.config.check_memory_reads()
         self._watched = watched
 
     def memory_reads(self) -> list[list[Chunk]]:
-        """Return of each row how much the chunks of its episode have read."""
+        """Return the memory reads of the chunks of each row's episode."""
         return [row.reads for row in self.rollout.rows]
 
     @property
     def _inputs(self) -> list[str]:
-        """Observations of the present that the model is given, if they are there."""
+        """Keys of the present observation that the model reads, if present."""
         images = [*self.config.image_features] if self.config.uses_pictures else []
         objects = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.uses_objects else []
         return [*images, *objects, OBS_STATE, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
@@ -450,73 +444,65 @@ class MemobenchMemPolicy(PI05Policy):
         missed = self.rollout.missed(rows)
         if missed is not None:
             raise MemobenchError(
-                f"This policy remembers every {self.rollout.stride} control steps, and was not shown step {missed} of "
-                "this episode: its memory would be another one than in training; offer it the observation of every "
-                "control step, by select_action or by observe."
+                f"this policy remembers every {self.rollout.stride} control steps and did not observe step {missed} of "
+                "this episode, so its memory would differ from training; pass the observation of every control step to "
+                "select_action or observe."
             )
 
-    def _noise(self, rows: list[int]) -> Tensor:
-        return self._stacked(lambda row, shape: self.rollout.rows[row].noise(shape), rows)
-
-    def _stacked(self, draw: Callable[[int, tuple[int, int]], Tensor], rows: Iterable[int]) -> Tensor:
-        """Return the noise (n, chunk, max_action_dim) that is drawn for each row; zeros by regression."""
+    def _noise(self, rows: Iterable[int], draw: Callable[[int, tuple[int, int]], Tensor] | None = None) -> Tensor:
+        """Return noise (n, chunk, max_action_dim) for the plans of rows, by default their own; zeros by regression."""
         shape = self.config.chunk_size, self.config.max_action_dim
-        regression = self.config.objective == REGRESSION
-        return torch.stack([torch.zeros(shape) if regression else draw(row, shape) for row in rows])
+        if self.config.objective == REGRESSION:
+            return torch.stack([torch.zeros(shape) for _ in rows])
+        own = draw or (lambda row, shape: self.rollout.rows[row].noise(shape))
+        return torch.stack([own(row, shape) for row in rows])
 
     def needs_observation(self) -> bool:
-        """Return whether the next observation's pictures or objects are read: it is remembered, or planned from.
+        """Return after an action whether the next observation's pictures or objects are read, for memory or a plan.
 
-        Asked after an action. Whether the next frame is the first of an execution, where chunks begin, only the
-        environment knows: that one is observed in any case, as the first of an episode.
+        The first frames of an episode and of its execution, which only the environment can foresee, are always read.
         """
         return self.rollout.writes_next() or any(not self.rollout.rows[row].queue for row in self._acting_rows)
 
     def has_planned_action(self) -> bool:
-        """Return whether the next action is planned and no frame will be remembered: then only the clock is read."""
+        """Return whether the next action needs only the clock of the observation."""
         return not self.needs_observation()
 
     def supports_rtc(self) -> bool:
-        """Return whether LeRobot's real-time chunking may ask this policy for its chunks.
-
-        It guides the denoising of a chunk, which regression lacks.
-        """
+        """Return whether LeRobot's real-time chunking, which guides denoising, is possible; regression has none."""
         return bool(super().supports_rtc()) and self.config.objective != REGRESSION
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Take in one observation per row and plan for all rows: (B, chunk, A), normalised.
+        """Observe one frame per row, and return plans for all rows (B, chunk, A), normalised.
 
-        A policy that remembers must be offered the observation of every control step by `observe`, this one included,
-        unless it holds its step (``observation.step``); or let `select_action` do so. A training batch is answered
-        with the histories that it brings. ``noise`` (B, chunk, max_action_dim) replaces the episodes' own; other
-        keywords are LeRobot's real-time chunking ones, which offers one observation per chunk: it is remembered at the
-        step at which it is seen, for the frames that were due since the last one.
+        A policy with a memory must have observed every control step (`observe`), unless observations have a clock
+        (``observation.step``); `select_action` observes by itself. A training batch has its own histories. ``noise``
+        (B, chunk, max_action_dim) replaces the episodes' own; other keywords are those of LeRobot's real-time chunking.
+        That passes one observation per chunk, which then also replaces the frames due since the last one.
 
         Raises:
-            MemobenchError: observations were left out between two chunks; or real-time chunking, by regression.
+            MemobenchError: observations were left out between two chunks; or real-time chunking with regression.
         """
         self.eval()
         if self._rtc_enabled() and self.config.objective == REGRESSION:
             raise MemobenchError(
-                "Real-time chunking guides the denoising of a plan, which a policy of objective=regression lacks: its "
-                "plans would not continue the last one; use --inference.type=sync, or train with "
-                "--policy.objective=flow_matching."
+                "real-time chunking guides denoising, which a policy with objective=regression lacks; use "
+                "--inference.type=sync, or train with --policy.objective=flow_matching."
             )
         noise = kwargs.pop("noise", None)
-        if PHASE in batch:  # of a training
+        if PHASE in batch:  # a training batch
             samples = range(len(batch[PHASE]))
             if noise is None:
-                noise = self._stacked(lambda _, shape: torch.randn(shape), samples)
+                noise = self._noise(samples, lambda _, shape: torch.randn(shape))
             return self.plan(batch, [*samples], noise, training=True, **kwargs)
         if OBS_STEP in batch or not self._remembers or not self._calls or self._rtc_enabled():
             self.observe(batch)
         elif self._calls == self._planned:
             raise MemobenchError(
-                "This policy remembers observations of every control step, and was asked for two plans with no "
-                "observation between them: its memory would be another one than in training; let select_action take "
-                "every observation (--inference.type=sync), offer each to observe before planning, or train with "
-                "--policy.memory=none."
+                "this policy needs the observation of every control step, and was asked for two plans without an "
+                "observation between them, so its memory would differ from training; pass every observation to "
+                "select_action (--inference.type=sync) or to observe, or train with --policy.memory=none."
             )
         self._planned = self._calls
         rows = list(range(len(self.rollout.rows)))
@@ -534,22 +520,20 @@ class MemobenchMemPolicy(PI05Policy):
         dataset_meta: Any | None = None,
         **kwargs: Any,
     ) -> MemobenchMemPolicy:
-        """Load a checkpoint: the averaged weights.
+        """Load a checkpoint's averaged weights.
 
         Args:
             dataset_meta: metadata of the dataset to train on; None: the policy only acts.
 
-        LeRobot's pi0.5 goes on with random weights when loading fails; this does not.
-
         Raises:
-            MemobenchError: weights that do not fit, or, for evaluation, missing statistics.
+            MemobenchError: weights do not fit, or, for evaluation, statistics are missing.
         """
         source = pretrained_name_or_path
         config = read_config(source, config, revision)
         path = weights_file(source, revision, named=f"The checkpoint '{source}'", fix="give a pretrained_model folder")
         if dataset_meta is None:
             require_statistics(source, revision)
-        # The steps lie with an adapter, and not with what it adapts, of which these are the weights.
+        # With an adapter, ``source`` is the base; the processor steps are saved with the adapter.
         saved, of = (config.pretrained_path, config.pretrained_revision) if config.use_peft else (source, revision)
         if saved is not None:
             require_agreement(saved, of, config, training=dataset_meta is not None)
@@ -558,29 +542,18 @@ class MemobenchMemPolicy(PI05Policy):
         trained = as_trained(source, config, revision)
         assert isinstance(trained, MemobenchMemConfig)
         check_weights(source, trained, revision)
-        policy = cls(config, dataset_meta=dataset_meta, load_base=False, draw=remembers_otherwise(config, trained))
+        policy = cls(config, dataset_meta=dataset_meta, load_base=False, draw=has_another_memory(config, trained))
         load_weights(policy, path, source, trained)
         policy.to(config.device)
         policy.eval()
         return policy
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> MemobenchMemPolicy:
-        """Return a copy with weights and rollout of its own.
-
-        The copy has no graph of the last pass: `backward` goes through the original.
-        """
-        made = self.__new__(type(self))
-        memo[id(self)] = made
-        with _WithoutGraph():
-            made.__dict__.update(copy.deepcopy(self.__dict__, memo))
-        return made
-
     # -- adapters --------------------------------------------------------------------------------------------------
 
     def wrap_with_peft(self, peft_config: Any = None, peft_cli_overrides: dict[str, Any] | None = None) -> Any:
-        """Wrap the policy with adapters (LeRobot's ``--peft…``); memory and heads are trained whole beside them.
+        """Add adapters (LeRobot's ``--peft…``); all weights of memory and heads are trained as well.
 
-        The adapters' base is what evaluation loads beneath them: a checkpoint's averaged weights.
+        The base of the adapters is a checkpoint's averaged weights, as in evaluation.
         """
         wrapped = super().wrap_with_peft(peft_config, peft_cli_overrides)
         self.precision.settle()
@@ -596,28 +569,19 @@ class MemobenchMemPolicy(PI05Policy):
         return overrides
 
     def trained_whole(self, asked: Iterable[str] = ()) -> list[str]:
-        """Return peft's ``modules_to_save``: those ``asked`` for, and memory and heads as far as there are some."""
+        """Return peft's ``modules_to_save``: the modules ``asked`` for, and the model's memory and heads."""
         names = [name for name, _ in self.named_modules()]
         own = [end for end in OWN_MODULES if any(name == end or name.endswith(f".{end}") for name in names)]
         return [*asked, *(end for end in own if end not in set(asked))]
 
 
-class _WithoutGraph(TorchFunctionMode):
-    """Copy tensors that autograd made as plain tensors, where torch refuses to copy them."""
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is Tensor.__deepcopy__ and not args[0].is_leaf:
-            return args[0].detach().clone()
-        return func(*args, **(kwargs or {}))
-
-
 def _without_labels(batch: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return a batch without the true subgoals, by which a privileged memory chooses as in a rollout."""
+    """Return a batch without true subgoals, so that a privileged memory chooses as in a rollout."""
     return {name: value for name, value in batch.items() if name not in (SUBGOAL, SUBGOALS)}
 
 
 def _column(batch: dict[str, Tensor], key: str) -> list[int] | None:
-    """Return a whole number per row, None where a batch does not have it."""
+    """Return an integer per row; None if the batch does not have the key."""
     if key not in batch:
         return None
     return [round(value) for value in batch[key].reshape(len(batch[key]), -1)[:, 0].tolist()]

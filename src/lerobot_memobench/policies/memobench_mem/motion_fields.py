@@ -1,9 +1,9 @@
-"""What moves from one stored frame to the next: the interface `MotionField`, of pictures and of objects.
+"""Motion between stored frames: the interface `MotionField`, for pictures and for objects.
 
-A field has C cells of K numbers. Of pictures a cell is a block of the thumbnail, and its motion is found by exhaustive
-block matching, as a video codec does; of objects it is a slot, or the hand, and its motion a displacement.
+A field has C cells of K numbers. Of pictures a cell is a block of the thumbnail, whose motion is found by exhaustive
+block matching, as in a video codec; of objects it is a slot, or the hand, whose motion is a displacement.
 
-Shapes: N pairs of frames, B samples, h pairs of a sample, n frames that follow, W width of tokens.
+Shapes: N pairs of frames, B samples, h pairs of a sample, n following frames, W width of tokens.
 """
 
 from __future__ import annotations
@@ -19,15 +19,21 @@ from einops import rearrange
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL, ObservationEncoder
-from lerobot_memobench.policies.memobench_mem.objects import CLASS_DIM, HAND_DIM, MIDDLE, PER_METRE, ObjectEncoder
+from lerobot_memobench.policies.memobench_mem.objects import (
+    CLASS_DIM,
+    HAND_DIM,
+    PER_METRE,
+    WORKSPACE_CENTRE,
+    ObjectEncoder,
+)
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 
 
 class MotionField(nn.Module, ABC):
-    """Motion between two stored frames, and tokens of it; the tokens' layers learn.
+    """Motion between two stored frames, and tokens of it; the layers of the tokens are trained.
 
     Attributes:
-        size: D', numbers of a stored frame. cells: C. numbers: K of a cell, of which the first ``moved`` are motion.
+        size: D', numbers of a stored frame. cells: C. numbers: K of a cell; the first ``moved`` are motion.
     """
 
     size: int
@@ -37,23 +43,23 @@ class MotionField(nn.Module, ABC):
 
     @abstractmethod
     def between(self, before: Tensor, now: Tensor) -> Tensor:
-        """Return the field (N, C, K) from stored frames (N, 1, D') to those after them; nothing in it learns."""
+        """Return the field (N, C, K) between stored frames (N, 1, D'), without trained weights."""
 
     @abstractmethod
     def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the motion (B, n, C, moved) of what the first of frames (B, n + 1, 1, D') shows, frame by frame.
+        """Follow the cells of the first of frames (B, n + 1, 1, D') from frame to frame.
 
         Returns:
-            Beside it which cells are known, (B, n, C) bool.
+            Their motion (B, n, C, moved), and for which cells it is known, (B, n, C) bool.
         """
 
     @abstractmethod
     def tokens(self, fields: Tensor) -> Tensor:
-        """Return tokens (B, T, W), with their positions, of the fields (B, h, C, K) of a sample, oldest first."""
+        """Return tokens (B, T, W), positions included, of the fields (B, h, C, K) of a sample, oldest first."""
 
 
 def motion_field(observations: ObservationEncoder, width: int, pairs: int = 8) -> MotionField:
-    """Return the motion field of what an encoder stores of a frame; ``pairs`` is h, ``width`` W."""
+    """Return the motion field for the stored frames of an encoder; ``pairs`` is h, ``width`` W."""
     if isinstance(observations, ObjectEncoder):
         return ObjectMotion(observations.order, observations.kinds, width, pairs)
     return PictureMotion(width, pairs)
@@ -66,28 +72,26 @@ BLOCKS = 16
 """Side of the square of blocks."""
 BLOCK = THUMBNAIL // BLOCKS
 REACH = 4
-"""How far a block may have moved in each direction, pixels of the thumbnail. In demonstrations of two tasks 3 % of the
-blocks that moved reached it in four steps, and 27 % in eight; in one step most moved by less than a pixel."""
-STILL = 2.0
-"""Mean difference of a block's pixels, of 255, up to which it stands still, as a codec skips it: what compression of
-videos changes."""
+"""Maximum displacement of a block in each direction, pixels of the thumbnail. In demonstrations of two tasks 3 % of the
+moving blocks reached it in four steps, and 27 % in eight; in one step most moved by less than a pixel."""
+UNCHANGED = 2.0
+"""Mean difference of a block's pixels, of 255, up to which its motion is zero: the noise of video compression."""
 OFFSETS = sorted(itertools.product(range(-REACH, REACH + 1), repeat=2), key=lambda offset: math.hypot(*offset))
-"""Rows and columns from a block to where it may have been; of equally good ones the nearest counts."""
+"""Candidate offsets (rows, columns) to a block's earlier place, nearest first, which decides ties."""
 WIDE = 512
 """From this width on a token covers 2 x 2 blocks, as in the source, else 4 x 4."""
 
 
 @torch.no_grad()
 def match_blocks(before: Tensor, now: Tensor) -> Tensor:
-    """Return by how many pixels each block of pictures (N, S, S) has moved since others, (N, 16, 16, 2): x, y.
+    """Return the displacement (N, 16, 16, 2) in pixels, x and y, of each block between pictures (N, S, S).
 
-    Every offset within `REACH` is tried, beyond the picture's edge too, where its outermost pixels go on. The least sum
-    of absolute differences counts.
+    The offset within `REACH` with the least sum of absolute differences is chosen; pictures are padded by their edge.
     """
-    moving = F.avg_pool2d((now - before).abs().unsqueeze(1), BLOCK).squeeze(1) > STILL
+    moving = F.avg_pool2d((now - before).abs().unsqueeze(1), BLOCK).squeeze(1) > UNCHANGED
     around = F.pad(before.unsqueeze(1), (REACH,) * 4, mode="replicate").squeeze(1)
     side = BLOCK + 2 * REACH
-    # Blocks last, side by side: sums then run over all of them at once.
+    # Blocks are the last axis, so that sums run over all of them at once.
     windows = rearrange(around.unfold(1, side, BLOCK).unfold(2, side, BLOCK)[moving], "m y x -> y x m").contiguous()
     blocks = rearrange(now.unfold(1, BLOCK, BLOCK).unfold(2, BLOCK, BLOCK)[moving], "m y x -> y x m").contiguous()
     costs = [
@@ -124,7 +128,7 @@ class PictureMotion(MotionField):
         return match_blocks(earlier, later).flatten(1, 2)
 
     def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Match each frame's blocks with those of the one before it; all are known."""
+        """Match each frame's blocks with those of the previous frame; all are known."""
         pairs = self.between(frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1))
         moved = pairs.unflatten(0, (len(frames), -1))
         return moved, torch.ones(moved.shape[:-1], dtype=torch.bool, device=moved.device)
@@ -139,17 +143,17 @@ class PictureMotion(MotionField):
 
 
 SAME = 0.15
-"""How far a thing may have moved from one frame to the next, m; beyond it another one is in its place."""
+"""Maximum displacement of a thing between two frames, m; beyond it, another thing is assumed."""
 PER_STEP = 200.0
-"""What brings displacements (m) and changes of joints (m or rad) in a control step to about one."""
+"""Factor that scales displacements (m) and changes of joints (m or rad) per control step to about one."""
 MOVED = 4
 """Displacement (3) and change of the joint (1)."""
 
 
 class ObjectMotion(MotionField):
-    """Displacement of each slot's thing and of the hand; of each pair of frames a token, pooled by learned attention.
+    """Displacement of each slot's thing and of the hand; one token per pair of frames, pooled by learned attention.
 
-    A cell's numbers are its motion, whether it is known, its class, and its place. Hand: class ``kinds``.
+    A cell's numbers are its motion, whether it is known, its class, and its place. The hand has class ``kinds``.
 
     Args:
         order, kinds: of classes, as of `objects.SlotEncoder`.
@@ -166,29 +170,29 @@ class ObjectMotion(MotionField):
         self.times = nn.Parameter(torch.randn(pairs, width) * 0.02)
 
     def between(self, before: Tensor, now: Tensor) -> Tensor:
-        """Return for each slot of the earlier frame, and for the hand, where its thing has gone."""
+        """Return the displacement of the thing in each slot of the earlier frame, and of the hand."""
         field, _ = self._between(before, now)
         return field
 
     def _between(self, before: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the field (N, C, K), and in which cell of the later frame each thing is, (N, C)."""
+        """Return the field (N, C, K), and the cell of each thing in the later frame, (N, C)."""
         (then, kind, place, joint), (later, later_kind, later_place, later_joint) = map(self._cells, (before, now))
         apart = torch.cdist(place, later_place)
         another = ~then.unsqueeze(2) | ~later.unsqueeze(1) | (kind.unsqueeze(2) != later_kind.unsqueeze(1))
         apart = apart.masked_fill(another | (apart > SAME), torch.inf)
-        nearest = apart.argmin(dim=2)  # of equal things the nearest, if each is the other's
+        nearest = apart.argmin(dim=2)  # things match if each is the other's nearest of the same class
         back = apart.argmin(dim=1).gather(1, nearest)
         cells = torch.arange(self.cells, device=back.device)
         known = (back == cells) & apart.isfinite().any(dim=2)
         gone = later_place.gather(1, nearest.unsqueeze(-1).expand_as(place)) - place
         turned = later_joint.gather(1, nearest.unsqueeze(-1)) - joint
         moved = PER_STEP * torch.cat([gone, turned], dim=-1) * known.unsqueeze(-1)
-        seen = place.new_tensor(MIDDLE)
+        seen = place.new_tensor(WORKSPACE_CENTRE)
         parts = [moved, known.unsqueeze(-1), kind.unsqueeze(-1), (place - seen) * PER_METRE]
         return torch.cat([part.to(place.dtype) for part in parts], dim=-1), nearest
 
     def _cells(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return of stored frames which cells hold a thing (N, C), their classes (N, C), places and joints."""
+        """Return which cells of stored frames hold a thing (N, C), and their classes (N, C), places and joints."""
         slots, hand, _ = frames.to(torch.float32).flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
         slots = slots.unflatten(1, (SLOTS, WIDTH))
         alone = torch.ones_like(hand[:, :1])
@@ -199,7 +203,7 @@ class ObjectMotion(MotionField):
         return there, kind, place, joint
 
     def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Follow the things of the first frame from frame to frame, until one is lost."""
+        """Follow each thing of the first frame from frame to frame until it is lost."""
         count = frames.shape[1] - 1
         pairs, went = self._between(frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1))
         pairs, went = (of.unflatten(0, (-1, count)) for of in (pairs, went))

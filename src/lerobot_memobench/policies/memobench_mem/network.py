@@ -1,4 +1,4 @@
-"""pi0.5 with a memory, at a chosen size: LeRobot's transformers, our passes over them, and the memory mechanism."""
+"""pi0.5 with a memory at a chosen size: LeRobot's transformers, passes over them, and the memory mechanism."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch.utils.checkpoint import checkpoint
 
 from lerobot_memobench.policies.memobench_mem.backbone import embed_images, make_backbone
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import LOUD, ObservationEncoder
+from lerobot_memobench.policies.memobench_mem.encoders import TOKEN_SCALE, ObservationEncoder
 from lerobot_memobench.policies.memobench_mem.fusion import Context, MemoryFusion, Modulation, Prefix, Reading
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
@@ -25,12 +25,12 @@ from lerobot_memobench.policies.memobench_mem.passes import PrefixKeys, adaptive
 
 FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
 OWN = ("state_token.", "instruction.", "paligemma_with_expert.perception.")
-"""First parts of the names of parameters that plain pi0.5 does not have, beyond the memory's."""
+"""Prefixes of the names of further parameters that plain pi0.5 does not have, except for the memory's."""
 
 
 @functools.cache
 def compiled(part: Callable[..., Any], mode: str) -> Callable[..., Any]:
-    """Compile a part of a pass without graph breaks; models share the result."""
+    """Compile a part of a pass without graph breaks, once for all models."""
     return torch.compile(part, mode=mode, fullgraph=True)
 
 
@@ -38,8 +38,8 @@ class Observation(NamedTuple):
     """Inputs of a pass.
 
     Attributes:
-        images: pictures or tokens of each part of the observation, the last of which is the state (B, dim) of a model
-            with a token of it. image_masks: (B,) or (B, n) bool of each, False where a part is missing.
+        images: pictures or tokens of each part of the observation; in a model with a state token, the last is the
+            state (B, dim). image_masks: (B,) or (B, n) bool of each part, False if it is missing.
         words: (B, n) token numbers of the instruction. word_masks: (B, n) bool, False for padding.
     """
 
@@ -52,13 +52,13 @@ class Observation(NamedTuple):
 class MemoryPI05(nn.Module):
     """pi0.5 at a policy's dimensions, with a memory.
 
-    No token of the prefix attends to an action, so every pass is two: one over the prefix, whose keys and values are
+    No token of the prefix attends to an action, so a pass has two parts: one over the prefix, whose keys and values are
     kept, and one over the actions for each step of denoising.
 
     Attributes:
-        memory: the memory mechanism. fusion: the way in which actions read its tokens. None: plain pi0.5.
-        state_token: of the robot's state, where it enters as numbers; None: it enters as words of the text prompt.
-        instruction: with a token of the state, maps the instruction to a condition of the action expert's norms.
+        memory: the memory mechanism. fusion: how actions read its tokens. None: plain pi0.5.
+        state_token: encodes the robot's state as a token; None: the text prompt spells the state.
+        instruction: with a state token, maps the instruction to a condition of the action expert's norms.
     """
 
     def __init__(self, config: MemobenchMemConfig, rtc_processor: Any = None) -> None:
@@ -82,22 +82,20 @@ class MemoryPI05(nn.Module):
         if config.memory == NONE:
             return
         self.memory = make_memory(config, self.paligemma_with_expert.perception)
-        self.fusion = (self.memory.fusion or FUSIONS[config.memory_fusion])(self, vlm_width, width)
-        if config.open_gate and isinstance(self.fusion, Modulation):
-            self.fusion.open_gate()
+        self.fusion = (self.memory.fusion or FUSIONS[str(config.memory_fusion)])(self, vlm_width, width)
 
     def reading(self, memory: MemoryTokens | None, watched: bool = False) -> Reading:
         """Begin a pass over memory tokens; None: plain pi0.5.
 
         Args:
-            watched: collect how much of each token is read (`Reading.shares`).
+            watched: collect attention weights for `Reading.shares`.
         """
         return Reading() if self.fusion is None or memory is None else self.fusion.begin(memory, watched)
 
     # -- passes ------------------------------------------------------------------------------------------------------
 
     def embed(self, seen: Observation, reading: Reading) -> Prefix:
-        """Return the prefix: observation, then words, as the reading changes it."""
+        """Return the prefix: observation, words, and the additions of the reading."""
         words, masks = seen.words, seen.word_masks
         if (self.state_token is not None or self.training) and not masks.is_meta:  # padding is most of a short prefix
             longest = int(masks.sum(dim=1).max())
@@ -118,7 +116,7 @@ class MemoryPI05(nn.Module):
         return reading.prefix(Prefix(tokens, torch.cat([*of_tokens, masks], dim=1), instruction), state)
 
     def read_prefix(self, prefix: Prefix, reading: Reading) -> PrefixKeys:
-        """Run the first pass; ``reading`` gets the last states for which the prefix asks."""
+        """Run the pass over the prefix; pass the last states of `Prefix.asked` to ``reading``."""
         past: PrefixKeys = self._run(read_prefix, self.paligemma_with_expert, prefix, reading, self._call_layer)
         return past
 
@@ -146,12 +144,12 @@ class MemoryPI05(nn.Module):
         return velocity
 
     def _run(self, part: Callable[..., Any], *given: Any) -> Any:
-        """Run a part of a pass, compiled if the configuration asks for it."""
+        """Run a part of a pass, compiled if configured."""
         run = compiled(part, self.config.compile_mode) if self.config.compile_model else part
         return run(*given)
 
     def _call_layer(self, layer: Callable[..., Any], *given: Any) -> Any:
-        """Run a layer, under gradient checkpointing without keeping its activations."""
+        """Run a layer; with gradient checkpointing, discard its activations."""
         if self.gradient_checkpointing_enabled and self.training:
             return checkpoint(layer, *given, use_reentrant=False, preserve_rng_state=False)
         return layer(*given)
@@ -221,7 +219,7 @@ class MemoryPI05(nn.Module):
     # -- parameters --------------------------------------------------------------------------------------------------
 
     def gradient_checkpointing_enable(self) -> None:
-        """Compute layers again in the backward pass, which saves their activations."""
+        """Recompute layers in the backward pass instead of storing their activations."""
         self.gradient_checkpointing_enabled = True
         self.paligemma_with_expert.paligemma.model.vision_tower.gradient_checkpointing = True
 
@@ -232,27 +230,18 @@ class MemoryPI05(nn.Module):
 
     def memory_names(self) -> set[str]:
         """Return the names of the tensors of the memory and of its fusion."""
-        fusion = self.fusion
-        return {
-            name
-            for name in self.state_dict()
-            if name.startswith("memory.") or (fusion is not None and fusion.owns(name))
-        }
-
-    def place_of(self, name: str) -> str:
-        """Return the name in this model of a parameter of plain pi0.5."""
-        return name if self.fusion is None else self.fusion.place_of(name)
+        parts = ("memory.",) if self.fusion is None else ("memory.", *self.fusion.parts)
+        return {name for name in self.state_dict() if name.startswith(parts)}
 
 
 def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) -> MemoryMechanism:
-    """Build the memory mechanism of a policy that reads these observations."""
+    """Build the memory mechanism of a policy with this encoder of observations."""
     mechanism, dims = find_mechanism(config.memory), config.dimensions
     spec = MemorySpec(
         dim=observations.dim,
         tokens=config.tokens_per_frame,
         width=dims.vlm.width,
         expert=dims.expert.width,
-        frames=config.memory_frames,
         grid=observations.grid,
         stride=config.memory_stride,
         subgoals=config.subgoal_texts,
@@ -262,7 +251,7 @@ def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) ->
 
 
 class StateToken(nn.Module):
-    """The robot's normalised state as one token."""
+    """Encode the robot's normalised state as one token."""
 
     def __init__(self, dim: int, width: int) -> None:
         super().__init__()
@@ -270,15 +259,15 @@ class StateToken(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """Return the token (B, 1, width) of a state (B, dim)."""
-        return rearrange(self.mlp(state) * LOUD, "b d -> b 1 d")
+        return rearrange(self.mlp(state) * TOKEN_SCALE, "b d -> b 1 d")
 
 
 class InstructionCondition(nn.Module):
-    """The instruction's mean word as a condition of the action expert's adaptive norms, added to the time of denoising.
+    """Map the mean word of the instruction to a condition of the action expert's norms, added to the denoising time.
 
-    Attention alone has to find the one word in which two instructions differ. On six tasks of one cabinet, one
-    microwave and one stove, 2,000 updates, the loss was 2 % lower with it and 28 of 30 rollouts were solved instead of
-    24 (one training seed, and validation seeds).
+    With attention only, the model has to find the single word in which two instructions differ. On six tasks of one
+    cabinet, one microwave and one stove, after 2,000 updates, the loss was 2 % lower with this condition, and 28 of 30
+    rollouts were solved instead of 24 (one training seed, validation seeds).
     """
 
     def __init__(self, words_dim: int, width: int) -> None:
@@ -286,7 +275,7 @@ class InstructionCondition(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(words_dim, width), nn.SiLU(), nn.Linear(width, width))
 
     def forward(self, words: Tensor, real: Tensor) -> Tensor:
-        """Return the condition (B, width) of embedded words (B, n, D), of which ``real`` (B, n) are no padding."""
+        """Return the condition (B, width) of embedded words (B, n, D); ``real`` (B, n) is False for padding."""
         weights = real.unsqueeze(-1).to(words.dtype)
         mean = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
         condition: Tensor = self.mlp(mean.to(next(self.mlp.parameters()).dtype))

@@ -1,7 +1,7 @@
-"""The passes of pi0.5's two transformers: one over the prefix, one over the actions for each step of denoising.
+"""The passes of pi0.5's two transformers: one over the prefix, and one over the actions for each denoising step.
 
-They equal LeRobot's passes to rounding, and leave out results that nothing reads: actions among the keys of the prefix,
-and last states of the prefix. Shapes: B rows, N tokens of the prefix, T of the actions, M keys, W width of the expert.
+They equal LeRobot's passes up to rounding, and skip results without use: actions among the keys of the prefix, and last
+states of the prefix. Shapes: B rows, N tokens of the prefix, T of the actions, M keys, W width of the expert.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lerobot_memobench.policies.memobench_mem.fusion import ModulatedNorm, Prefix, Reading
+from lerobot_memobench.policies.memobench_mem.fusion import Prefix, Reading
 from lerobot_memobench.policies.memobench_mem.layers import (
     attend,
     hidden,
@@ -25,14 +25,14 @@ from lerobot_memobench.policies.memobench_mem.layers import (
 )
 
 Call = Callable[..., Any]
-"""Runs a layer; under gradient checkpointing again in the backward pass."""
+"""Runs a layer; with gradient checkpointing, again in the backward pass."""
 
 
 class PrefixKeys(NamedTuple):
     """The part of a prefix to which actions attend.
 
     Attributes:
-        keys: of each layer, keys and values (B, M, d). bias: (B, 1, M), added to scores.
+        keys: per layer, keys and values (B, M, d). bias: (B, 1, M), added to attention scores.
         length: (B, 1), number of real tokens of the prefix, which is the position of the first action.
     """
 
@@ -42,9 +42,9 @@ class PrefixKeys(NamedTuple):
 
 
 def read_prefix(backbone: Any, prefix: Prefix, reading: Reading, call: Call) -> PrefixKeys:
-    """Return each layer's keys and values of a prefix; ``reading`` gets the last states for which the prefix asks."""
+    """Return each layer's keys and values of a prefix; pass the last states of `Prefix.asked` to ``reading``."""
     model = backbone.paligemma.model.language_model
-    real, found = prefix.real, reading.attention[0] if reading.attention else None
+    real, found = prefix.real, reading.attention.get("prefix")
     turned = rotary(torch.cumsum(real, dim=1) - 1, model.rotary_emb.inv_freq)
     seen = real[:, None] if prefix.attends is None else prefix.attends & real[:, None]
     x, kept, last = _narrowed(prefix.tokens, model), [], len(model.layers) - 1
@@ -64,7 +64,7 @@ def read_actions(
     """Return the expert's last states (B, T, W) of its tokens (B, T, W), which attend to the prefix and each other.
 
     Args:
-        modulations: scale, shift and gate of each of the `adaptive_norms` (B, 1, 3 W).
+        modulations: scale, shift and gate (B, 1, 3 W) of each of the `adaptive_norms`.
     """
     model = backbone.gemma_expert.model
     places = past.length + torch.arange(x.shape[1], device=x.device)
@@ -77,16 +77,15 @@ def read_actions(
 
 
 def adaptive_norms(backbone: Any) -> Iterator[Any]:
-    """Yield the expert's norms in the order of a pass."""
+    """Yield the expert's norms in the order in which a pass applies them."""
     expert = backbone.gemma_expert.model
     for layer in expert.layers:
-        after = layer.post_attention_layernorm
-        yield from (layer.input_layernorm, after.norm if isinstance(after, ModulatedNorm) else after)
+        yield from (layer.input_layernorm, layer.post_attention_layernorm)
     yield expert.norm
 
 
 def _narrowed(x: Tensor, model: Any) -> Tensor:
-    """Convert tokens to bfloat16 if the layers of a transformer are."""
+    """Convert tokens to bfloat16 if the weights of the layers are bfloat16."""
     return x.to(torch.bfloat16) if model.layers[0].self_attn.q_proj.weight.dtype == torch.bfloat16 else x
 
 
@@ -99,7 +98,7 @@ def _projected(attention: Any, x: Tensor, turned: Tensor) -> Tensor:
 def _prefix_layer(
     layer: Any, x: Tensor, turned: Tensor, bias: Tensor, asked: slice | None, found: list[Tensor] | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the next states of the ``asked`` tokens, and keys and values of all."""
+    """Return the next states of the ``asked`` tokens, and keys and values of all tokens."""
     attention = layer.self_attn
     normed = (rms_norm(x) * (1.0 + layer.input_layernorm.weight.float())).to(x.dtype)
     key, value = rotate(attention.k_proj(normed), turned), attention.v_proj(normed)
@@ -124,7 +123,7 @@ def _action_layer(
     reading: Reading,
 ) -> Tensor:
     """Return the next states (B, T, W) of the expert's tokens, given the modulations of both norms."""
-    attention, found = layer.self_attn, reading.attention[1] if reading.attention else None
+    attention, found = layer.self_attn, reading.attention.get("actions")
     normed, gate = modulated(x, before)
     own = rotate(attention.k_proj(normed), turned), attention.v_proj(normed)
     key, value = (torch.cat([of_past, here], dim=1) for of_past, here in zip(past, own, strict=True))

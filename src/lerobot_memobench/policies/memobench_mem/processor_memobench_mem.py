@@ -1,7 +1,7 @@
-"""Pre- and post-processing of ``memobench_mem``: pi0.5's steps, memory of training samples, tokenizers of text prompts.
+"""Pre- and post-processing of ``memobench_mem``: pi0.5's steps, memory of training samples, tokenizers of prompts.
 
-A tokenizer is a pretrained one, or of words from the dataset's tasks. It warns of what it loses: words that it does not
-know, and what its length cuts off.
+A tokenizer is pretrained, or made of the words of the dataset's tasks. It warns about unknown words, and about prompts
+that it cuts off.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import InitVar, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +46,8 @@ from lerobot_memobench.policies.memobench_mem.alignment import (
     texts_of_histories,
     words,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SHUFFLE_SEED, MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     AHEAD,
     CHOICES,
@@ -74,21 +74,21 @@ def make_memobench_mem_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Build both processors of a new policy (LeRobot's factory calls this when nothing saved is loaded).
+    """Build both processors of a new policy (LeRobot's factory calls this unless it loads saved ones).
 
     Args:
         dataset_stats: normalisation statistics of the training dataset.
-        dataset_meta: its metadata, whose task texts become the tiny tokenizer's words. LeRobot 0.6.1 leaves it on the
-            config instead.
+        dataset_meta: its metadata, whose task texts give the words of the word tokenizer. LeRobot 0.6.1 sets it as an
+            attribute of the config instead.
         lookup: the frames of the training dataset; None in LeRobot's own trainer, and for a policy that only acts.
 
     Raises:
-        MemobenchError: no statistics, as when a policy is evaluated that was never trained.
+        MemobenchError: there are no statistics, as for a policy that was never trained.
     """
     if not dataset_stats:
         raise MemobenchError(
-            "memobench_mem was given no dataset statistics, so states and actions could not be normalised and every "
-            "episode would fail: evaluate a trained checkpoint with --policy.path=<folder of pretrained_model>."
+            "memobench_mem has no dataset statistics to normalise states and actions; evaluate a trained checkpoint "
+            "with --policy.path=<folder of pretrained_model>."
         )
     meta = dataset_meta or getattr(config, "_runtime_dataset_meta", None)
     steps = make_default_policy_processor_steps(config, dataset_stats)
@@ -100,11 +100,11 @@ def make_memobench_mem_pre_post_processors(
     input_steps: list[ProcessorStep] = [
         steps.rename_observations,
         steps.add_batch_dim,
-        GatherMemoryProcessorStep(**gathering(config), lookup=lookup),
+        GatherMemoryProcessorStep(config=config, lookup=lookup),
         OracleMemoryProcessorStep(enabled=config.oracle_memory, lookup=lookup),
         relative,
         *([RawStateProcessorStep()] if config.uses_objects else []),
-        steps.normalize,  # before the prompt, which may spell the normalised state out
+        steps.normalize,  # before the prompt, which may spell the normalised state
         *([] if config.state_token else [Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim)]),
         _tokenizer(config, prompt_texts(config, meta, lookup)),
         steps.to_device,
@@ -118,7 +118,7 @@ def make_memobench_mem_pre_post_processors(
 
 
 def follow_training(steps: Iterable[Any], config: MemobenchMemConfig, meta: Any, lookup: FrameLookup) -> None:
-    """Give the saved steps of a checkpoint the settings, prompts and frames of the training that they are used in."""
+    """Set the settings, prompts and frames of a training in the saved steps of the checkpoint that it starts from."""
     for step in steps:
         if isinstance(step, GatherMemoryProcessorStep):
             step.follow(config, lookup)
@@ -129,7 +129,7 @@ def follow_training(steps: Iterable[Any], config: MemobenchMemConfig, meta: Any,
 
 
 def prompt_texts(config: MemobenchMemConfig, meta: Any | None, lookup: FrameLookup | None) -> list[str]:
-    """Return a dataset's tasks, and with oracle memory every memory text that follows them in a prompt."""
+    """Return a dataset's tasks, and with oracle memory all its memory texts."""
     tasks = [] if meta is None or meta.tasks is None else [str(task) for task in meta.tasks.index]
     if config.oracle_memory and lookup is not None:
         tasks += [with_memory("", memory) for memory in lookup.memories]
@@ -149,25 +149,16 @@ def _tokenizer(config: MemobenchMemConfig, texts: Sequence[str]) -> TokenizerPro
     return WordTokenizerProcessorStep(vocabulary=make_vocabulary(texts, config.dimensions.vocabulary), **options)
 
 
-def gathering(config: MemobenchMemConfig) -> dict[str, Any]:
-    """Return the fields of a policy's `GatherMemoryProcessorStep`."""
-    same = ("align", "subgoal_level", "shuffle_subgoals", "memory")
-    frames = 0 if config.memory == NONE else config.memory_frames
-    subgoals = (config.subgoals or {}) if config.privileged_memory else {}
-    return {"frames": frames, "subgoals": subgoals} | {name: getattr(config, name) for name in same}
-
-
 @dataclass
 class LookupProcessorStep(ProcessorStep):
-    """A step that looks up the frames of training samples; without a ``lookup`` it sees none."""
+    """A step that looks up the frames of training samples in ``lookup``, if there is one."""
 
     lookup: FrameLookup | None = field(default=None, repr=False, kw_only=True)
 
     def sample_indices(self, transition: EnvTransition) -> list[int] | None:
         """Return the global indices of training samples; None in a rollout.
 
-        LeRobot keeps of a training batch only the keys of its transition, the frame's ``index`` among them; rollouts
-        carry none.
+        A transition of LeRobot keeps the ``index`` of training frames; rollouts have none.
         """
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
@@ -187,34 +178,32 @@ class LookupProcessorStep(ProcessorStep):
 class GatherMemoryProcessorStep(LookupProcessorStep):
     """Add history, phase and subgoal embeddings to training samples.
 
-    In a rollout, where the policy itself keeps the history, observations are left alone, but for ``memory.choices``
-    (B, S), which training samples have too: which of the texts of ``subgoals`` (instruction -> texts of its
-    checkpoints) are the task's, for a memory that chooses among them.
+    Training samples get ``memory.frames``, ``memory.steps`` and ``memory.places`` (`Histories`), ``phase`` (B,), and
+    features of the frames (``observation.encoded.*``). An alignment adds ``memory.text`` and ``memory.text_mask``:
+    (B, d_t) and (B,) of the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) of the remembered frames. A
+    privileged memory adds the indices of the active texts, ``memory.subgoal`` (B,) of the samples and
+    ``memory.subgoals`` (U,) of the frames; a memory that learns to predict frames adds ``memory.ahead`` (B, n).
 
-    Adds ``memory.frames``, ``memory.steps`` and ``memory.places`` (`Histories`), ``phase`` (B,), features of the frames
-    (``observation.encoded.*``), and with an alignment ``memory.text`` and ``memory.text_mask``: (B, d_t) and (B,) for
-    the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) for the frames of the history. With ``subgoals``
-    there are the numbers of the active ones: ``memory.subgoal`` (B,) and ``memory.subgoals`` (U,), of the samples and
-    of the frames. A memory that learns to foresee has ``memory.ahead`` (B, n). With ``frames`` 0 (``memory=none``)
-    there is no history.
+    In a rollout, where the policy itself keeps the history, and in LeRobot's own trainer, only ``memory.choices``
+    (B, S) is added: which texts of ``subgoals`` belong to the task.
 
-    A step without a ``lookup`` (a rollout, LeRobot's own trainer) adds nothing but ``memory.choices``.
+    Args:
+        subgoals: instruction -> texts of its checkpoints, of a privileged memory; saved with the checkpoint.
+        config: the policy's; None if the step is loaded to act.
     """
 
-    frames: int = 32
-    align: str = "none"
-    subgoal_level: str = "intermediate"
-    shuffle_subgoals: bool = False
-    shuffle_seed: InitVar[int] = SHUFFLE_SEED  # written by earlier versions, always this
-    memory: str = "frames"
     subgoals: dict[str, list[str]] = field(default_factory=dict)
+    config: MemobenchMemConfig | None = field(default=None, repr=False, kw_only=True)
     _texts: np.ndarray | None = field(default=None, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        if self.config is not None:
+            self.subgoals = (self.config.subgoals or {}) if self.config.privileged_memory else {}
+
     def follow(self, config: MemobenchMemConfig, lookup: FrameLookup) -> None:
-        """Look up frames for a training by its settings."""
-        self.lookup, self._texts = lookup, None
-        for name, value in gathering(config).items():
-            setattr(self, name, value)
+        """Set the configuration and the frames of a training."""
+        self.config, self.lookup, self._texts = config, lookup, None
+        self.__post_init__()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         """Return the transition with the frames' history, phase and texts."""
@@ -228,7 +217,7 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         transition = transition.copy()
         transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, **self.gather(lookup, indices)}
         observation = transition.get(TransitionKey.OBSERVATION) or {}
-        # LeRobot passes on observations only, and in a dataset with pictures the objects' column has another name.
+        # In a dataset with pictures the column of objects is no observation of LeRobot's.
         if OBS_ENV_STATE in lookup.columns and OBS_ENV_STATE not in observation:
             transition[TransitionKey.OBSERVATION] = {
                 **observation,
@@ -238,54 +227,45 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
 
     def gather(self, lookup: FrameLookup, indices: Sequence[int]) -> dict[str, Tensor]:
         """Look up frames of the dataset by their global indices."""
+        config = self.config
+        assert config is not None
         places = [lookup.locate(index) for index in indices]
         found = {PHASE: torch.from_numpy(lookup.phase[np.asarray(indices)].astype(np.int64))}
         found |= {name: encoded(indices) for name, encoded in lookup.encoded.items()}
-        if not self.frames:
+        if config.memory == NONE:
             return found
-        mechanism, stride = find_mechanism(self.memory), lookup.stride
-        recalled = [(episode, np.asarray(mechanism.slots(frame // stride, self.frames))) for episode, frame in places]
+        mechanism, stride = find_mechanism(config.memory), lookup.stride
+        settings = read_settings(config.memory, config.memory_settings)
+        recalled = [(episode, np.asarray(mechanism.slots(frame // stride, settings))) for episode, frame in places]
         ahead = [np.arange(frame // stride + 1, frame // stride + 1 + mechanism.ahead) for _, frame in places]
         memory, numbers = _histories(lookup, recalled, ahead)
         if self.subgoals:
             number = {text: row for row, text in enumerate(texts_of(self.subgoals))}
             known = np.array([*(number.get(text, -1) for text in lookup.texts), -1])
-            rows = lookup.text_rows(self.subgoal_level)
+            rows = lookup.text_rows(config.subgoal_level)
             asked = {SUBGOAL: np.asarray(indices), SUBGOALS: numbers.numpy()}
             memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
-        if self.align == "none":
+        if config.align == "none":
             return memory | found
-        rows = self._text_rows(lookup)
-        if self.align != "framewise":
-            return memory | found | texts_of_frames(lookup, rows, indices)
-        histories = [int(lookup.episodes[episode]) + read * stride for episode, read in recalled]
-        return memory | found | texts_of_histories(lookup, rows, histories, self.frames)
-
-    def _text_rows(self, lookup: FrameLookup) -> np.ndarray:
         if self._texts is None:
-            self._texts = text_rows(lookup, self.subgoal_level, self.align, self.shuffle_subgoals)
-        return self._texts
+            self._texts = text_rows(lookup, config.subgoal_level, config.align, config.shuffle_subgoals)
+        if config.align != "framewise":
+            return memory | found | texts_of_frames(lookup, self._texts, indices)
+        histories = [int(lookup.episodes[episode]) + read * stride for episode, read in recalled]
+        return memory | found | texts_of_histories(lookup, self._texts, histories)
 
     def get_config(self) -> dict[str, Any]:
-        """Return what the processor file holds; ``frames`` alone tells the oldest two mechanisms apart there."""
-        found = {
-            "frames": self.frames,
-            "align": self.align,
-            "subgoal_level": self.subgoal_level,
-            "shuffle_subgoals": self.shuffle_subgoals,
-        }
-        if self.subgoals:
-            found["subgoals"] = self.subgoals
-        return found if self.memory in ("frames", NONE) else found | {"memory": self.memory}
+        """Return the saved settings."""
+        return {"subgoals": self.subgoals} if self.subgoals else {}
 
 
 def _histories(
     lookup: FrameLookup, recalled: Sequence[tuple[int, np.ndarray]], ahead: Sequence[np.ndarray]
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Load frames of episodes by their slots, each once; return them for a batch, and their numbers in the dataset.
+    """Load frames of episodes by their slots, each once; return them for a batch, and their indices in the dataset.
 
     Args:
-        ahead: slots that follow each of those, beyond the episode's end perhaps.
+        ahead: following slots of each sample, possibly beyond the episode's end.
     """
     stride, needed = lookup.stride, dict[int, list[np.ndarray]]()
     counts = -(-np.diff(lookup.episodes) // stride)
@@ -312,11 +292,11 @@ def _histories(
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_oracle_memory")
 class OracleMemoryProcessorStep(LookupProcessorStep):
-    """The paper's control: ground-truth memory text behind the instruction, before the prompt is tokenized.
+    """Append ground-truth memory text to the instruction before tokenization: a control of the paper.
 
-    Training samples take it from the dataset's column ``memory``. In a rollout the environment, which alone knows what
-    has been done, writes the same words into its instruction; one that does not is refused, because the policy would
-    be scored without the memory it was trained on. A step that is not ``enabled`` does nothing.
+    In training the text comes from the dataset's column ``memory``; in a rollout the environment appends it. An
+    environment without this text is refused, because the policy would act without the memory of its training. A step
+    that is not ``enabled`` has no effect.
     """
 
     enabled: bool = True
@@ -325,7 +305,7 @@ class OracleMemoryProcessorStep(LookupProcessorStep):
         """Return the transition with memory text in its tasks.
 
         Raises:
-            MemobenchError: a rollout's instruction has none, or LeRobot's own trainer runs the step.
+            MemobenchError: a rollout's instruction has no memory text, or LeRobot's own trainer runs the step.
         """
         if not self.enabled:
             return transition
@@ -350,20 +330,17 @@ class OracleMemoryProcessorStep(LookupProcessorStep):
         return transition
 
     def get_config(self) -> dict[str, Any]:
-        """Return what the processor file holds."""
+        """Return the saved settings."""
         return {"enabled": self.enabled}
 
 
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_raw_state")
 class RawStateProcessorStep(ObservationProcessorStep):
-    """Copy the state (B, n), m and rad, to ``observation.raw_state`` before it is normalised.
-
-    Objects' places are given from the hand.
-    """
+    """Copy the state (B, n), m and rad, to ``observation.raw_state`` before normalisation, for places of objects."""
 
     def observation(self, observation: dict) -> dict:
-        """Return the observation with its state twice."""
+        """Return the observation with a copy of its state."""
         if OBS_STATE not in observation:
             return observation
         return observation | {OBS_RAW_STATE: observation[OBS_STATE].clone()}
@@ -381,15 +358,15 @@ _SPECIAL = ("<pad>", "<unk>", "<bos>", "<eos>")
 
 
 def make_vocabulary(texts: Iterable[str], size: int) -> list[str]:
-    """Words for :class:`WordTokenizerProcessorStep`: special tokens, the prompt's frame, states 0-255, then ``texts``.
+    """Return words for `WordTokenizerProcessorStep`: special tokens, the prompt's frame, states 0-255, then ``texts``.
 
-    The commonest words stay when there are more than ``size`` in all.
+    At most ``size`` words are kept, the most frequent.
     """
     return extend([*_SPECIAL, *"-:;,.", "task", "state", "action", *map(str, range(256))], texts, size)
 
 
 def extend(vocabulary: Sequence[str], texts: Iterable[str], size: int) -> list[str]:
-    """Return a vocabulary and behind it, sorted, the words of ``texts`` that it lacks: the commonest up to ``size``."""
+    """Append to a vocabulary the words of ``texts`` that it lacks, sorted; the most frequent if ``size`` is reached."""
     counts = Counter(word for text in texts for word in words(text))
     for word in vocabulary:
         counts.pop(word, None)
@@ -398,8 +375,8 @@ def extend(vocabulary: Sequence[str], texts: Iterable[str], size: int) -> list[s
 
 
 def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
-    """A word-level tokenizer from its list of words; unknown words become ``<unk>``. No file and no hub."""
-    from transformers import PreTrainedTokenizerFast  # slow to import, and the other size needs none of it
+    """Build a word-level tokenizer from a list of words; unknown words become ``<unk>``."""
+    from transformers import PreTrainedTokenizerFast  # slow to import
 
     number = {word: row for row, word in enumerate(vocabulary)}
     tokenizer = Tokenizer(WordLevel(number, unk_token="<unk>"))
@@ -411,54 +388,53 @@ def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
     )
 
 
-_told: set[str] = set()
-"""Texts, instructions and words about which this process has been warned."""
+_warned: set[str] = set()
+"""Texts, instructions and words about which this process has logged a warning."""
 
 
 def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> None:
-    """Warn of what a policy does not read of a prompt: unknown words, each once per process; and what is cut off, once
-    per instruction: numbers of the state and memory texts differ from step to step.
+    """Warn about unknown words of a prompt, each once per process, and about cut prompts, once per instruction.
 
     Args:
-        full: the prompt takes all of ``max_length`` tokens, and may have had more.
+        full: whether the prompt fills ``max_length`` tokens, so that it may have been cut.
     """
     prompt = text.partition(", State: ")[0]
     instruction = prompt.partition(MARK)[0].removeprefix("Task: ")
-    if f"read {prompt}" in _told and (not full or f"cut {instruction}" in _told):
+    if f"read {prompt}" in _warned and (not full or f"cut {instruction}" in _warned):
         return
     coded = tokenizer(text, return_offsets_mapping=True)
     spans = list(zip(coded["input_ids"], coded["offset_mapping"], strict=True))
     unknown = dict.fromkeys(text[a:b].lower() for token, (a, b) in spans if token == tokenizer.unk_token_id)
-    new = [repr(word) for word in unknown if f"word {word}" not in _told]
+    new = [repr(word) for word in unknown if f"word {word}" not in _warned]
     if new:
         logger.warning(
-            "the policy does not know %s in %r, and reads unknown words all alike; it can act on these only after "
-            "training on instructions that hold them",
+            "unknown words %s in %r: the policy reads all unknown words alike; train it on instructions with these "
+            "words",
             ", ".join(new),
             instruction,
         )
-    if len(spans) > max_length and f"cut {instruction}" not in _told:
+    if len(spans) > max_length and f"cut {instruction}" not in _warned:
         logger.warning(
-            "the prompt of %r has %d tokens and the policy reads %d (policy.tokenizer_max_length when it is trained); "
-            "cut off: %r",
+            "the prompt of %r has %d tokens; the policy reads %d (policy.tokenizer_max_length of its "
+            "training); cut off: %r",
             instruction,
             len(spans),
             max_length,
             text[spans[max_length][1][0] :],
         )
-        _told.add(f"cut {instruction}")
-    _told.update(f"word {word}" for word in unknown)
-    _told.add(f"read {prompt}")
+        _warned.add(f"cut {instruction}")
+    _warned.update(f"word {word}" for word in unknown)
+    _warned.add(f"read {prompt}")
 
 
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_tokenizer")
 class PromptTokenizerProcessorStep(TokenizerProcessorStep):
-    """LeRobot's tokenizer step, which warns of what it loses of a prompt."""
+    """LeRobot's tokenizer step with warnings about unknown words and cut prompts."""
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
         found: dict[str, Tensor] = super()._tokenize_text(text)
-        # A full row may have been cut off. Both are checked in numbers first: this runs at every step.
+        # Checked on token numbers first, because this runs at every control step. A full row may have been cut.
         tokenizer, full = self.input_tokenizer, found["attention_mask"].bool().all(dim=-1)
         unknown = (found["input_ids"] == (-1 if tokenizer.unk_token_id is None else tokenizer.unk_token_id)).any(dim=-1)
         for row in (unknown | full).nonzero().flatten().tolist():
@@ -466,17 +442,17 @@ class PromptTokenizerProcessorStep(TokenizerProcessorStep):
         return found
 
     def save_artifacts(self, save_directory: Path) -> dict[str, str]:
-        """Save no tokenizer, as LeRobot's main does: its name or words stand in the file, which 0.6.1 reads too."""
+        """Save no tokenizer files: the settings hold the tokenizer's name or words."""
         return {}
 
 
 @dataclass
 @ProcessorStepRegistry.register(name="memobench_word_tokenizer")
 class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
-    """LeRobot's tokenizer step with the word tokenizer; its words are saved in the checkpoint's processor file.
+    """LeRobot's tokenizer step with the word tokenizer, whose words are saved in the checkpoint's processor file.
 
-    In a training from a checkpoint it takes the length of the training's prompts, and adds their new words behind its
-    own, which keep their numbers.
+    A training from a checkpoint sets the length of its prompts and appends their new words; known words keep their
+    numbers.
     """
 
     vocabulary: list[str] = field(default_factory=list)
@@ -484,26 +460,26 @@ class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
     def __post_init__(self) -> None:
         if not self.vocabulary:
             raise MemobenchError(
-                "The checkpoint's preprocessor has no 'vocabulary' for its word tokenizer; save the policy again with "
+                "the checkpoint's preprocessor has no 'vocabulary' for its word tokenizer; save the policy again with "
                 "its preprocessor."
             )
         self.tokenizer = make_word_tokenizer(self.vocabulary)
         super().__post_init__()
 
     def follow(self, config: MemobenchMemConfig, texts: Sequence[str]) -> None:
-        """Learn the words of a training's prompts, and take their length."""
+        """Add the words of a training's prompts, and set their length."""
         assert config.tokenizer_max_length is not None  # set by the configuration
         self.max_length = config.tokenizer_max_length
         self.vocabulary = extend(self.vocabulary, texts, config.dimensions.vocabulary)
         self.__post_init__()
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
-        """Do as LeRobot does, with each of the texts once: the samples of a batch share a few instructions."""
+        """Tokenize each different text once, because the samples of a batch share a few instructions."""
         texts = [text] if isinstance(text, str) else text
         row = {different: number for number, different in enumerate(dict.fromkeys(texts))}
         rows = torch.tensor([row[text] for text in texts])
         return {name: of_different[rows] for name, of_different in super()._tokenize_text([*row]).items()}
 
     def get_config(self) -> dict[str, Any]:
-        """Return what the processor file holds, the words included."""
+        """Return the saved settings with the vocabulary."""
         return super().get_config() | {"vocabulary": self.vocabulary}

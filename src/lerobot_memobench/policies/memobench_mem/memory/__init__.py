@@ -1,6 +1,6 @@
-"""Memory mechanisms, one file each, by their names. `mechanism` is their interface.
+"""Memory mechanisms by name, one file each; `mechanism` is their interface.
 
-Another package brings one by an entry point: its name and class in the group ``lerobot_memobench.memories``.
+A package adds a mechanism by an entry point in the group ``lerobot_memobench.memories``: its name and class.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ OURS = {
     "recurrent": "Recurrent",
     "fast_weights": "FastWeights",
 }
-"""Name, which is the module's too -> class."""
+"""Name of a mechanism and of its module -> class."""
 
 
 def mechanism_names() -> list[str]:
-    """Return the names of all mechanisms, those of other packages behind ours; without ``none``."""
+    """Return the names of all mechanisms except ``none``: ours, then those of other packages."""
     return [*OURS, *sorted({point.name for point in entry_points(group=GROUP)} - {*OURS, NONE})]
 
 
@@ -44,40 +44,36 @@ def find_mechanism(name: str) -> type[MemoryMechanism]:
     """Return a mechanism by its name.
 
     Raises:
-        MemobenchError: there is none, several have this name, or the package that brings it is broken.
+        MemobenchError: the name is unknown or ambiguous, or the package that adds it is broken.
     """
     found = [point for point in entry_points(group=GROUP) if point.name == name]
     if name in OURS:
         for point in found:
-            logger.warning("the memory '%s' of a package (%s) is not used: ours has this name", name, point.value)
+            logger.warning("the memory '%s' of a package (%s) is ignored: it has the name of ours", name, point.value)
         found = [EntryPoint(name, f"{__name__}.{name}:{OURS[name]}", GROUP)]
     if not found:
         known = [NONE, *mechanism_names()]
-        raise MemobenchError(f"There is no memory '{name}': {nearest(name, known)} Pass --policy.memory=<one of them>.")
+        raise MemobenchError(f"unknown memory '{name}': {nearest(name, known)} Pass --policy.memory=<one of them>.")
     if len({point.value for point in found}) > 1:
-        told = " and ".join(sorted(point.value for point in found))
-        raise MemobenchError(
-            f"There are several memories '{name}' ({told}); remove a package, or rename its entry point."
-        )
+        classes = " and ".join(sorted(point.value for point in found))
+        raise MemobenchError(f"several memories '{name}' ({classes}); remove a package, or rename its entry point.")
     try:
         made = found[0].load()
     except Exception as error:
         raise MemobenchError(
-            f"The memory '{name}' ({found[0].value}) cannot be imported: {type(error).__name__}: {error}; mend or "
-            "remove the package that brings it."
+            f"the memory '{name}' ({found[0].value}) cannot be imported: {type(error).__name__}: {error}; repair or "
+            "remove its package."
         ) from error
-    if not (isinstance(made, type) and issubclass(made, MemoryMechanism)):
+    if not (isinstance(made, type) and issubclass(made, MemoryMechanism) and is_dataclass(made.Settings)):
         raise MemobenchError(
-            f"The memory '{name}' ({found[0].value}) is no subclass of MemoryMechanism "
-            "(lerobot_memobench.policies.memobench_mem.memory.mechanism)."
+            f"the memory '{name}' ({found[0].value}) is no subclass of MemoryMechanism "
+            "(lerobot_memobench.policies.memobench_mem.memory.mechanism) with a dataclass as its Settings."
         )
-    if not is_dataclass(made.Settings):
-        raise MemobenchError(f"The Settings of the memory '{name}' ({found[0].value}) are no dataclass.")
     return made
 
 
 def settings_of_another(name: str, given: Mapping[str, Any]) -> str | None:
-    """Return another mechanism all of whose settings are among ``given``, with all of these that this one lacks."""
+    """Return another mechanism whose settings are all ``given`` and include those that this mechanism lacks."""
     strange = set(given) - settings_of(name)
     if not strange:
         return None
@@ -94,36 +90,34 @@ def settings_of(name: str) -> set[str]:
 
 
 def read_settings(name: str, given: Mapping[str, Any]) -> Any:
-    """Return the settings of a mechanism, its defaults where nothing is ``given``.
+    """Return the settings of a mechanism, with defaults for those that are not ``given``.
 
     Raises:
-        MemobenchError: a setting is unknown, or of another type.
+        MemobenchError: a setting is unknown, or has a wrong type or value.
     """
     known = settings_of(name)
     for key in given:
         if key not in known:
-            told = nearest(key, known) if known else "it has none."
-            raise MemobenchError(f"policy.memory_settings names '{key}', which is no setting of memory={name}; {told}")
+            hint = nearest(key, known) if known else "it has no settings."
+            raise MemobenchError(f"policy.memory_settings: unknown setting '{key}' for memory={name}; {hint}")
     settings = find_mechanism(name).Settings
     for key, value in given.items():
         _check_type(name, key, value, get_type_hints(settings)[key])
     try:
         return draccus.decode(settings, dict(given))
-    except Exception as error:  # draccus answers by its own kinds of error
+    except Exception as error:  # draccus raises errors of its own kinds
         raise MemobenchError(
             f"policy.memory_settings={dict(given)} of memory={name} cannot be read: {error.__cause__ or error}"
         ) from None
 
 
 def _check_type(name: str, key: str, value: Any, kind: Any) -> None:
-    """Refuse what draccus cannot read as this type, or takes for one: none, and a truth value for a number."""
+    """Refuse values that draccus cannot read as this type, and None or a bool instead of a number."""
     try:
         read = draccus.decode(kind, value)
         fits = isinstance(read, bool) or not isinstance(value, bool)
-    except Exception:  # of whatever kind
+    except Exception:
         fits = False
     if not fits or (value is None and kind in (bool, int, float, str)):
         expected = kind.__name__ if isinstance(kind, type) else kind
-        raise MemobenchError(
-            f"policy.memory_settings says {key}={value!r} of memory={name}, which cannot be read; expected {expected}"
-        )
+        raise MemobenchError(f"policy.memory_settings: found {key}={value!r} for memory={name}; expected {expected}")

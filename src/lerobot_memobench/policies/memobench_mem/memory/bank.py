@@ -1,19 +1,21 @@
-"""Perceptual-cognitive memory bank (MemoryVLA): the present looks into a bounded list of timed entries, and joins it.
+"""Perceptual-cognitive memory bank (MemoryVLA): the present attends to a bounded list of timed entries.
 
-The variant of Dexbotic's MemoryVLA+, in two streams: perceptual, the P tokens of a frame, and cognitive, one token. A
-frame's tokens retrieve from their stream's entries, are fused with what they find by a gate, and become an entry; where
-there are too many, the two most similar neighbours become one. An action chunk reads the present, fused in the same
-way.
+This is the variant of Dexbotic's MemoryVLA+ with two streams: perceptual, the P tokens of a frame, and cognitive, one
+token. The tokens of a frame retrieve from the entries of their stream, are fused with the result by a gate, and become
+an entry; when the stream is full, its two most similar neighbours are merged. An action chunk reads the present, fused
+in the same way.
 
-What differs: the cognitive token of the source is the language model's last prompt state, which would be a pass of the
-whole backbone for each frame; here one layer makes it, in which a learned token looks at the frame's tokens. It reads
-no words: where the prompt spells the robot's state, a training batch has those of its samples' frames alone. The
-perceptual stream's squeeze-excite bottleneck is a Linear to the same 256 channels, behind the policy's own pooling. The
-fused tokens are memory tokens, read as the policy's ``memory_fusion`` says, where the source has a diffusion
-transformer with a condition and a cross-attention of its own. Frames are written at a stride, not where chunks begin,
-so a chunk that begins at such a step finds its own frame among the entries. Times are control steps everywhere; the
-source trains by frames and acts by calls. Each row has a bank, where rows of the source share one while they act, and
-there is no dropout, which the source applies then too.
+Differences from the source:
+
+- The cognitive token of the source is the language model's last prompt state, which would need a pass of the backbone
+  per frame; here it is made by one layer, in which a learned token attends to the frame's tokens. It reads no words.
+- The squeeze-excite bottleneck of the perceptual stream is a Linear to the same 256 channels after the pooling.
+- The fused tokens are memory tokens, read by ``memory_fusion``; the source has a diffusion transformer with its own
+  condition and cross-attention.
+- Frames are written at a fixed stride instead of at the beginning of chunks, so a chunk that begins at such a step
+  finds its own frame among the entries. Times are control steps; the source trains with frames and acts with calls.
+- Each row has its own bank, and there is no dropout. The source shares one bank between rows of a rollout, and applies
+  dropout in rollouts as well.
 """
 
 from __future__ import annotations
@@ -42,12 +44,10 @@ class BankSettings:
     """Settings of `Bank`.
 
     Attributes:
-        length: entries that each stream keeps.
-        time_codes: whether the present can tell when an entry was made.
+        length: maximum number of entries per stream.
     """
 
     length: int = 16
-    time_codes: bool = True
 
     def __post_init__(self) -> None:
         if self.length < 1:
@@ -55,10 +55,10 @@ class BankSettings:
 
 
 class Bank(MemoryMechanism):
-    """Two streams of at most ``length`` entries. No gradient passes through what has been written.
+    """Two streams of at most ``length`` entries. No gradient passes through written entries.
 
-    State: of each stream ``<stream>`` (R, length, N, d) and ``<stream>_steps`` (R, length), its entries and their
-    control steps (means, where entries were merged), oldest first; ``count`` (R,), how many there are.
+    State: for each stream its entries, ``<stream>`` (R, length, N, d), and their control steps, ``<stream>_steps``
+    (R, length), oldest first, averaged when entries are merged; ``count`` (R,), the number of entries.
     """
 
     Settings = BankSettings
@@ -73,11 +73,11 @@ class Bank(MemoryMechanism):
         self.reduce = nn.Linear(spec.dim, widths["perceptual"])
         self.asking = nn.Parameter(torch.randn(1, 1, spec.dim))
         self.summary = Lookup(spec.dim)
-        self.streams = nn.ModuleDict({name: Stream(width, settings.time_codes) for name, width in widths.items()})
+        self.streams = nn.ModuleDict({name: Stream(width) for name, width in widths.items()})
         self.out = nn.ModuleDict({name: nn.Linear(width, spec.width) for name, width in widths.items()})
 
     def _present(self, tokens: Tensor) -> dict[str, Tensor]:
-        """Return the present of each stream (R, N, d), of a frame's tokens (R, P, D)."""
+        """Return the input (R, N, d) of each stream for a frame's tokens (R, P, D)."""
         tokens = F.rms_norm(tokens.float(), tokens.shape[-1:], eps=1e-6)
         hidden = torch.zeros(tokens.shape[:2], dtype=torch.bool, device=tokens.device)
         summary, _ = self.summary(self.asking.expand(len(tokens), -1, -1), tokens, tokens, hidden)
@@ -93,7 +93,7 @@ class Bank(MemoryMechanism):
 
     @torch.no_grad()
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
-        """Fuse the frame with what it finds, and make an entry of it."""
+        """Fuse the frame with its retrieval, and append the result as an entry."""
         count = state["count"]
         made = {"count": (count + 1).clamp(max=self.capacity)}
         for name, present in self._present(tokens).items():
@@ -103,11 +103,11 @@ class Bank(MemoryMechanism):
         return made
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return the present of both streams, fused with what it finds: P perceptual tokens and a cognitive one."""
+        """Return the present fused with its retrieval: P perceptual tokens and one cognitive token."""
         assert query is not None
         assert query.tokens is not None
         count, read, shares, steps = state["count"], [], [], []
-        now = torch.zeros_like(count)  # of an empty bank alone, which no chunk reads: an episode's first frame is there
+        now = torch.zeros_like(count)  # used only with an empty bank, which no chunk reads
         real = torch.arange(self.capacity, device=count.device) < count[:, None]
         for name, present in self._present(query.tokens).items():
             fused, looked = self.streams[name](present, state[name], state[f"{name}_steps"], count, now)
@@ -121,7 +121,7 @@ class Bank(MemoryMechanism):
 
 
 class Lookup(nn.Module):
-    """Cross-attention and a feed-forward layer, each added and then normalised; without an output projection."""
+    """Cross-attention and a feed-forward layer, both with residual and post-norm, without an output projection."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -130,13 +130,13 @@ class Lookup(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
 
     def forward(self, asking: Tensor, keys: Tensor, values: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Return tokens (R, N, d) after a look at M others, and how much each head looked at each: (R, heads N, M).
+        """Return tokens (R, N, d) after attention to M others, and the attention weights (R, heads N, M).
 
-        Keys and values (R, M, d) are not projected themselves: the query is, by the keys' weights too, and then the sum
-        of values. The products are the same, and there are tens of times more keys than queries.
+        The projections of keys and values (R, M, d) are applied to the query and to the weighted sum instead: the
+        products are the same, and there are many times more keys than queries.
 
         Args:
-            hidden: (R, M) bool, which of them are not looked at.
+            hidden: (R, M) bool, keys that are masked out.
         """
         of_key, of_value = (one.weight.unflatten(0, (HEADS, -1)) for one in (self.key, self.value))
         query = torch.einsum("rnhe,hed->rhnd", self.query(asking).unflatten(2, (HEADS, -1)), of_key).flatten(1, 2)
@@ -148,13 +148,12 @@ class Lookup(nn.Module):
 
 
 class Stream(nn.Module):
-    """Retrieval from the entries of a stream, and the gate of what is found."""
+    """Retrieval from the entries of a stream, and the gate of the result."""
 
-    def __init__(self, width: int, time_codes: bool) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.time: nn.Module | None = None
-        if time_codes:  # a last bias would be the same for all entries, which softmax does not see
-            self.time = nn.Sequential(nn.Linear(2 * WAVES, width), nn.SiLU(), nn.Linear(width, width, bias=False))
+        # The last layer has no bias, because softmax is invariant to a term shared by all entries.
+        self.time = nn.Sequential(nn.Linear(2 * WAVES, width), nn.SiLU(), nn.Linear(width, width, bias=False))
         self.blocks = nn.ModuleList(Lookup(width) for _ in range(BLOCKS))
         self.gate = nn.Linear(2 * width, width)
         nn.init.normal_(self.gate.weight, std=1e-3)
@@ -163,23 +162,21 @@ class Stream(nn.Module):
     def forward(
         self, present: Tensor, entries: Tensor, steps: Tensor, count: Tensor, now: Tensor
     ) -> tuple[Tensor, list[Tensor]]:
-        """Return the present fused with what it finds in the entries; where there are none, in itself.
+        """Return the present fused with its retrieval from the entries, or from itself if there are no entries.
 
         Args:
-            present: (R, N, d). entries: (R, L, N, d), of which the first ``count`` (R,) are real. steps: (R, L).
-            now: (R,) the present's step.
+            present: (R, N, d). entries: (R, L, N, d); the first ``count`` (R,) are real. steps: (R, L).
+            now: (R,) step of the present.
 
         Returns:
-            (R, N, d), and of each block, how much its heads looked at each token of the entries and, behind them, of
-            the present: (R, heads N, (L + 1) N).
+            (R, N, d), and for each block the attention of its heads to the tokens of the entries and then of the
+            present: (R, heads N, (L + 1) N).
         """
         slots = torch.arange(entries.shape[1] + 1, device=count.device)
         hidden = torch.where(slots < slots[-1], slots >= count[:, None], count[:, None] > 0)
         hidden = hidden.repeat_interleave(present.shape[1], dim=1)
         values = torch.cat([entries, present[:, None]], dim=1)
-        keys = values
-        if self.time is not None:
-            keys = values + self.time(waves(torch.cat([steps, now[:, None]], dim=1)))[:, :, None]
+        keys = values + self.time(waves(torch.cat([steps, now[:, None]], dim=1)))[:, :, None]
         keys, values = keys.flatten(1, 2), values.flatten(1, 2)
         found, looked = present, []
         for block in self.blocks:
@@ -190,7 +187,7 @@ class Stream(nn.Module):
 
 
 def shares_of(looked: list[Tensor], tokens: int) -> Tensor:
-    """Return the share (R, N, L) of each entry, of ``tokens`` N, in what a stream's heads and blocks looked at."""
+    """Return the share (R, N, L) of each entry in the attention of a stream's blocks and heads; ``tokens`` is N."""
     of_all = torch.stack(looked).detach().float()
     shares: Tensor = reduce(of_all, "b r (h n) (l m) -> r n l", "sum", h=HEADS, m=tokens) / (HEADS * len(looked))
     return shares[:, :, :-1]
@@ -204,17 +201,20 @@ def waves(steps: Tensor) -> Tensor:
 
 
 def append(entries: Tensor, steps: Tensor, count: Tensor, new: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-    """Return entries and steps with a new entry; in a full row the two most similar neighbours become their mean.
+    """Append an entry; in a full row, replace the two most similar neighbours by their mean.
 
     Similarity is the cosine of the tokens at the same place, averaged over the places.
 
     Args:
-        entries: (R, L, N, d). steps: (R, L). count: (R,) real ones. new: (R, N, d). now: (R,), its step.
+        entries: (R, L, N, d). steps: (R, L). count: (R,), number of entries. new: (R, N, d). now: (R,), its step.
+
+    Returns:
+        Entries and steps.
     """
     length = entries.shape[1]
     entries, steps = torch.cat([entries, new[:, None]], dim=1), torch.cat([steps, now[:, None].to(steps)], dim=1)
     unit = F.normalize(entries, dim=3)
-    pair = (unit[:, :-1] * unit[:, 1:]).sum(dim=3).mean(dim=2).argmax(dim=1)[:, None]  # this one and the next
+    pair = (unit[:, :-1] * unit[:, 1:]).sum(dim=3).mean(dim=2).argmax(dim=1)[:, None]  # the first of two
     slots, full, free = torch.arange(length, device=count.device), (count == length)[:, None], count[:, None]
     kept = torch.where(full, slots + (slots > pair), torch.where(slots == free, length, slots))
     other = kept + (full & (slots == pair))

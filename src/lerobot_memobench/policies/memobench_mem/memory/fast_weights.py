@@ -1,4 +1,4 @@
-"""Fast weights: a linear map of each row learns from each remembered frame by a step of gradients (RoboMME's TTT)."""
+"""Fast weights (RoboMME's TTT): each row has a linear map that takes a gradient step for each remembered frame."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from lerobot_memobench.policies.memobench_mem.memory.recurrent import HIDDEN, Re
 
 HEADS, FRAMES_READ = 2, 8
 BASE_RATE, MAX_RATE, MAX_STEP = 0.01, 0.1, 5.0
-"""Of the inner step: its rate where nothing is learned yet, and at most; the norm of a head's step at most."""
+"""Initial and maximum rate of the inner step, and maximum norm of a head's step."""
 
 
 class FastWeights(MemoryMechanism):
     """TTT of RoboMME's pi0.5: weights W, b of each head that map a token's key to its value, learned while acting.
 
-    A frame is one step of gradients on |R(k W + b) - (v - k)|^2 / 2, R being an RMS norm with a learned scale and
-    shift that the step leaves alone. Each token has its rate, and the steps of W and of b are at most 5 long. Then
-    y = R(q W + b) + q, and the token comes out as x + LN_post(y) W_o. A chunk reads what came out of the last 8 frames;
-    what lies further back is in W and b alone.
+    A frame is one gradient step on |R(k W + b) - (v - k)|^2 / 2, with R an RMS norm whose learned scale and shift the
+    step does not change. Each token has its own rate, and the steps of W and of b have a norm of at most 5. Then
+    y = R(q W + b) + q, and the token's output is x + LN_post(y) W_o. A chunk reads the outputs of the last 8 frames;
+    earlier frames are kept in W and b only.
 
-    Unlike the source, W and b are carried over from one remembered frame to the next; there they are learned anew at
-    each chunk from the last 64. Gradients of training pass through the last ``gradient_frames``; there through all 64.
-    A frame has this policy's tokens (2 of objects, 16 of a picture; there 64).
+    Unlike in the source, W and b are carried over from one remembered frame to the next; the source learns them again
+    from the last 64 frames at each chunk. Gradients of training pass through the last ``gradient_frames``; in the
+    source, through all 64. A frame has this policy's tokens (2 of objects, 16 of a picture; 64 in the source).
     """
 
     Settings = RecurrenceSettings
@@ -52,7 +52,7 @@ class FastWeights(MemoryMechanism):
         self.query_norm, self.key_norm, self.value_norm = (nn.LayerNorm(of_head, eps=1e-6) for _ in range(3))
         self.rate = nn.Linear(self.width, HEADS)
         nn.init.normal_(self.rate.weight, std=0.02)
-        nn.init.constant_(self.rate.bias, math.log(math.expm1(BASE_RATE)))  # of which softplus is the base rate
+        nn.init.constant_(self.rate.bias, math.log(math.expm1(BASE_RATE)))  # softplus of it is the base rate
         self.weight = nn.Parameter(torch.empty(HEADS, of_head, of_head))
         nn.init.normal_(self.weight, std=of_head**-0.5)
         self.bias = nn.Parameter(torch.zeros(HEADS, 1, of_head))
@@ -61,7 +61,7 @@ class FastWeights(MemoryMechanism):
         self.out = nn.Linear(self.width, spec.width)
 
     def init(self, rows: int) -> State:
-        """Return the learned initial weights of each row, and no frame."""
+        """Return the learned initial weights, and no frame."""
         outputs = self.bias.new_zeros(rows, FRAMES_READ, self.spec.tokens, self.width)
         return {
             "weight": repeat(self.weight, "... -> r ...", r=rows),
@@ -71,8 +71,8 @@ class FastWeights(MemoryMechanism):
         }
 
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
-        """Let the weights learn from the frame, then apply them to it; drop the oldest frame's output."""
-        frame = encoded(self.encoder, tokens, step, self.settings.time_codes)
+        """Take a gradient step on the frame, apply the weights to it, and drop the oldest frame's output."""
+        frame = encoded(self.encoder, tokens, step)
         asked, key, value = (
             norm(rearrange(linear(frame), "r p (h d) -> r h p d", h=HEADS))
             for norm, linear in (
@@ -82,7 +82,7 @@ class FastWeights(MemoryMechanism):
             )
         )
         rate = rearrange(F.softplus(self.rate(frame)).clamp(max=MAX_RATE), "r p h -> r h p 1")
-        with torch.autocast(frame.device.type, enabled=False):  # steps are a hundredth of what they change
+        with torch.autocast(frame.device.type, enabled=False):  # a step is about a hundredth of the weights
             key, value, asked, rate = (part.to(state["weight"]) for part in (key, value, asked, rate))
             weight, bias = self._learned(state["weight"], state["bias"], key, value, rate)
             applied, _ = self._normed(asked @ weight + bias)
@@ -98,7 +98,7 @@ class FastWeights(MemoryMechanism):
     def _learned(self, weight: Tensor, bias: Tensor, key: Tensor, value: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         """Return the weights (R, H, d, d) and biases (R, H, 1, d) after one step.
 
-        Its gradients are written out, so that it goes without autograd, and gradients of training pass through it.
+        Its gradients are written out: it needs no autograd in a rollout, and training differentiates through it.
 
         Args:
             key, value: (R, H, P, d). rate: (R, H, P, 1).
@@ -109,19 +109,19 @@ class FastWeights(MemoryMechanism):
         return weight - _shortened(key.mT @ step), bias - _shortened(step.sum(dim=-2, keepdim=True))
 
     def _normed(self, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """Return R(z), z at unit size, and what brought it there."""
+        """Return R(z); z at unit size, and the factor that scaled it."""
         root = torch.rsqrt(z.square().mean(dim=-1, keepdim=True) + 1e-8)
         unit = z * root
         return unit * (1 + self.scale) + self.shift, (unit, root)
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return what came out of the last frames."""
+        """Return the outputs of the last frames."""
         each: Tensor = self.out(state["outputs"].flatten(1, 2))
         steps = repeat(state["steps"], "r f -> r (f p)", p=self.spec.tokens)
         return MemoryTokens(each, steps >= 0, steps=steps)
 
 
 def _shortened(step: Tensor) -> Tensor:
-    """Return the steps of each row and head (R, H, ...), none longer than allowed."""
+    """Return the steps of each row and head (R, H, ...), with norms of at most `MAX_STEP`."""
     length = torch.linalg.vector_norm(step, dim=(-2, -1), keepdim=True)
     return step * (MAX_STEP / length.clamp(min=MAX_STEP))

@@ -1,4 +1,4 @@
-"""Frame sampling: an action chunk reads frames spread evenly over the episode so far (RoboMME; the paper's memory)."""
+"""Frame sampling, the paper's memory (RoboMME): a chunk reads frames spread evenly over the episode so far."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ logger = logging.getLogger(__name__)
 
 
 def sample_frames(step: int, max_frames: int) -> list[int]:
-    """Choose at most ``max_frames`` of the frames 0 ... ``step``, evenly, first and last included.
+    """Choose at most ``max_frames`` of the frames 0 ... ``step``, evenly spaced, with the first and the last.
 
-    All of them while there are no more than ``max_frames``. Indices are rounded down and strictly increase.
+    Indices are rounded down and strictly increase.
     """
     if step < 0 or max_frames < 1:
         raise ValueError(f"step must be >= 0 and max_frames >= 1, got {step} and {max_frames}")
@@ -41,10 +41,11 @@ def sample_frames(step: int, max_frames: int) -> list[int]:
 
 @dataclass(eq=False)
 class Frame:
-    """A frame: its control step since the episode began, and what is stored of it (P', D') on the CPU.
+    """A remembered frame.
 
     Attributes:
-        tokens: its memory tokens (P, d_m), once it has been read; of objects alone, where they are small.
+        step: control step since the episode began. stored: (P', D') on the CPU, as returned by the encoder.
+        tokens: its memory tokens (P, d_m), kept after the first read; only of objects, whose tokens are small.
     """
 
     step: int
@@ -57,24 +58,24 @@ class FramesSettings:
     """Settings of `Frames`.
 
     Attributes:
-        time_codes: whether a memory token says when its frame was; if not, only the frames' order is told.
-        content: whether it says what was seen; if not, memory is a clock: the control of `docs/guides/controls.md`.
-            With ``memory_phase`` it is one that knows when the execution began.
+        frames: maximum number of frames that a chunk reads.
+        content: whether tokens hold the observation. If false, they hold only their time: the clock-only control of
+            `docs/guides/controls.md`; with ``memory_phase``, also the phase.
     """
 
-    time_codes: bool = True
+    frames: int = 32
     content: bool = True
 
     def __post_init__(self) -> None:
-        if not (self.time_codes or self.content):
-            raise ValueError("a memory with neither time_codes nor content says nothing")
+        if self.frames < 1:
+            raise ValueError(f"frames={self.frames} must be at least 1")
 
 
 class Frames(MemoryMechanism):
-    """FrameSamp of RoboMME's pi0.5: stored frames, of which a chunk reads F spread evenly, each token with its time.
+    """FrameSamp of RoboMME's pi0.5: a chunk reads F of the stored frames, spread evenly, each token with its time.
 
-    Every frame is stored, because which are read changes with each new one; of an episode without end the latest. They
-    are kept as they were stored, and pooled when they are read.
+    Every frame is stored, because each new frame changes the selection; of a very long episode, the latest `capacity`.
+    Frames are kept as returned by the encoder, and pooled when they are read.
     """
 
     Settings = FramesSettings
@@ -87,34 +88,34 @@ class Frames(MemoryMechanism):
         self.warned = False
 
     @classmethod
-    def slots(cls, slot: int, frames: int) -> Sequence[int]:
-        """Return the sampled frames alone."""
+    def slots(cls, slot: int, settings: FramesSettings) -> Sequence[int]:
+        """Return the sampled frames."""
         first = max(0, slot + 1 - cls.capacity)
-        return [first + chosen for chosen in sample_frames(slot - first, frames)]
+        return [first + chosen for chosen in sample_frames(slot - first, settings.frames)]
 
     def init(self, rows: int) -> list[list[Frame]]:
         """Return no frames."""
         return [[] for _ in range(rows)]
 
     def observe(self, state: Any, frames: Tensor, step: Tensor, query: Query | None = None) -> list[list[Frame]]:
-        """Keep the frames as they are."""
+        """Store the frames."""
         return self.write(state, frames, step)
 
     def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> list[list[Frame]]:
-        """Keep the frames, as they are stored."""
+        """Store the frames without pooling."""
         if not self.warned and any(len(row) == self.capacity for row in state):
             self.warned = True
             logger.warning(
-                "An episode has more than %d remembered frames, of which the latest are kept; call policy.reset() "
-                "when an episode begins.",
+                "An episode has more than %d remembered frames; only the latest are kept. Call policy.reset() when an "
+                "episode begins.",
                 self.capacity,
             )
         new = [Frame(now, stored) for now, stored in zip(step.tolist(), tokens.to("cpu"), strict=True)]
         return [[*row[1 - self.capacity :], frame] for row, frame in zip(state, new, strict=True)]
 
     def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
-        """Return the sampled frames of each row, encoded; rows with fewer than F are padded."""
-        count, device = self.spec.frames, self.encoder.project.weight.device
+        """Return the encoded sampled frames of each row, padded to F."""
+        count, device = self.settings.frames, self.encoder.project.weight.device
         rows = [[kept[slot] for slot in sample_frames(len(kept) - 1, count)] for kept in state]
         read = [frame for row in rows for frame in row]
         places, steps = torch.zeros(len(rows), count, dtype=torch.int64), torch.zeros(len(read), dtype=torch.int64)
@@ -125,7 +126,7 @@ class Frames(MemoryMechanism):
         return self._tokens(each[places].flatten(1, 2), real, steps[places])
 
     def _each(self, read: list[Frame], steps: Tensor) -> Tensor:
-        """Return the memory tokens (N, P, d_m) of frames, each of objects made once."""
+        """Return the memory tokens (N, P, d_m) of frames; tokens of objects are computed once per frame."""
         new = [number for number, frame in enumerate(read) if frame.tokens is None]
         made = [frame.tokens for frame in read]
         if new:
@@ -135,22 +136,22 @@ class Frames(MemoryMechanism):
                 return tokens
             for number, made[number] in zip(new, tokens, strict=True):
                 read[number].tokens = made[number]
-        return torch.stack(made)  # type: ignore[arg-type]  # all are made now
+        return torch.stack(made)  # type: ignore[arg-type]  # none is None now
 
     def join(self, states: Sequence[Any]) -> list[list[Frame]]:
-        """Return the rows of several states."""
+        """Concatenate the rows of several states."""
         return [row for state in states for row in state]
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
-        """Encode each frame once, whichever samples read it."""
-        padded = F.pad(histories.places, (0, self.spec.frames - histories.places.shape[1]), value=-1)
+        """Encode each frame once for all samples that read it."""
+        padded = F.pad(histories.places, (0, self.settings.frames - histories.places.shape[1]), value=-1)
         real, places = padded >= 0, padded.clamp(min=0)
         each = self._encoded(self._pooled(histories.frames).unsqueeze(1), histories.steps[:, None]).squeeze(1)
         found = self._tokens(each, real, histories.steps[places])
         return found._replace(places=places)
 
     def _pooled(self, frames: Tensor) -> Tensor:
-        """Return tokens (N, P, D) of stored frames (N, P', D'); a clock's hold the phase, or nothing."""
+        """Return tokens (N, P, D) of stored frames (N, P', D'); without content, zeros or the phase."""
         if not self.settings.content and isinstance(self.pool, ObjectPool) and self.pool.phase is not None:
             return self.pool.phases(frames)
         tokens: Tensor = self.pool(frames)
@@ -158,7 +159,7 @@ class Frames(MemoryMechanism):
 
     def _encoded(self, tokens: Tensor, steps: Tensor) -> Tensor:
         """Return memory tokens (B, F, P, d_m) of tokens (B, F, P, D) at control steps (B, F)."""
-        encoded: Tensor = self.encoder(tokens, steps if self.settings.time_codes else torch.zeros_like(steps))
+        encoded: Tensor = self.encoder(tokens, steps)
         return encoded
 
     def _tokens(self, each: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:
@@ -175,18 +176,18 @@ _TIME_BASE, _SPACE_BASE = 10_000.0, 1_000.0
 
 
 def _waves(values: Tensor, base: float) -> Tensor:
-    """Sines, then cosines, of values (...) at 128 frequencies from 1 down to 1/base: (..., 256) float32."""
+    """Return sines, then cosines, of values (...) at 128 frequencies from 1 down to 1/base: (..., 256) float32."""
     exponents = torch.arange(_FREQUENCIES, dtype=torch.float32, device=values.device) / (_FREQUENCIES - 1)
     angles = rearrange(values.to(torch.float32), "... -> ... 1") * base**-exponents
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
 class MemoryEncoder(nn.Module):
-    """Vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear.
+    """Map vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear.
 
-    A Linear of a concatenation is the sum of its parts' Linears. The 16 tokens of a frame share their time and all
+    A Linear of a concatenation is the sum of Linears of its parts. The 16 tokens of a frame share their time and all
     frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
-    Tokens without a ``grid`` are joined with their time alone.
+    Tokens without a ``grid`` are joined with their time only.
     """
 
     def __init__(self, image_dim: int, memory_dim: int, grid: int = MEMORY_GRID) -> None:
@@ -199,7 +200,7 @@ class MemoryEncoder(nn.Module):
         """Encode tokens (B, F, P, D) of control steps (B, F) to (B, F, P, d_m) float32."""
         of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
         image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
-        # A training batch gives its frames one by one, of a tenth as many steps.
+        # A training batch holds single frames with many equal steps.
         alone = steps.shape[1] == 1 and not steps.is_meta
         at, places = steps.unique(return_inverse=True) if alone else (steps, None)
         positions = F.linear(F.silu(self._positions(at)), of_position)
@@ -208,10 +209,10 @@ class MemoryEncoder(nn.Module):
         return image + positions
 
     def _positions(self, steps: Tensor) -> Tensor:
-        """Return `position` of each token (..., 16, 768); of a frame's time alone (..., 1, d_m) without a grid.
+        """Return `position` of each token, (..., 16, 768); without a grid, of the frame's time only, (..., 1, d_m).
 
-        Its input is sin t, cos t, sin y, cos y, sin x, cos x, 128 frequencies each from 1 down to 1/base. Token i of a
-        grid row lies at 4 i + 2 of the 16 patches (its middle), y runs over rows.
+        Its input is sin t, cos t, sin y, cos y, sin x, cos x, at 128 frequencies each from 1 down to 1/base. The middle
+        of token i of a grid row lies at 4 i + 2 of the 16 patches; y runs over rows.
         """
         weight = self.position.weight
         if not self.grid:

@@ -1,7 +1,7 @@
-"""Keyframes: a high level says the active checkpoint and nominates frames to keep; the low level acts on what it says.
+"""Keyframes (MemER): a high level chooses the active checkpoint and nominates keyframes; a low level acts on this.
 
-MemER's two levels. All memory is the high level's: recent frames, and keyframes that it nominated among earlier recent
-ones. The low level, which is the policy, reads the words of the checkpoint that the high level said last.
+The memory belongs to the high level: recent frames, and keyframes that it nominated among earlier recent frames. The
+low level, which is the policy, reads the words of the checkpoint that the high level chose last.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     Query,
     State,
 )
-from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
+from lerobot_memobench.policies.memobench_mem.memory.subgoal import CheckpointTexts, scored
 
 RECENT, SHOWN, GAP = 8, 8, 5
-"""Frames of the recent window; keyframes that are shown at most; frames between two nominations of one cluster."""
+"""Frames of the recent window; maximum number of keyframes shown; maximum gap in a cluster of nominations, frames."""
 NOMINATED = 64
-"""Different nominated frames that are kept, the latest: clusters before the eight that are shown count no more."""
+"""Nominated frames that are kept, the latest."""
 DROPPED, SHIFTED = 0.1, 2
-"""In training: share of the true keyframes that is left out, and by how many frames the others are moved at most."""
+"""In training: share of the true keyframes that is dropped, and maximum shift of the others, frames."""
 LAYERS, HEADS = 2, 8
 
 
 def representatives(nominated: Sequence[int], gap: int) -> list[int]:
     """Return the low median of each cluster of nominated frames, ascending.
 
-    A cluster ends where the next nomination is more than ``gap`` away. A frame counts as often as it was nominated.
+    A cluster ends when the next nomination is more than ``gap`` away. A frame counts once per nomination.
     """
     clusters: list[list[int]] = []
     for frame in sorted(nominated):
@@ -47,7 +47,7 @@ def representatives(nominated: Sequence[int], gap: int) -> list[int]:
 
 
 def shown(nominated: Sequence[int], gap: int, window: int) -> list[int]:
-    """Return the keyframes that are shown: the last representatives, without those of the recent window.
+    """Return the keyframes to show: the last representatives before the recent window.
 
     Args:
         window: the oldest recent frame.
@@ -56,17 +56,17 @@ def shown(nominated: Sequence[int], gap: int, window: int) -> list[int]:
 
 
 class Keyframes(MemoryMechanism):
-    """MemER on this backbone; nominations, clusters and labels are those of its released code.
+    """MemER on this backbone; nominations, clusters and labels follow its released code.
 
-    A frame is written every 10 control steps (2 Hz), and the high level is asked at each; the recent window spans 4 s.
-    A keyframe's label is the last written frame before a checkpoint is completed. The high level learns from true
-    keyframes, clustered as its own would be, some left out or moved, which the source does not; of the checkpoint it
-    learns the one that is active at the next frame, and the low level acts on the same.
+    A frame is written every 10 control steps (2 Hz), and the high level runs for each; the recent window spans 4 s. A
+    keyframe's label is the last written frame before a checkpoint is completed. The high level learns from true
+    keyframes, clustered as in a rollout, with some dropped or shifted, unlike in the source. Its target is the
+    checkpoint that is active at the next frame, on which the low level acts as well.
 
-    Otherwise than there: the high level is no VLM but a small transformer of its own over the frames' tokens, from
-    scratch; it chooses among the task's texts, which also tell it the task, and has a logit per recent frame. The low
-    level reads the text beside the instruction, not in its place. 64 nominated frames are kept, not all. Weights are
-    not merged with those of before.
+    Differences from the source: the high level is no VLM but a small transformer over the frames' tokens, trained from
+    scratch; it chooses from the task's texts, which also identify the task, and has a logit per recent frame. The low
+    level reads the text in addition to the instruction. The latest 64 nominated frames are kept instead of all. Weights
+    are not merged with earlier ones.
     """
 
     stride = 10
@@ -93,11 +93,11 @@ class Keyframes(MemoryMechanism):
     # -- the high level ----------------------------------------------------------------------------------------------
 
     def ask_high_level(self, frames: Tensor, real: Tensor, choices: Tensor) -> tuple[Tensor, Tensor]:
-        """Return scores (B, S + 1) of the checkpoints, and logits (B, RECENT) of the recent frames' nomination.
+        """Return scores (B, S + 1) of the checkpoints, and logits (B, RECENT) for nominating the recent frames.
 
         Args:
-            frames: (B, SHOWN + RECENT, P, D) keyframes and recent frames, each the latest last. real: (B, SHOWN +
-                RECENT) which there are. choices: (B, S) which texts are the task's.
+            frames: (B, SHOWN + RECENT, P, D) keyframes and recent frames, each the latest last.
+            real: (B, SHOWN + RECENT), False for padding. choices: (B, S), which texts belong to the task.
         """
         tokens = self.embed(frames.to(self.embed.weight.dtype)) + self.place + self.spot
         task = self.task(choices.to(tokens.dtype)).unsqueeze(1)
@@ -110,18 +110,18 @@ class Keyframes(MemoryMechanism):
     # -- a rollout ---------------------------------------------------------------------------------------------------
 
     def init(self, rows: int) -> State:
-        """Return no frames, and nothing said."""
+        """Return no frames and the empty text."""
         like = self.ask
         frame = rows, RECENT + NOMINATED, self.spec.tokens, self.spec.dim
         return {
             "frames": torch.zeros(frame, device=like.device),
             "steps": torch.full(frame[:2], -1, device=like.device),
             "votes": torch.zeros(rows, NOMINATED, dtype=torch.int64, device=like.device),
-            "said": torch.full((rows,), self.count, device=like.device),
+            "text": torch.full((rows,), self.count, device=like.device),
         }
 
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
-        """Keep the frame, ask the high level, and count its nominations."""
+        """Keep the frame, run the high level, and count its nominations."""
         assert query is not None
         assert query.choices is not None
         kept, old = state["frames"][:, :NOMINATED], state["frames"][:, NOMINATED:]
@@ -143,11 +143,11 @@ class Keyframes(MemoryMechanism):
             "frames": torch.cat([kept, recent], dim=1),
             "steps": torch.cat([kept_at, recent_at], dim=1),
             "votes": votes[rows, latest],
-            "said": scores.argmax(dim=1),
+            "text": scores.argmax(dim=1),
         }
 
     def _shown(self, kept: Tensor, kept_at: Tensor, votes: Tensor, recent_at: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the keyframes (R, SHOWN, P, D) that are shown, and which of them there are."""
+        """Return the keyframes (R, SHOWN, P, D) to show, and their mask."""
         chosen = torch.full((len(kept), SHOWN), -1)
         for row, (steps, counts, recent) in enumerate(
             zip(kept_at.tolist(), votes.tolist(), recent_at.tolist(), strict=True)
@@ -160,13 +160,13 @@ class Keyframes(MemoryMechanism):
         return kept[torch.arange(len(kept), device=kept.device).unsqueeze(1), chosen.clamp(min=0)], chosen >= 0
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return the words of what the high level said last."""
-        return MemoryTokens(*self.texts(state["said"]))
+        """Return the words of the text that the high level chose last."""
+        return MemoryTokens(*self.texts(state["text"]))
 
     # -- a training --------------------------------------------------------------------------------------------------
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
-        """Ask the high level once for each sample, by true keyframes; as a rollout would be, where nothing is true."""
+        """Run the high level once per sample with true keyframes; without labels, replay a rollout."""
         if histories.subgoals is None or query is None or query.subgoal is None:
             return super().replay(histories, query)
         assert query.choices is not None
@@ -190,15 +190,15 @@ class Keyframes(MemoryMechanism):
         return MemoryTokens(*self.texts(torch.where(target < 0, self.count, target)))
 
     def _true_frames(self, labels: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return which frames the high level is shown in training, and which recent ones it should nominate.
+        """Return the frames shown to the high level in training, and which recent frames it should nominate.
 
-        A frame whose next one has another label is a keyframe: a checkpoint is completed behind it.
+        A frame is a keyframe if the next frame has another label: a checkpoint is completed between them.
 
         Args:
-            labels: (B, F) of the histories' frames. counts: (B,) how many frames these have.
+            labels: (B, F) of the histories' frames. counts: (B,) numbers of these frames.
 
         Returns:
-            (B, SHOWN + RECENT) places in the histories, -1: none; (B, RECENT) bool.
+            (B, SHOWN + RECENT) indices in the histories, -1 for padding; (B, RECENT) bool.
         """
         device, size = labels.device, labels.shape[1]
         within = torch.arange(1, size, device=device) < counts.unsqueeze(1)
@@ -216,6 +216,6 @@ class Keyframes(MemoryMechanism):
         return slots, ends.gather(1, recent.clamp(min=0)) & (recent >= 0)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the losses of the last replay with labels: to the true checkpoint, and to the true keyframes."""
+        """Return the losses of the last replay with labels, for the checkpoint and for the keyframes."""
         found, self._losses = self._losses, {}
         return found

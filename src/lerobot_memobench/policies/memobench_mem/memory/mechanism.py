@@ -1,9 +1,9 @@
-"""Interface of memory mechanisms: what is kept of an episode, how it is read, and how training goes through the past.
+"""Interface of memory mechanisms: how to keep an episode, how to read it, and how training replays it.
 
-A mechanism is a module with weights of its own. In a rollout each row has a state, which `write` changes once per
-remembered frame and `read` turns into memory tokens once per action chunk. In training `replay` does the same for the
-samples of a batch, from frames loaded as a rollout would have written them; gradients pass through a bounded number of
-the last ones.
+A mechanism is a module with its own weights. In a rollout each row has a state: `write` updates it once per remembered
+frame, and `read` turns it into memory tokens once per action chunk. In training `replay` computes the same for the
+samples of a batch, from the frames that a rollout would have written; gradients pass through a bounded number of the
+last frames.
 
 Shapes: B samples, R rows, U different frames, F frames of a sample's history, P tokens per frame, D their width, d_m
 width of memory tokens, L memory tokens of a row.
@@ -19,35 +19,37 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.products import exact_products
+from lerobot_memobench.policies.memobench_mem.layers import exact_products
 
 MEMORY_GRID = 4
 """A remembered picture is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
+OBJECT_TOKENS = 2
+"""The objects of a remembered frame are pooled to this number of tokens."""
 
-# -- in a batch -------------------------------------------------------------------------------------------------------
+# -- keys of a batch --------------------------------------------------------------------------------------------------
 
 FRAMES, STEPS, PLACES = "memory.frames", "memory.steps", "memory.places"
 """Histories of a training batch: see `Histories`."""
 EXACT = "memory.exact"
-"""Frames without detection noise, where the others have some."""
+"""The remembered frames without detection noise."""
 AHEAD = "memory.ahead"
-"""Frames that follow the histories, for mechanisms that learn to foresee them (`MemoryMechanism.ahead`)."""
+"""Frames that follow the histories, for mechanisms that learn to predict them (`MemoryMechanism.ahead`)."""
 SUBGOAL, SUBGOALS, CHOICES = "memory.subgoal", "memory.subgoals", "memory.choices"
-"""Labels for mechanisms that learn from checkpoints (`MemoryMechanism.privileged`), as numbers of texts; -1: none. Of
-each sample (B,), of each frame (U,), and which texts are its task's (B, S) bool, which a rollout has too."""
+"""For mechanisms that learn from texts (`MemoryMechanism.privileged`): the index of the active text, -1 for none, of
+each sample (B,) and of each frame (U,); and which texts belong to the sample's task, (B, S) bool, also in rollouts."""
 TEXT, TEXT_MASK = "memory.text", "memory.text_mask"
 PHASE = "phase"
 
 
 class Histories(NamedTuple):
-    """What B samples remember, frames that several share once.
+    """Remembered frames of B samples; frames shared by several samples are stored once.
 
     Attributes:
         frames: (U, P, D') stored frames. steps: (U,) their control steps since their episodes began, int64.
-        places: (B, F) which of them each sample remembers, oldest first; -1 behind the last.
-        subgoals: (U,) number of the text that is a frame's subgoal, -1: none; with `MemoryMechanism.privileged`.
-        ahead: (B, n) which frames follow those, -1 behind the episode's last; with `MemoryMechanism.ahead`.
-        exact: (U, P, D') the frames without detection noise, for labels; None: ``frames`` have none.
+        places: (B, F) indices of each sample's frames, oldest first, padded by -1.
+        subgoals: (U,) index of each frame's subgoal text, -1: none; with `MemoryMechanism.privileged`.
+        ahead: (B, n) indices of the frames that follow, -1 after the episode's end; with `MemoryMechanism.ahead`.
+        exact: (U, P, D') the frames without detection noise, for labels; None: ``frames`` have no noise.
     """
 
     frames: Tensor
@@ -58,17 +60,17 @@ class Histories(NamedTuple):
     exact: Tensor | None = None
 
     def to(self, device: torch.device) -> Histories:
-        """Move them to a device."""
+        """Move all tensors to a device."""
         return Histories(*(None if part is None else part.to(device) for part in self))  # type: ignore[arg-type]
 
 
 class Query(NamedTuple):
-    """The present of R rows, by which memory may be written and read.
+    """The present of R rows, as an input of writing and reading.
 
     Attributes:
-        tokens: (R, P, D) of the present observation, as of a remembered frame; if a mechanism `asks_present`.
-        choices: (R, S) bool, which of the S subgoals are the task's; with `MemoryMechanism.privileged`.
-        subgoal: (R,) which is the present one, -1: none; of training samples alone.
+        tokens: (R, P, D) of the present observation, as of a remembered frame; with `MemoryMechanism.asks_present`.
+        choices: (R, S) bool, which of the S texts belong to the task; with `MemoryMechanism.privileged`.
+        subgoal: (R,) index of the active text, -1: none; only in training.
     """
 
     tokens: Tensor | None = None
@@ -76,21 +78,21 @@ class Query(NamedTuple):
     subgoal: Tensor | None = None
 
     def rows(self, chosen: Any) -> Query:
-        """Return some rows."""
+        """Select rows."""
         return Query(*(None if part is None else part[chosen] for part in self))
 
 
 class MemoryTokens(NamedTuple):
-    """Tokens that B rows read, L each.
+    """Memory tokens of B rows, L each.
 
     Attributes:
         each: (B, L, d), or (U, P, d) of U frames.
-        mask: (B, L) bool, which are real.
-        places: (B, F), which of the U frames each row reads, with F P = L; None where ``each`` lies in rows.
-        steps: (B, L), control step of the frame that a token is of, -1 where it is of none; None: of none.
-        sources: where a token is made of several entries of a memory, the share of each, (B, L, E), and the control
-            steps of these, (B, E), -1 where there is none; for looking at, without gradients.
-        query: the present that they were read by, where the mechanism's own fusion asks for it.
+        mask: (B, L) bool, False for padding.
+        places: (B, F) indices of each row's frames, with F P = L; None if ``each`` is (B, L, d).
+        steps: (B, L), control step of each token's frame, -1 for a token without a frame; None: no token has a frame.
+        sources: if a token mixes several entries of a memory: the share of each entry, (B, L, E), and the entries'
+            control steps, (B, E), -1 for padding. For memory reads, without gradients.
+        query: the present, if the mechanism's own fusion needs it.
     """
 
     each: Tensor
@@ -101,11 +103,11 @@ class MemoryTokens(NamedTuple):
     query: Query | None = None
 
     def through(self, made: Callable[[Tensor], Tensor]) -> MemoryTokens:
-        """Return what is made of every token by itself."""
+        """Apply a module to each token."""
         return self._replace(each=made(self.each))
 
     def rows(self) -> Tensor:
-        """Return what each row reads, (B, L, d)."""
+        """Return the tokens of each row, (B, L, d)."""
         if self.places is None:
             return self.each
         return self.each.index_select(0, self.places.flatten()).unflatten(0, self.places.shape).flatten(1, 2)
@@ -115,26 +117,25 @@ class MemoryTokens(NamedTuple):
 
 
 State = Any
-"""What is kept of R rows: a dict of tensors (R, ...), unless a mechanism has its own ``join`` and ``replay``."""
+"""Memory of R rows: a dict of tensors (R, ...), unless a mechanism defines its own ``join`` and ``replay``."""
 
 
 @dataclass(frozen=True)
 class MemorySpec:
-    """What a mechanism is built for.
+    """Dimensions for which a mechanism is built.
 
     Attributes:
         dim: D, width of a frame's tokens. tokens: P, their number. width: d_m, of memory tokens.
-        expert: width of the action expert. frames: F at most, of what a chunk reads.
-        grid: side of the square of a picture's tokens; 0 where tokens have no place in a picture.
-        stride: control steps from one written frame to the next.
-        subgoals: texts of the checkpoints, where the mechanism is `MemoryMechanism.privileged`.
+        expert: width of the action expert.
+        grid: side of the square of a picture's tokens; 0 if tokens have no place in a picture.
+        stride: control steps between written frames.
+        subgoals: texts of the checkpoints; with `MemoryMechanism.privileged`.
     """
 
     dim: int
     tokens: int
     width: int
     expert: int
-    frames: int
     grid: int
     stride: int
     subgoals: tuple[str, ...] = ()
@@ -142,27 +143,25 @@ class MemorySpec:
 
 @dataclass
 class NoSettings:
-    """Settings of a mechanism that has none."""
+    """Settings of a mechanism without settings."""
 
 
 class MemoryMechanism(nn.Module, ABC):
-    """A way to remember an episode.
+    """Base class of memory mechanisms.
 
     Attributes:
-        Settings: a dataclass of what may be set (``policy.memory_settings``), each with a default.
-        stride: control steps from one written frame to the next where nobody says, perhaps by the perception; None: as
-            `frames`.
-        asks_present: whether it reads by tokens of the present observation.
-        asks_motion: whether it remembers what moves: its pool is a `motion_fields.MotionField`, and what is stored of a
-            picture is a thumbnail.
-        ahead: how many stored frames that follow are loaded in training, as labels.
-        privileged: whether it learns from the checkpoints' texts; a rollout is told the texts of its task, in no order.
-        fusion: its own way in which actions read it (``policy.memory_fusion=own``), a `fusion.MemoryFusion`; None: any
-            other of these.
-        gradient_frames: through how many of the last frames gradients pass at most.
+        Settings: a dataclass of the settings (``policy.memory_settings``), each with a default.
+        stride: default number of control steps between written frames, or one per perception; None: as `frames`.
+        asks_present: whether `read` needs tokens of the present observation.
+        asks_motion: whether the memory stores motion: its pool is a `motion_fields.MotionField`, and a stored picture
+            is a thumbnail.
+        ahead: number of following frames that training loads as labels.
+        privileged: whether it learns from texts of checkpoints. A rollout gets the texts of its task, in no order.
+        fusion: its own `fusion.MemoryFusion` (``policy.memory_fusion=own``); None: any general one.
+        gradient_frames: maximum number of last frames through which gradients pass.
         per_frame: whether memory tokens are P of each frame read, oldest first, as ``align=framewise`` needs.
-        reads_text: whether memory tokens are words of a checkpoint's text, of the true one in training: no alignment.
-        capacity: how many entries are kept of an episode at most.
+        reads_text: whether memory tokens are words of a checkpoint's text; then no alignment is possible.
+        capacity: maximum number of entries kept of an episode.
     """
 
     Settings: ClassVar[type] = NoSettings
@@ -178,10 +177,10 @@ class MemoryMechanism(nn.Module, ABC):
     capacity: int
 
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:
-        """Build it.
+        """Build the mechanism.
 
         Args:
-            pool: from N stored frames (N, P', D') to their tokens (N, P, D). It learns, and is part of the memory.
+            pool: maps N stored frames (N, P', D') to tokens (N, P, D). It is trained as a part of the memory.
             settings: an instance of `Settings`.
         """
         super().__init__()
@@ -191,53 +190,53 @@ class MemoryMechanism(nn.Module, ABC):
 
     @abstractmethod
     def init(self, rows: int) -> State:
-        """Return the state of rows whose episodes begin."""
+        """Return the initial state of rows."""
 
     @abstractmethod
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
-        """Return the state after each row's next frame; ``state`` itself is not changed.
+        """Return the state after each row's next frame, without changing ``state``.
 
         Args:
-            tokens: (R, P, D) of the frame, as `pooled` returns them. step: (R,) control step since the episode began.
+            tokens: (R, P, D) of the frame, as of `pooled`. step: (R,) control step since the episode began.
             query: choices of the rows.
         """
 
     @abstractmethod
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return the tokens that a chunk reads, (R, L, d_m), L being the same for all states."""
+        """Return the tokens that a chunk reads, (R, L, d_m), with the same L for all states."""
 
     def observe(self, state: State, frames: Tensor, step: Tensor, query: Query | None = None) -> State:
         """Return the state after each row's next stored frame (R, P', D')."""
         return self.write(state, self.pooled(frames), step, query)
 
     def pooled(self, frames: Tensor) -> Tensor:
-        """Return the tokens (N, P, D) of stored frames (N, P', D'), at least as precise as the mechanism's weights.
+        """Return the tokens (N, P, D) of stored frames (N, P', D'), at least in the precision of the weights.
 
-        Frames of pictures are stored in bfloat16; weights are float32 in a training, and mostly in a rollout.
+        Frames of pictures are stored in bfloat16; weights are float32 in training and usually in a rollout.
         """
         tokens: Tensor = self.pool(frames)
         own = next((one for name, one in self.named_parameters() if not name.startswith("pool.")), tokens)
         return tokens.to(torch.promote_types(tokens.dtype, own.dtype))
 
     def join(self, states: Sequence[State]) -> State:
-        """Return one state of the rows of several."""
+        """Concatenate the rows of several states."""
         return {name: torch.cat([state[name] for state in states]) for name in states[0]}
 
     # -- a training --------------------------------------------------------------------------------------------------
 
     @classmethod
-    def slots(cls, slot: int, frames: int) -> Sequence[int]:
-        """Return which of an episode's frames 0 ... ``slot`` are loaded to read at the last; all, where nobody knows.
+    def slots(cls, slot: int, settings: Any) -> Sequence[int]:
+        """Return which of an episode's frames 0 ... ``slot`` training loads to read at the last; by default all.
 
         Args:
-            frames: F of the specification.
+            settings: an instance of `Settings`.
         """
         return range(slot + 1)
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
-        """Return what B samples read, as rollouts would that have written the same frames.
+        """Return what B samples read, equal to rollouts that wrote the same frames.
 
-        Frames but the last `gradient_frames` of each sample are written without gradients, once for all samples of an
+        All but the last `gradient_frames` of each sample are written without gradients, once for all samples of an
         episode. Histories must begin at the same frame for all samples of an episode.
 
         Args:
@@ -253,12 +252,12 @@ class MemoryMechanism(nn.Module, ABC):
             state = self._before(histories, begin, query)
         if not self.gradient_frames:
             return state
-        fresh = self.init(len(begin))  # whose gradients count where nothing was written before
+        fresh = self.init(len(begin))  # with gradients, for samples without earlier frames
         early = begin == 0
         state = {name: torch.where(_like(early, of), fresh[name], of) for name, of in state.items()}
         ahead = begin[:, None] + torch.arange(int((count - begin).max()), device=begin.device)
         places = histories.places.gather(1, ahead.clamp(max=histories.places.shape[1] - 1))
-        order = (count - begin).argsort(descending=True, stable=True)  # those that end drop off the end
+        order = (count - begin).argsort(descending=True, stable=True)  # finished rows are dropped from the end
         written = self._written(
             _rows(state, order), histories, places[order], (count - begin)[order], _of(query, order)
         )
@@ -267,20 +266,20 @@ class MemoryMechanism(nn.Module, ABC):
     def _before(self, histories: Histories, begin: Tensor, query: Query | None) -> State:
         """Return the states of B samples, each after the first ``begin`` (B,) frames of its history.
 
-        Each episode is gone through once, as far as its latest sample asks.
+        Each episode is written once, up to its latest sample.
         """
         first, episode = histories.places[:, 0].unique(return_inverse=True)
         until = torch.zeros_like(first).scatter_reduce(0, episode, begin, "amax")
         latest = torch.zeros_like(first)
         ends = begin == until[episode]
-        latest[episode[ends]] = ends.nonzero().flatten()  # a sample of each episode, which asks the furthest
+        latest[episode[ends]] = ends.nonzero().flatten()  # the latest sample of each episode
         order = until.argsort(descending=True, stable=True)
         samples, row_of = latest[order], order.argsort()[episode]
         read = torch.arange(histories.places.shape[1], device=begin.device) < begin[:, None]
         if ((histories.places != histories.places[latest[episode]]) & read).any():
             raise ValueError(
-                f"slots of {type(self).__name__} are not the beginning of one sequence for all samples of an episode "
-                "that have the first in common; replay goes through that once, so write one of your own"
+                f"{type(self).__name__}.slots returns different sequences for samples of one episode with the same "
+                "first frame; the default replay needs prefixes of one sequence, so define your own replay"
             )
         stops: dict[int, list[int]] = {}
         for sample, stop in enumerate(begin.tolist()):
@@ -310,8 +309,8 @@ class MemoryMechanism(nn.Module, ABC):
         """Write the first ``counts`` (R,) frames, descending, of the rows' ``places`` (R, T); return states on the way.
 
         Returns:
-            Without ``stops`` those of the rows that end, after 0, 1, ... frames; else those of samples by ``stops``
-            (after so many frames, these), which go with the rows ``row_of`` (B,).
+            Without ``stops``: the states of the rows that end after 0, 1, ... frames. With ``stops`` (number of
+            frames -> samples): the states of these samples, whose rows are ``row_of`` (B,).
         """
         needed, where = places.clamp(min=0).unique(return_inverse=True)
         pooled, steps = self.pooled(histories.frames[needed]), histories.steps[needed]
@@ -329,16 +328,16 @@ class MemoryMechanism(nn.Module, ABC):
                 state = self.write(state, pooled[now], steps[now], part)
         return found
 
-    # -- what it learns by itself -------------------------------------------------------------------------------------
+    # -- losses -------------------------------------------------------------------------------------
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return losses of its own by their names, (B,) each and weighted; called after `replay` and the actions'.
+        """Return the mechanism's own losses by name, (B,) each and weighted; called after `replay` and the actions.
 
-        Where a loss is only measured, a privileged memory replays the histories with labels, and then without them: the
-        actions follow its own choice.
+        When a loss is only measured, a privileged memory replays the histories with labels, and then without them, so
+        that the actions follow its own choice.
 
         Args:
-            batch: the training batch, and what its fusion made beside actions (`Reading.outputs`).
+            batch: the training batch, and `Reading.outputs` of its fusion.
         """
         return {}
 
@@ -352,5 +351,5 @@ def _of(query: Query | None, chosen: Any) -> Query | None:
 
 
 def _like(rows: Tensor, other: Tensor) -> Tensor:
-    """Return ``rows`` (R,) with as many dimensions as another tensor (R, ...)."""
+    """Reshape ``rows`` (R,) to the number of dimensions of another tensor (R, ...)."""
     return rows.reshape(-1, *[1] * (other.ndim - 1))

@@ -1,10 +1,10 @@
-"""Motion: an action chunk reads what has just moved, and the expert says what will move next.
+"""Motion (HiF-VLA): an action chunk reads the motion of the last frames, and the expert predicts the next motion.
 
 From HiF-VLA (OpenHelix-Team/HiF-VLA, CVPR 2026): hindsight of the last 8 motions, its encoder, 8 foresight queries,
-their loss of 0.01 L1, and modulation of the expert by hindsight. Left out or otherwise here: motion is found by block
-matching of thumbnails, or is the displacement of objects, and no codec gives its vectors; queries stand beside the
-actions in pi0.5's expert, and there is no joint expert with norms, projections and feed-forwards of motion's own; two
-layers decode motion, without attention over place and time; an action chunk is learned as pi0.5's is.
+their loss of 0.01 L1, and modulation of the expert by hindsight. Differences: motion is found by block matching of
+thumbnails, or is the displacement of objects, instead of vectors of a codec; the queries join the actions in pi0.5's
+expert, and there is no joint expert with its own norms, projections and feed-forwards for motion; two layers decode
+motion, without attention over place and time; an action chunk is learned as in pi0.5.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from lerobot_memobench.policies.memobench_mem.motion_fields import MotionField
 
 HINDSIGHT, FORESIGHT = 8, 8
-"""Motions that are remembered, and that are foreseen: h and n."""
+"""Number of remembered motions (h) and of predicted motions (n)."""
 FORESIGHT_WEIGHT = 0.01
 LAYERS, HEADS = 4, 8
 FORESEEN = "memory.foreseen"
@@ -40,9 +40,9 @@ FORESEEN = "memory.foreseen"
 
 
 class MotionExpert(nn.Module):
-    """What the action expert has more: motion queries, the condition that hindsight is, and a decoder of motion.
+    """Additions to the action expert: motion queries, the condition made of hindsight, and a decoder of motion.
 
-    The condition's last layer starts at zero, so that hindsight changes nothing where training starts.
+    The condition's last layer starts at zero, so training starts without an effect of hindsight.
     """
 
     def __init__(self, memory_dim: int, width: int, numbers: int) -> None:
@@ -63,7 +63,7 @@ class ForesightReading(Reading):
         self.expert, self.hindsight = expert, expert.condition(memory.rows().squeeze(1))
 
     def actions(self, tokens: Tensor) -> Tensor:
-        """Insert the queries before the actions, to which they attend as actions do."""
+        """Insert the queries before the actions; queries and actions attend to each other."""
         queries = repeat(self.expert.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
         return torch.cat([queries, tokens], dim=1)
 
@@ -73,15 +73,17 @@ class ForesightReading(Reading):
         return condition + hindsight
 
     def expert_states(self, states: Tensor) -> None:
-        """Decode the motion (B, n, C k) that the queries foresee."""
+        """Decode the motion (B, n, C k) that the queries predict."""
         self.outputs[FORESEEN] = self.expert.decode(states[:, :FORESIGHT].to(torch.float32))
 
 
 class Foresight(MemoryFusion):
-    """Hindsight is added to the condition of the expert's norms; motion queries precede the actions.
+    """Add hindsight to the condition of the expert's norms, and insert motion queries before the actions.
 
-    Queries and actions attend to each other, so the actions' positions are `FORESIGHT` further on than in plain pi0.5.
+    The actions' positions are therefore shifted by `FORESIGHT` from those of plain pi0.5.
     """
+
+    parts = ("foresight.",)
 
     def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
         self.model = cast(Any, model)
@@ -89,22 +91,18 @@ class Foresight(MemoryFusion):
         self.model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
-        """Make the condition of this pass."""
+        """Begin a pass conditioned on this memory."""
         return ForesightReading(self.model.foresight, memory)
-
-    def owns(self, name: str) -> bool:
-        """Return whether a parameter is the queries', the condition's or the decoder's."""
-        return name.startswith("foresight.")
 
 
 # -- hindsight --------------------------------------------------------------------------------------------------------
 
 
 class Motion(MemoryMechanism):
-    """The last 8 motions of stored frames, as one token. What is older is forgotten.
+    """The last 8 motions between stored frames, as one token.
 
     Of objects every control step is stored; of pictures every fourth, in which an arm moves by some pixels of a
-    thumbnail. While there are fewer motions the earliest is repeated, and at an episode's first frame nothing moves.
+    thumbnail. With fewer motions the earliest is repeated; at an episode's first frame the motion is zero.
     """
 
     fusion = Foresight
@@ -124,16 +122,16 @@ class Motion(MemoryMechanism):
 
     @property
     def field(self) -> MotionField:
-        """What moves between two stored frames."""
+        """The motion field between two stored frames."""
         return cast("MotionField", self.pool)
 
     @classmethod
-    def slots(cls, slot: int, frames: int) -> Sequence[int]:
-        """Return the last frames alone, between which the motions are."""
+    def slots(cls, slot: int, settings: NoSettings) -> Sequence[int]:
+        """Return the last frames, between which the motions are."""
         return range(max(0, slot - HINDSIGHT), slot + 1)
 
     def init(self, rows: int) -> dict[str, Tensor]:
-        """Return no motion, and no frame from which something could move."""
+        """Return zero motion, and no last frame."""
         like, field = self.summary, self.field
         return {
             "frame": like.new_zeros(rows, 1, field.size),
@@ -142,11 +140,11 @@ class Motion(MemoryMechanism):
         }
 
     def observe(self, state: Any, frames: Tensor, step: Tensor, query: Query | None = None) -> dict[str, Tensor]:
-        """Add the motion to frames, as they are stored."""
+        """Append the motion to stored frames."""
         return self.write(state, frames, step, query)
 
     def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> dict[str, Tensor]:
-        """Add the motion to frames, as they are stored."""
+        """Append the motion to stored frames."""
         count, motions = state["frames"], state["motions"]
         moved = self.field.between(state["frame"].to(tokens.dtype), tokens).to(motions.dtype).unsqueeze(1)
         first, second = (rearrange(count == number, "r -> r 1 1 1") for number in (0, 1))
@@ -159,7 +157,7 @@ class Motion(MemoryMechanism):
         return self._encoded(state["motions"])
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
-        """Find the motions of all samples at once, and those that follow, which are to be foreseen."""
+        """Compute the motions of all samples at once, and the following motions as labels."""
         frames, places, field = histories.frames, histories.places, self.field
         exact = frames if histories.exact is None else histories.exact
         self._followed = None
@@ -173,7 +171,7 @@ class Motion(MemoryMechanism):
         moved = field.between(frames[places[:, :-1][pairs]], frames[places[:, 1:][pairs]])
         motions = self.summary.new_zeros(len(places), HINDSIGHT, field.cells, field.numbers)
         count = pairs.sum(dim=1, keepdim=True)
-        # Row b's motions lie from first[b] on in `moved`, oldest first; the last stand last, the earliest repeats.
+        # The motions of row b begin at first[b] in `moved`, oldest first; the earliest is repeated in front.
         first = count.cumsum(dim=0) - count
         ages = torch.arange(HINDSIGHT, device=places.device) - HINDSIGHT + count
         some = count.squeeze(1) > 0
@@ -181,7 +179,7 @@ class Motion(MemoryMechanism):
         return self._encoded(motions)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the weighted mean error of the motions that are foreseen, of cells that are known."""
+        """Return the weighted mean error of the predicted motions over cells with a known motion."""
         if self._followed is None or FORESEEN not in batch:
             return {}
         (moved, known), self._followed = self._followed, None

@@ -1,4 +1,4 @@
-"""Recurrence: a fixed number of slots reads each remembered frame and is all that is kept (RoboMME's RMT)."""
+"""Recurrence (RoboMME's RMT): a fixed number of slots reads each remembered frame."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 )
 
 HIDDEN = 512
-"""Width of a recurrence at most, as in the source."""
+"""Maximum width of a recurrence, as in the source."""
 HEADS = 8
 SLOTS_OF_WIDTH = 4
-"""Slots: the width of memory tokens divided by this; 512 at size pi05, as in the source, and 32 at small."""
+"""Width of memory tokens per slot: 512 slots at size pi05, as in the source, and 32 at small."""
 
 
 @dataclass
@@ -30,16 +30,16 @@ class RecurrenceSettings:
     """Settings of a recurrence.
 
     Attributes:
-        time_codes: whether a frame is written with its control step.
-        gradient_frames: through how many of the last frames gradients pass.
+        gradient_frames: number of last frames through which gradients pass.
     """
 
-    time_codes: bool = True
     gradient_frames: int = 16
 
     def __post_init__(self) -> None:
         if self.gradient_frames < 1:
-            raise ValueError(f"gradient_frames={self.gradient_frames} must be at least 1: nothing would be learned")
+            raise ValueError(
+                f"gradient_frames={self.gradient_frames} must be at least 1, or the memory would not learn"
+            )
 
 
 @dataclass
@@ -47,7 +47,7 @@ class RecurrentSettings(RecurrenceSettings):
     """Settings of `Recurrent`.
 
     Attributes:
-        slots: their number; None: a quarter of the width of memory tokens.
+        slots: number of slots; None: a quarter of the width of memory tokens.
     """
 
     slots: int | None = None
@@ -59,19 +59,19 @@ class RecurrentSettings(RecurrenceSettings):
 
 
 class Recurrent(MemoryMechanism):
-    """RMT of RoboMME's pi0.5: slots attend to the frame and to themselves, and are normed behind the residual.
+    """RMT of RoboMME's pi0.5: slots attend to the frame and to themselves, with a norm after the residual.
 
     For a frame X and slots S: Z = LN_pre([X; S]); O is softmax attention of the slots' rows of Z to all of Z, with
     rotary positions along [X; S] and one key-value head; S <- LN_post(O W_o + S). One layer, no feed-forward.
 
-    Unlike the source, slots are carried over from one remembered frame to the next; there they are computed anew at
-    each chunk from the last 64. Gradients pass through the last ``gradient_frames``; there through all 64. A frame has
-    this policy's tokens (2 of objects, 16 of a picture; there 64).
+    Unlike in the source, slots are carried over from one remembered frame to the next; the source computes them again
+    from the last 64 frames at each chunk. Gradients pass through the last ``gradient_frames``; in the source, through
+    all 64. A frame has this policy's tokens (2 of objects, 16 of a picture; 64 in the source).
     """
 
     Settings = RecurrentSettings
     stride = 16
-    capacity = 1  # the slots, however long the episode is
+    capacity = 1  # the slots
 
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: RecurrentSettings) -> None:
         super().__init__(spec, pool, settings)
@@ -90,34 +90,33 @@ class Recurrent(MemoryMechanism):
         return {"slots": repeat(self.initial, "s d -> r s d", r=rows)}
 
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
-        """Let the slots read the frame and themselves."""
+        """Let the slots attend to the frame and to themselves."""
         slots: Tensor = state["slots"]
-        frame = encoded(self.encoder, tokens, step, self.settings.time_codes)
+        frame = encoded(self.encoder, tokens, step)
         count, length = slots.shape[1], frame.shape[1] + slots.shape[1]
         both = self.pre_norm(torch.cat([frame, slots], dim=1))
         key, value = self.key_value(both).chunk(2, dim=-1)
         asked = rearrange(self.query(both[:, -count:]), "r s (h d) -> r h s d", h=HEADS)
-        # All heads share the keys, so they are one head with more rows. Without a mask this is quicker than torch's.
+        # All heads share the keys, so they are computed as one head with more rows, faster than torch's kernel.
         asked = rotate_from(asked, length - count).flatten(1, 2) * key.shape[-1] ** -0.5
         weights = (asked @ rotate_from(key, 0).mT).softmax(dim=-1)
         read = rearrange(weights @ value, "r (h s) d -> r s (h d)", h=HEADS)
         return {"slots": self.post_norm(self.attended(read) + slots)}
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return every slot at the width of memory tokens; none is of a single frame."""
+        """Return the slots at the width of memory tokens."""
         each: Tensor = self.out(state["slots"])
         return MemoryTokens(each, torch.ones(each.shape[:2], dtype=torch.bool, device=each.device))
 
 
 def projection(inputs: int, outputs: int, std: float = 0.02) -> nn.Linear:
-    """Return a linear layer without a bias, its weights drawn from N(0, std^2)."""
+    """Return a linear layer without bias, with weights drawn from N(0, std^2)."""
     made = nn.Linear(inputs, outputs, bias=False)
     nn.init.normal_(made.weight, std=std)
     return made
 
 
-def encoded(encoder: MemoryEncoder, tokens: Tensor, step: Tensor, time_codes: bool) -> Tensor:
-    """Return a frame's tokens (R, P, D) with their places, and its control step (R,) or none: (R, P, d)."""
-    steps = step if time_codes else torch.zeros_like(step)
-    made: Tensor = encoder(tokens.unsqueeze(1), steps.unsqueeze(1)).squeeze(1)
+def encoded(encoder: MemoryEncoder, tokens: Tensor, step: Tensor) -> Tensor:
+    """Encode a frame's tokens (R, P, D) with their places and its control step (R,): (R, P, d)."""
+    made: Tensor = encoder(tokens.unsqueeze(1), step.unsqueeze(1)).squeeze(1)
     return made

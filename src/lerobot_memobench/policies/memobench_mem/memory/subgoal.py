@@ -1,12 +1,12 @@
-"""Say the active checkpoint, and act on that alone: SimpleMemVLA's narrow channel.
+"""SimpleMemVLA's narrow channel: choose the text of the active checkpoint, and act on that text only.
 
-History and present stand in the prefix. There the policy first says which of its task's checkpoints is the active one;
-the tokens of that text follow the prefix, attend to all of it, and are all that the action expert reads of it.
+The prefix holds history and present. From it the policy chooses one of its task's checkpoint texts. The tokens of this
+text follow the prefix, attend to all of it, and are all that the action expert reads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix, Reading
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
-from lerobot_memobench.policies.memobench_mem.memory.texts import CheckpointTexts, scored
 
 if TYPE_CHECKING:
     from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
@@ -25,11 +24,52 @@ if TYPE_CHECKING:
 SCORES = "memory.scores"
 
 
+# -- texts of checkpoints as tokens ------------------------------------------------------------------------------------
+
+
+class CheckpointTexts(nn.Module):
+    """Embed texts as learned tokens of their words; the last text is an empty one, for frames without a text.
+
+    Equal words share an embedding. Each text ends with the same token.
+    """
+
+    rows: Tensor
+
+    def __init__(self, texts: Sequence[str], width: int) -> None:
+        super().__init__()
+        spelled = [text.lower().split() for text in (*texts, "")]
+        number = {word: row for row, word in enumerate(sorted({word for words in spelled for word in words}), start=1)}
+        self.length = 1 + max(map(len, spelled))
+        padding = [[-1] * (self.length - 1 - len(words)) for words in spelled]
+        rows = [[*(number[word] for word in words), 0, *rest] for words, rest in zip(spelled, padding, strict=True)]
+        # On the CPU, so that a model built on the meta device has it too.
+        self.register_buffer("rows", torch.tensor(rows, device="cpu"), persistent=False)
+        self.embedding = nn.Embedding(1 + len(number), width)
+
+    def forward(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the tokens (B, n, d) of texts by their indices (B,), -1 for the empty text, and a mask (B, n)."""
+        rows = self.rows[numbers]
+        return self.embedding(rows.clamp(min=0)), rows >= 0
+
+
+def scored(scores: Tensor, choices: Tensor) -> Tensor:
+    """Return scores (B, S + 1) given those (B, S) of all texts; the last is the empty text's.
+
+    Texts that ``choices`` (B, S) excludes rank below the empty text, which ranks below all other texts.
+    """
+    low = torch.finfo(torch.float32).min
+    masked = scores.to(torch.float32).masked_fill(~choices, low)
+    return torch.cat([masked, masked.new_full((len(masked), 1), low / 2)], dim=1)
+
+
+# -- the channel -------------------------------------------------------------------------------------------------------
+
+
 class SubgoalChoice(nn.Module):
-    """What the narrow channel adds to the model.
+    """Modules that the narrow channel adds to the model.
 
     Attributes:
-        ask: the token, last of the prefix, whose last state says which text is active. score: from it to S scores.
+        ask: the last token of the prefix, whose last state is scored. score: maps this state to S scores.
         texts: tokens of the texts.
     """
 
@@ -41,7 +81,7 @@ class SubgoalChoice(nn.Module):
 
 
 class NarrowReading(Reading):
-    """A pass whose prefix holds LeRobot's, the memory and ``ask``, then the chosen text and a copy of the state.
+    """A pass with LeRobot's prefix, the memory and ``ask``, followed by the chosen text and a copy of the state.
 
     | attends to            | prefix, memory, ask | text | copy of the state | actions |
     |-----------------------|---------------------|------|-------------------|---------|
@@ -50,34 +90,36 @@ class NarrowReading(Reading):
     | copy of the state     |                     |      | yes               |         |
     | actions               |                     | yes  | yes               | yes     |
 
-    The state's own token attends to the whole prefix, so its states would be a second channel: hence a copy. Where
-    the state enters as words of the text prompt there is none. Conditions of the expert's norms come from the text
-    instead of the instruction.
+    The state's own token attends to the whole prefix, so reading it would open a second channel; hence the copy. If
+    the prompt spells the state, there is no copy. The condition of the expert's norms comes from the text instead of
+    the instruction.
 
-    In training the text is the true one; otherwise a pass over the prefix chooses it, which does not depend on the
-    tokens behind.
+    In training the text is the true one; otherwise a pass over the prefix, which does not depend on later tokens,
+    chooses it.
 
     Attributes:
-        said: (B,) number of the text of the prefix; S: none.
+        chosen: (B,) index of the text in the prefix; S: the empty text.
     """
+
+    watches = ("prefix",)
 
     def __init__(self, model: MemoryPI05, memory: MemoryTokens, watched: bool) -> None:
         super().__init__(watched)
         assert memory.query is not None
         self.model, self.memory, self.query = model, memory, memory.query
         self.choice = cast(SubgoalChoice, model.subgoal)
-        self.said: Tensor | None = None
+        self.chosen: Tensor | None = None
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Append memory, text and the state's copy."""
+        """Append the memory, the text and the copy of the state."""
         memory, true = self.memory, self.query.subgoal
         own = prefix.tokens[:, : 0 if state is None else state + 1][:, -1:]
         ask = repeat(self.choice.ask, "1 1 d -> b 1 d", b=len(own))
         prefix = prefix.joined(memory.rows(), memory.mask).joined(ask, memory.mask.new_ones(len(own), 1))
         unread, none = prefix.tokens.shape[1], self.choice.score.out_features
         prefix = prefix._replace(asked=slice(unread - 1, unread))
-        said = self.said = self._chosen(prefix) if true is None else torch.where(true < 0, none, true)
-        text, of_text = self.choice.texts(said)
+        chosen = self.chosen = self._chosen(prefix) if true is None else torch.where(true < 0, none, true)
+        text, of_text = self.choice.texts(chosen)
         if self.model.instruction is not None:
             prefix = prefix._replace(instruction=self.model.instruction(text, of_text))
         whole = prefix.joined(text, of_text).joined(own, of_text.new_ones(own.shape[:2]))
@@ -87,7 +129,7 @@ class NarrowReading(Reading):
         """Return which tokens attend to which, (B, N, N) bool: see the table.
 
         Args:
-            unread: number of leading tokens that actions do not read. copies: 1 where the last is the state's copy.
+            unread: number of leading tokens that actions do not read. copies: 1 if the last is the state's copy.
         """
         places = torch.arange(prefix.tokens.shape[1], device=prefix.tokens.device)
         part = (places >= unread).int() + (places >= len(places) - copies).int()  # 0: before the text, 1: text, 2: copy
@@ -97,7 +139,7 @@ class NarrowReading(Reading):
 
     @torch.no_grad()
     def _chosen(self, prefix: Prefix) -> Tensor:
-        """Return the texts (B,) that a pass over this prefix chooses."""
+        """Return the indices (B,) of the texts that a pass over this prefix chooses."""
         self.model.read_prefix(prefix, self)
         return self.outputs[SCORES].argmax(dim=1)
 
@@ -108,12 +150,11 @@ class NarrowReading(Reading):
         self.outputs[SCORES] = scored(score(states[:, 0].to(score.weight.dtype)), self.query.choices)
 
     def shares(self) -> list[Tensor]:
-        """Return the share of the chosen text's attention that each memory token gets."""
-        assert self.said is not None
-        _, real = self.choice.texts(self.said)
+        """Return the share of the chosen text's attention on each memory token."""
+        assert self.chosen is not None
+        _, real = self.choice.texts(self.chosen)
         words, length = real.shape[1], self.memory.mask.shape[1]
-        of_prefix, _ = self.attention or ([], [])
-        found = []
+        of_prefix, found = self.attention["prefix"], []
         for weights in of_prefix[len(of_prefix) // 2 :]:  # (B, heads, N, N), after the pass that chooses
             unread = weights.shape[2] - words - (self.model.state_token is not None)
             read = weights[:, :, unread : unread + words, unread - 1 - length : unread - 1].mean(dim=1)
@@ -122,9 +163,10 @@ class NarrowReading(Reading):
 
 
 class NarrowChannel(MemoryFusion):
-    """Choose a text by prefix and memory; actions read that text alone (`NarrowReading`)."""
+    """Choose a text by prefix and memory; actions read only this text (`NarrowReading`)."""
 
-    tells_reads = True
+    reports_reads = True
+    parts = ("subgoal.",)
 
     def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
         self.model = model
@@ -132,38 +174,34 @@ class NarrowChannel(MemoryFusion):
         model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
-        """Begin a pass over this memory, whose ``query`` holds the texts to choose from."""
+        """Begin a pass over this memory; its ``query`` holds the texts to choose from."""
         return NarrowReading(self.model, memory, watched)
-
-    def owns(self, name: str) -> bool:
-        """Return whether a parameter is of the choice."""
-        return name.startswith("subgoal.")
 
 
 class Subgoal(Frames):
-    """SimpleMemVLA on this backbone: 32 frames in the prefix, the active checkpoint said, an expert that reads that.
+    """SimpleMemVLA on this backbone: 32 frames in the prefix, and an expert that reads only the chosen text.
 
-    As there: cross-entropy of the text beside the actions' loss, 1 : 1; the expert is trained on states of the true
-    text; its condition is states and embeddings of the text, and the robot's state. Otherwise than there: frames are
-    those of ``memory=frames`` (at most 32, even over the episode, not 120 at 2 Hz); the text is chosen among the task's
-    and not generated; its words are embedded anew; the expert is pi0.5's, which reads states of every layer and not
-    the last's.
+    As in the source: cross-entropy of the text with weight 1 next to the actions' loss; the expert is trained on states
+    of the true text; its condition is states and embeddings of the text, and the robot's state. Differences: frames are
+    those of ``memory=frames`` (at most 32, even over the episode, not 120 at 2 Hz); the text is chosen from the task's
+    texts and not generated; its words have their own embeddings; the expert is pi0.5's, which reads states of every
+    layer instead of the last layer's.
     """
 
     privileged = True
     fusion = NarrowChannel
 
     def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
-        """Read the frames, and keep what may be said."""
+        """Read the frames, and pass on the texts to choose from."""
         return super().read(state, query)._replace(query=query)
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
-        """Read the frames, and keep what may be said and what is true."""
+        """Read the frames, and pass on the texts to choose from and the true text."""
         return super().replay(histories, query)._replace(query=query)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return how far from the true text the choice was; 0 where there is none."""
-        if SCORES not in batch:  # no pass was made
+        """Return the cross-entropy of the choice; 0 for frames without a text."""
+        if SCORES not in batch:  # without a pass of the model
             return {}
         true = batch[SUBGOAL].to(batch[SCORES].device)
         return {"subgoal": F.cross_entropy(batch[SCORES], true, ignore_index=-1, reduction="none")}

@@ -1,0 +1,562 @@
+"""The policy: training batches, rollouts of independent rows, real-time chunking, precision, checkpoints."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder
+from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
+from lerobot_memobench.policies.memobench_mem.rollout import Rollout, Row
+from lerobot_memobench.policies.update_checkpoint import update_checkpoint
+from lerobot_memobench.protocol import CONTROL_HZ, ENDED, EXECUTION, NO_CLOCK, PROMPT
+from tests.support.memory import remembered, trained_on
+from tests.support.object_dataset import LENGTHS, make_object_dataset
+from tests.support.small_policy import batch_of, draw_modulation, made_for_training, open_small_training, small_config
+
+OBJECTS: dict[str, Any] = {"perception": "objects", "size": "small", "n_action_steps": 3, "memory_stride": 2}
+STARTS = np.cumsum([0, *LENGTHS]).tolist()
+"""First frames of the episodes, which have prompts of 6, 8 and 0 frames."""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
+
+
+@pytest.fixture(scope="module")
+def trained(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, Any, Path, dict[str, Any]]:
+    """A policy after two updates, its preprocessor, samples, checkpoint, and the last logged numbers."""
+    policy, before, after, dataset = made_for_training(
+        root, **OBJECTS, align="contrastive", objective="flow_matching", num_inference_steps=2
+    )
+    draw_modulation(policy)
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train()
+    for step in range(2):
+        loss, logged = policy.forward(before(batch_of(dataset, [10 + step, 30, 55, 80])))
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    folder = tmp_path_factory.mktemp("checkpoint") / "pretrained_model"
+    for part in (policy, before, after):
+        part.save_pretrained(folder)
+    return policy, before, dataset, folder, logged
+
+
+def observed(dataset: Any, *indices: int, clock: bool = True, **more: Any) -> dict[str, Any]:
+    """Return a rollout's observation of rows at these frames of the dataset."""
+    rows = [dataset.hf_dataset[index] for index in indices]
+    keys = ["observation.state", "observation.environment_state"]
+    keys += ["observation.step", "observation.phase"] if clock else []
+    found = {key: torch.stack([row[key].float().reshape(-1) for row in rows]) for key in keys}
+    return found | {"task": [dataset.meta.tasks.index[int(row["task_index"])] for row in rows]} | more
+
+
+# -- training ------------------------------------------------------------------------------------------------------
+
+
+def test_batch_holds_the_history_of_its_frames(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS, align="framewise")
+    batch = before(batch_of(dataset, [0, 39, 40 + 22, 45]))
+    steps = [[2 * slot for slot in sample_frames(frame // 2, 8)] for frame in (0, 39, 22, 5)]
+    assert [read for _, read in trained_on(batch)] == steps
+    assert batch["phase"].tolist() == [0, 1, 1, 0]
+    assert batch["memory.text"].shape == (4, 8, 64)
+    assert batch["memory.text_mask"].sum(dim=1).tolist() == [len(read) for read in steps]
+    text = dataset.hf_dataset[40 + 22]["simple_subgoal"]
+    torch.testing.assert_close(batch["memory.text"][2, len(steps[2]) - 1], WordTextEncoder(64)([text])[0])
+    loss, logged = policy.train().forward(batch)
+    loss.backward()
+    assert logged["align_grad_norm"] > 0
+
+
+def test_loss_is_logged_in_parts(trained: Any) -> None:
+    policy, before, dataset, _, logged = trained
+    assert logged["loss"] == pytest.approx(logged["action_loss"] + 0.1 * logged["align_loss"], rel=1e-5)
+    assert logged["align_grad_norm"] > 0
+    assert 0 <= logged["align_top1"] <= 1
+    assert logged["align_temperature"] > 0
+    per_sample, _ = policy.forward(before(batch_of(dataset, [3, 30, 80])), reduction="none")
+    assert per_sample.shape == (3,)
+
+
+def test_prompt_frames_do_not_count(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    batch = before(batch_of(dataset, [41, 43, 60, 10]))
+    loss, _ = policy.forward(batch)
+    per_sample, _ = policy.forward(batch, reduction="none")
+    assert per_sample[:2].tolist() == [0, 0]
+    assert loss.item() == pytest.approx(per_sample[2:].mean().item(), rel=1e-5)
+    assert policy.forward(before(batch_of(dataset, [41, 42])))[0].item() == 0.0
+
+
+def test_masked_memory_has_no_effect(trained: Any) -> None:
+    policy, before, dataset, _, _ = trained
+    batch = before(batch_of(dataset, [STARTS[2] + 7]))
+    assert batch[PLACES].tolist() == [[0, 1, 2, 3]]
+
+    def loss(frames: Tensor) -> float:
+        torch.manual_seed(3)
+        steps = torch.arange(len(frames))
+        return float(policy.eval().forward(batch | {FRAMES: frames, "memory.steps": steps})[1]["action_loss"])
+
+    frames = batch[FRAMES]
+    assert loss(torch.cat([frames, frames * 0.1])) == pytest.approx(loss(frames), abs=1e-6)
+    assert loss(torch.cat([frames[:1], frames[1:] * 0.9])) != pytest.approx(loss(frames), abs=1e-6)
+
+
+def test_no_memory_is_plain_pi05(root: Path) -> None:
+    """Histories have no effect, and no weight belongs to a memory."""
+    policy, before, _, dataset = made_for_training(root, **OBJECTS | {"memory": "none"})
+    assert not [name for name, _ in policy.named_parameters() if "memory" in name or "modulat" in name]
+    assert FRAMES not in before(batch_of(dataset, [30]))
+    plans = []
+    for history in ([], [0, 1, 2, 3], [41, 42, 43]):
+        policy.reset()
+        for index in history:
+            policy.observe(before(observed(dataset, index)))
+        plans.append(policy.predict_action_chunk(before(observed(dataset, 30))))
+    assert torch.equal(plans[0], plans[1])
+    assert torch.equal(plans[0], plans[2])
+
+
+@pytest.mark.parametrize("memory_fusion", ["modulation", "context"])
+def test_bfloat16_trains_in_float32(root: Path, memory_fusion: str) -> None:
+    """Updates below the last bit of a bfloat16 weight accumulate; frozen weights stay bfloat16."""
+    policy, before, _, dataset = made_for_training(
+        root, **OBJECTS, dtype="bfloat16", memory_fusion=memory_fusion, optimizer_lr=1e-6
+    )
+    assert {parameter.dtype for parameter in policy.get_optim_params()} == {torch.float32}
+    frozen = {name: p.dtype for name, p in policy.named_parameters() if not p.requires_grad}
+    assert frozen["model.paligemma_with_expert.gemma_expert.lm_head.weight"] == torch.bfloat16
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    weight = policy.model.paligemma_with_expert.gemma_expert.model.layers[0].mlp.up_proj.weight
+    start = weight.detach().clone()
+    for indices in ([10, 30], [20, 70]):
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            policy.train().forward(before(batch_of(dataset, indices)))[0].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    assert (weight != start).float().mean() > 0.95
+    assert policy.select_action(before(observed(dataset, 8))).isfinite().all()
+
+
+# -- rollouts ------------------------------------------------------------------------------------------------------
+
+
+def roll(policy: Any, before: Any, observations: list[dict[str, Any]]) -> Tensor:
+    """Return the actions (steps, rows, 7) of a rollout."""
+    policy.eval()
+    policy.reset()
+    return torch.stack([policy.select_action(before(one)) for one in observations])
+
+
+def test_rows_are_independent(trained: Any) -> None:
+    """A batch equals single rows in any order; a row that freezes and restarts does not affect another."""
+    policy, before, dataset, _, _ = trained
+    frames = [[start + t for start in STARTS[:3]] for t in range(14)]
+    together = roll(policy, before, [observed(dataset, *row) for row in frames])
+    close = {"rtol": 1e-4, "atol": 1e-4}
+    for row in range(3):
+        alone = roll(policy, before, [observed(dataset, indices[row]) for indices in frames])
+        torch.testing.assert_close(together[:, row : row + 1], alone, **close)
+    permuted = roll(policy, before, [observed(dataset, c, a, b) for a, b, c in frames])
+    torch.testing.assert_close(permuted, together[:, [2, 0, 1]], **close)
+    # Row 0 plays the episode without prompt, freezes after four steps, and restarts at step nine.
+    again = [(frames[min(t, 4)][2] if t < 9 else frames[t - 9][2], frames[t][1]) for t in range(14)]
+    mixed = roll(policy, before, [observed(dataset, *row) for row in again])
+    torch.testing.assert_close(mixed[:, 1], together[:, 1], **close)
+    torch.testing.assert_close(mixed[9:, 0], together[:5, 2], **close)
+    assert torch.equal(mixed[4:9, 0], mixed[4:5, 0].expand(5, -1))
+
+
+def test_memory_of_a_rollout_equals_that_of_training(trained: Any) -> None:
+    policy, before, dataset, _, _ = trained
+    policy.eval().reset()
+    for frame in range(23):
+        policy.observe(before(observed(dataset, STARTS[1] + frame, STARTS[2] + frame)))
+    batch = before(batch_of(dataset, [STARTS[1] + 22, STARTS[2] + 22]))
+    for (frames, steps), (learned, learned_steps) in zip(remembered(policy, [0, 1]), trained_on(batch), strict=True):
+        assert steps == learned_steps
+        assert torch.equal(frames, learned)
+
+
+def test_actions_depend_on_early_frames(trained: Any) -> None:
+    policy, before, dataset, _, _ = trained
+    noise = torch.zeros(1, policy.config.chunk_size, 32)
+
+    def last_plan(first: int) -> Tensor:
+        policy.reset()
+        frames = [observed(dataset, first, **{"observation.step": torch.zeros(1, 1)})]
+        frames += [observed(dataset, STARTS[2] + step) for step in range(1, 9)]
+        return [policy.predict_action_chunk(before(frame), noise=noise) for frame in frames][-1]
+
+    assert (last_plan(STARTS[2]) - last_plan(STARTS[1] + 8)).abs().max() > 1e-4
+    assert torch.equal(last_plan(STARTS[2]), last_plan(STARTS[2]))
+
+
+def test_plans_begin_with_the_execution(trained: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, before, dataset, _, _ = trained
+    planned: list[tuple[int, list[int]]] = []
+    original = policy.plan
+    monkeypatch.setattr(policy, "plan", lambda b, rows, *a: planned.append((t, rows)) or original(b, rows, *a))
+    policy.eval().reset()
+    for t in range(12):
+        policy.select_action(before(observed(dataset, STARTS[2] + t, STARTS[1] + t)))
+    # A plan lasts three steps; row 1 has a prompt of eight.
+    assert planned == [(0, [0]), (3, [0]), (6, [0]), (8, [1]), (9, [0]), (11, [1])]
+
+
+def test_noise_follows_the_seed_of_the_process(trained: Any) -> None:
+    policy, before, dataset, _, _ = trained
+    frames = [observed(dataset, STARTS[2])]
+    torch.manual_seed(7)
+    first = roll(policy, before, frames)
+    torch.rand(5)
+    assert torch.equal(roll(policy, before, frames), first)
+    torch.manual_seed(8)
+    assert not torch.equal(roll(policy, before, frames), first)
+
+
+def test_a_stalled_hand_executes_the_whole_chunk(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    policy.reset()
+    left = []
+    for step in range(12):
+        frame = observed(dataset, 30, **{"observation.step": torch.tensor([[float(step)]])})
+        frame["observation.state"] = frame["observation.state"] + 0.02 * (step >= 9)
+        policy.select_action(before(frame))
+        left.append(len(policy.rollout.rows[0].queue))
+    assert left == [2, 1, 0, 5, 4, 3, 2, 1, 0, 2, 1, 0]
+
+
+STATE = torch.tensor([0.1, 0.2, 1.0, 3.13, 0.1, 0.0, 0.04, -0.04])
+AXIS = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0])
+
+
+def moved(index: int, by: float) -> Tensor:
+    return STATE + by * torch.eye(8)[index]
+
+
+@pytest.mark.parametrize(
+    ("state", "queued"),
+    [(state, 16) for state in (STATE, moved(2, 0.005), moved(6, 0.005), moved(4, 0.05), STATE - 2.007 * STATE * AXIS)]
+    + [(state, 6) for state in (moved(2, 0.01), moved(7, 0.01), moved(4, 0.2), None)],
+)
+def test_stalled_hands_are_recognised(state: Tensor | None, queued: int) -> None:
+    """One state has nearly the same rotation with the opposite axis."""
+    row = Row()
+    row.begin_chunk(torch.zeros(16, 7), 6, STATE)
+    assert len(row.queue) == 6
+    row.queue.clear()
+    row.begin_chunk(torch.zeros(16, 7), 6, state)
+    assert len(row.queue) == queued
+    row.drop_chunk()
+    row.begin_chunk(torch.zeros(16, 7), 6, STATE)
+    assert len(row.queue) == 6
+
+
+def test_one_thread_runs_a_rollout(trained: Any) -> None:
+    policy, before, dataset, _, _ = trained
+
+    def act() -> Any:
+        return policy.select_action(before(observed(dataset, 8)))
+
+    policy.reset()
+    act()
+    with ThreadPoolExecutor(1) as other:
+        other.submit(policy.reset).result()
+        assert other.submit(act).result().shape == (1, 7)
+        with pytest.raises(MemobenchError, match="max_parallel_tasks=1"):
+            act()
+    policy.reset()
+    act()
+    (row,) = policy.rollout.rows
+    history = row.memory
+    policy.drop_queued_actions()
+    assert not row.queue
+    assert row.memory is history
+
+
+# -- rows and clocks -----------------------------------------------------------------------------------------------
+
+PUBLISHED = [(PROMPT, 0), (PROMPT, 1), (EXECUTION, 0), (EXECUTION, 1), (EXECUTION, 1), (PROMPT, 0)]
+COUNTED_ON = [(PROMPT, 0), (PROMPT, 1), (EXECUTION, 2), (EXECUTION, 3), (EXECUTION, 5), (EXECUTION, 0)]
+STRICT = [(PROMPT, 0), (PROMPT, 1), *[(EXECUTION, NO_CLOCK)] * 3, *[(EXECUTION, ENDED)] * 2, (PROMPT, 0)]
+WITHOUT_PROMPT = [*[(EXECUTION, NO_CLOCK)] * 3, *[(EXECUTION, ENDED)] * 2, *[(EXECUTION, NO_CLOCK)] * 2]
+
+
+@pytest.mark.parametrize(
+    ("clocks", "positions", "begins", "frozen"),
+    [
+        (PUBLISHED, [0, 1, 2, 3, 3, 0], [0, 5], [4]),
+        (COUNTED_ON, [0, 1, 2, 3, 5, 0], [0, 5], []),
+        (STRICT, [0, 1, 2, 3, 4, 4, 4, 0], [0, 7], [5, 6]),
+        (WITHOUT_PROMPT, [0, 1, 2, 2, 2, 0, 1], [0, 5], [3, 4]),
+    ],
+)
+def test_rows_follow_their_clock(
+    clocks: list[tuple[int, int]], positions: list[int], begins: list[int], frozen: list[int]
+) -> None:
+    written: list[int] = []
+    rollout = Rollout(remembers=True, stride=1)
+    found = [rollout.observe([clock], lambda rows, k=k: written.append(k)) for k, clock in enumerate(clocks)]  # type: ignore[misc]
+    assert [steps[0] for steps, _, _ in found] == positions
+    assert [k for k, (_, started, _) in enumerate(found) if started[0]] == begins
+    assert [k for k, (_, _, is_frozen) in enumerate(found) if is_frozen[0]] == frozen
+    assert written == [k for k in range(len(clocks)) if k not in frozen]
+
+
+def test_unobserved_frames_are_noticed() -> None:
+    rollout, written = Rollout(remembers=True, stride=4), list[list[int]]()
+    for step in (0, 3, 4, 4, 6, 8):  # frames between written ones may be left out
+        rollout.observe([(1, step), (1, 1)], written.append)
+    assert written == [[0, 1], [0], [0]]
+    assert rollout.missed([0, 1]) is None
+    rollout.observe([(1, 13), (1, 6)], written.append)
+    assert (rollout.missed([0]), rollout.missed([1]), rollout.missed([0, 1])) == (12, 4, 4)
+    rollout.observe([(1, 14), (1, 0)], written.append)
+    assert (rollout.missed([0]), rollout.missed([1])) == (12, None)
+
+
+# -- chunks for LeRobot --------------------------------------------------------------------------------------------
+
+
+def real_time(policy: Any) -> Any:
+    """Enable real-time chunking as lerobot/rollout/context.py does."""
+    policy.config.rtc_config = RTCConfig(enabled=True, execution_horizon=3)
+    policy.init_rtc_processor()
+    policy.reset()
+    return policy
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_real_time_chunking_guides_plans_with_memory(root: Path, clock: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each observation is remembered at its step, or at its time without a clock."""
+    fields = OBJECTS | {"objective": "flow_matching", "num_inference_steps": 10}
+    policy, before, _, dataset = made_for_training(root, **fields)
+    draw_modulation(policy)
+    assert real_time(policy).supports_rtc()
+    noise = torch.randn(1, policy.config.chunk_size, 32, generator=torch.Generator().manual_seed(0))
+
+    def plans(first: int) -> list[Tensor]:
+        """Return the free and the guided plan at step 7, after a plan at step 0 that saw another frame."""
+        found = []
+        for left_over in (None, torch.full((3, 7), 0.5)):
+            policy.reset()
+            for step, index in ((0, first), (7, STARTS[2] + 7)):
+                monkeypatch.setattr("time.monotonic", lambda step=step: 100.0 + step / CONTROL_HZ)
+                at = {"observation.step": torch.tensor([[float(step)]])} if clock else {}
+                batch = before(observed(dataset, index, clock=False, **at))
+                guidance = {} if step == 0 else {"inference_delay": 3, "prev_chunk_left_over": left_over}
+                plan = policy.predict_action_chunk(batch, noise=noise, **guidance)
+            found.append(plan)
+        return found
+
+    free, guided = plans(STARTS[2])
+    assert [step for _, steps in remembered(policy, [0]) for step in steps] == [0, 7]
+    apart = [float((plan[0, :3] - 0.5).abs().mean()) for plan in (free, guided)]
+    assert apart[1] < 0.1 < apart[0]
+    assert not torch.equal(guided, plans(20)[1])
+
+
+def test_regression_has_no_real_time_chunking(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS, memory="none")
+    assert not policy.supports_rtc()
+    with pytest.raises(MemobenchError, match=r"inference\.type=sync.*flow_matching"):
+        real_time(policy).predict_action_chunk(before(observed(dataset, 10)), inference_delay=3)
+
+
+def test_plans_need_every_observation(root: Path) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    policy.reset()
+    policy.predict_action_chunk(before(observed(dataset, 63, clock=False)))
+    with pytest.raises(MemobenchError, match=r"inference\.type=sync.*observe"):
+        policy.predict_action_chunk(before(observed(dataset, 69, clock=False)))
+    policy.reset()
+    policy.predict_action_chunk(before(observed(dataset, STARTS[2])))
+    with pytest.raises(MemobenchError, match="step 2"):
+        policy.predict_action_chunk(before(observed(dataset, STARTS[2] + 6)))
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_observe_and_plan_equal_select_action(root: Path, clock: bool) -> None:
+    policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    policy.reset()
+    plans, actions = [], []
+    for step in range(13):
+        batch = before(observed(dataset, STARTS[2] + step, clock=clock))
+        policy.observe(batch)
+        if step % 6 == 0:
+            plans.append(policy.predict_action_chunk(batch))
+    trained = before(batch_of(dataset, [STARTS[2] + 12]))
+    assert remembered(policy, [0])[0][1] == trained_on(trained)[0][1]
+    policy.reset()
+    for step in range(13):
+        policy.drop_queued_actions()
+        action = policy.select_action(before(observed(dataset, STARTS[2] + step, clock=clock)))
+        if step % 6 == 0:
+            actions.append(action)
+    assert all(torch.allclose(plan[:, 0], action, atol=1e-5) for plan, action in zip(plans, actions, strict=True))
+
+
+# -- checkpoints ---------------------------------------------------------------------------------------------------
+
+
+def copied(folder: Path, target: Path) -> Path:
+    shutil.copytree(folder, target)
+    return target
+
+
+def test_a_training_from_a_checkpoint_keeps_its_processors(trained: Any, root: Path) -> None:
+    policy, before, dataset, folder, _ = trained
+    config: Any = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    acting = MemobenchMemPolicy.from_pretrained(folder)
+    assert all(torch.equal(one, policy.state_dict()[name]) for name, one in acting.state_dict().items())
+    training = open_small_training(root, config)
+    for pipeline, lookup in (
+        (training.processors[0], training.lookup),
+        (make_pre_post_processors(config, pretrained_path=str(folder))[0], None),
+    ):
+        step = next(step for step in pipeline.steps if isinstance(step, GatherMemoryProcessorStep))
+        assert step.lookup is lookup
+    raw = batch_of(dataset, [10, 50])
+    first, second = before(copy.deepcopy(raw)), training.processors[0](copy.deepcopy(raw))
+    for key in (FRAMES, "memory.text", "observation.language.tokens", "action"):
+        assert torch.equal(first[key], second[key]), key
+    config.align = "framewise"
+    other = open_small_training(root, config).policy
+    assert type(other.alignment).__name__ == "FramewiseAlignment"
+    assert not torch.equal(other.alignment.project.weight, policy.alignment.project.weight)
+    assert torch.equal(other.model.memory.encoder.project.weight, policy.model.memory.encoder.project.weight)
+
+
+def test_incomplete_statistics_are_refused(trained: Any, tmp_path: Path) -> None:
+    policy, _, dataset, folder, _ = trained
+    broken = copied(folder, tmp_path / "it")
+    state = next(broken.glob("policy_preprocessor_step_*_normalizer_processor.safetensors"))
+    save_file({k: v for k, v in load_file(state).items() if not k.startswith("action")}, state)
+    with pytest.raises(MemobenchError, match="statistics for action"):
+        MemobenchMemPolicy.from_pretrained(broken)
+    MemobenchMemPolicy.from_pretrained(broken, dataset_meta=dataset.meta)  # a dataset has its own
+    (broken / "policy_preprocessor.json").unlink()
+    with pytest.raises(MemobenchError, match=r"policy_preprocessor\.json"):
+        MemobenchMemPolicy.from_pretrained(broken)
+    with pytest.raises(MemobenchError, match="statistics"):
+        make_pre_post_processors(policy.config)
+
+
+def test_broken_weights_are_refused(trained: Any, root: Path, tmp_path: Path) -> None:
+    file = copied(trained[3], tmp_path / "it") / "model.safetensors"
+    weights = load_file(file)
+    save_file({key: one for key, one in weights.items() if key != "model.memory.encoder.project.weight"}, file)
+    with pytest.raises(MemobenchError, match=r"model\.memory\.encoder\.project\.weight"):
+        MemobenchMemPolicy.from_pretrained(file.parent)
+    save_file(weights | {"model.action_in_proj.weight": torch.zeros(3, 3)}, file)
+    with pytest.raises(MemobenchError, match=r"model\.action_in_proj\.weight"):
+        MemobenchMemPolicy.from_pretrained(file.parent)
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(MemobenchError, match=rf"{file.name} cannot be read"):
+        MemobenchMemPolicy.from_pretrained(file.parent)
+    with pytest.raises(MemobenchError, match=rf"{file.name} cannot be read"):
+        made_for_training(root, **OBJECTS, base_weights=str(file.parent))
+    file.unlink()
+    with pytest.raises(MemobenchError, match=rf"no {file.name}"):
+        MemobenchMemPolicy.from_pretrained(file.parent)
+
+
+def test_base_weights_are_loaded_except_for_the_memory(trained: Any, tmp_path: Path) -> None:
+    fields = {"perception": "objects", "size": "small"}
+    plain = MemoryPI05(small_config(**fields, memory="none"))
+    with torch.no_grad():
+        for parameter in plain.parameters():
+            parameter.add_(0.1)
+    save_file({k: v.contiguous() for k, v in plain.state_dict().items()}, tmp_path / "model.safetensors")
+    features = {name: getattr(trained[0].config, name) for name in ("input_features", "output_features")}
+    policy = MemobenchMemPolicy(small_config(base_weights=str(tmp_path), **fields, **features))
+    memory = policy.model.memory_names()
+    own = {name: one for name, one in policy.model.named_parameters() if name not in memory}
+    assert own.keys() == dict(plain.named_parameters()).keys()
+    assert all(torch.equal(own[name], tensor) for name, tensor in plain.named_parameters())
+
+
+def nested(name: str) -> str:
+    """Return the earlier name of a tensor."""
+    norm = "model.paligemma_with_expert.gemma_expert.model.layers.{}.post_attention_layernorm."
+    if name.startswith("model.modulators."):
+        _, _, layer, rest = name.split(".", 3)
+        return norm.format(layer) + f"modulator.{rest}"
+    if ".gemma_expert." in name:
+        return name.replace("post_attention_layernorm.", "post_attention_layernorm.norm.")
+    return name
+
+
+OLD = {"memory_frames": 32, "tokens_per_frame": 2, "open_gate": False, "full_chunk_when_stalled": True}
+
+
+@pytest.mark.parametrize(
+    ("old", "noted", "refused"),
+    [
+        ({}, [], None),
+        ({"memory_frames": 8, "open_gate": True, "full_chunk_when_stalled": False}, ["open_gate", "full_chunk"], None),
+        (
+            {"memory_fusion": "none", "memory": None, "memory_stride": 8, "align": "none", "text_encoder": "words"},
+            [],
+            None,
+        ),
+        ({"memory_settings": {"time_codes": False, "content": True}}, [], "time_codes"),
+        ({"tokens_per_frame": 3}, [], "tokens_per_frame"),
+        ({"visual_encoder": "random"}, [], "visual_encoder"),
+    ],
+    ids=["usual", "notes", "no memory", "time_codes", "tokens", "encoder"],
+)
+def test_checkpoints_of_earlier_versions_are_updated(
+    trained: Any, tmp_path: Path, old: dict[str, Any], noted: list[str], refused: str | None
+) -> None:
+    folder = copied(trained[3], tmp_path / "it")
+    file, processor = folder / "config.json", folder / "policy_preprocessor.json"
+    content = json.loads(processor.read_text())
+    step = next(one for one in content["steps"] if one["registry_name"] == "memobench_gather_memory")
+    step["config"] = {"frames": 32, "align": "none", "shuffle_seed": 7}
+    processor.write_text(json.dumps(content))
+    weights = load_file(folder / "model.safetensors")
+    save_file({nested(name): tensor for name, tensor in weights.items()}, folder / "model.safetensors")
+    (folder.parent / "training_state").mkdir()
+    file.write_text(json.dumps(json.loads(file.read_text()) | OLD | {"memory_settings": {"content": True}} | old))
+    if refused is not None:
+        with pytest.raises(MemobenchError, match=refused):
+            update_checkpoint(folder)
+        return
+    notes = update_checkpoint(folder)
+    assert not (folder.parent / "training_state").exists()
+    assert notes.pop().startswith("the training cannot be resumed")
+    assert load_file(folder / "model.safetensors").keys() == weights.keys()
+    assert [any(one.startswith(name) for one in notes) for name in noted] == [True] * len(noted)
+    assert bool(notes) == bool(noted)
+    found: Any = PreTrainedConfig.from_pretrained(folder)
+    if old.get("memory_fusion") == "none":
+        assert (found.memory, found.memory_fusion) == ("none", None)
+        return
+    assert found.memory_settings == {"frames": old.get("memory_frames", 32), "content": True}
+    make_pre_post_processors(found, pretrained_path=str(folder))
+    MemobenchMemPolicy.from_pretrained(folder)
