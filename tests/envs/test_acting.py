@@ -30,7 +30,7 @@ from lerobot_memobench.policies.baselines.configuration_baselines import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
-from lerobot_memobench.run.merging import merge
+from lerobot_memobench.run.shards import merge
 from lerobot_memobench.sim.object_layout import SIZE
 
 TASK = "turn_on_the_stove_and_turn_it_off"

@@ -28,7 +28,7 @@ from lerobot_memobench.evaluation.metrics import failure_of
 from lerobot_memobench.evaluation.records import read_protocol, read_rollouts
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.protocol import EVALUATION_SEED, UNSEEDED
-from lerobot_memobench.run.merging import merge_and_report
+from lerobot_memobench.run.shards import merge_and_report
 from lerobot_memobench.tasks.catalogue import get_task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

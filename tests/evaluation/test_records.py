@@ -19,7 +19,7 @@ from lerobot_memobench.evaluation.metrics import failure_counts, summarise
 from lerobot_memobench.evaluation.records import read_protocol, read_rollouts, read_runs, sweeps
 from lerobot_memobench.evaluation.report import build, render, write_report
 from lerobot_memobench.evaluation.report_tables import departures, failures_table
-from lerobot_memobench.run.merging import merge
+from lerobot_memobench.run.shards import merge
 from lerobot_memobench.tasks.failures import FAILURES
 from tests.support import logs
 from tests.support.logs import SETTINGS, evaluation, rollout

@@ -11,9 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, INFO_FILE, check_whole, naming_damage
 from lerobot_memobench.envs.command_line import quiet
+from lerobot_memobench.envs.observations import check_obs_type
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on
@@ -31,14 +33,14 @@ from lerobot_memobench.run.arguments import (
     TRAINING_OPTIONS,
     Arguments,
     LerobotArguments,
-    check_task_names,
     checked_value,
+    env_config,
+    policy_config,
     read_arguments,
     read_config_file,
     resolve_recipe,
     whole_number,
 )
-from lerobot_memobench.run.plan import check_observations, env_config, policy_config
 from lerobot_memobench.training.resume import (
     check_same_training,
     how_to_go_on,
@@ -72,7 +74,6 @@ def train(given: Arguments, line: Sequence[str], tell: Callable[[str], None]) ->
     begun = time.time()
     use_threads(LEARNING)
     prompt_frames, obs_type, given = take_training_options(resolve_recipe(resumed(given)))
-    check_task_names(given)
     arguments = read_arguments("train", given)
     if given.wants_help:
         return run_lerobot(arguments.for_parser)
@@ -190,7 +191,9 @@ def complete_training(arguments: LerobotArguments) -> LerobotArguments:
     if path is not None and policy is not None:
         with quiet():
             check_weights(path, as_trained(path, policy))
-    check_observations(policy, env_config(arguments))
+    environment: Any = env_config(arguments)
+    if environment is not None and environment.type == "memobench":
+        check_obs_type(policy, environment.obs_type)
     steps = whole_number(arguments.get("steps"))
     if steps is not None and steps < 2000 and arguments.get("resume") != "true":
         # LeRobot's default of every 200 steps shows no loss of a short run.
