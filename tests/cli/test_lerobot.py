@@ -104,15 +104,11 @@ def test_help_explains_every_short_form(
     assert not any(len(line) > 106 for line in text.splitlines())
 
 
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [(["eval", "env=memobench", "tasks=stove"], "'stove'"), (["evaluate"], "'eval'")],
-)
-def test_the_installed_program(tmp_path: Path, words: list[str], named: str) -> None:
+def test_the_installed_program(tmp_path: Path) -> None:
     program = Path(sys.executable).with_name("lerobot")
-    done = subprocess.run([program, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run([program, "evaluate"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert named in done.stderr
+    assert "'eval'" in done.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -168,6 +164,7 @@ def test_errors_in_a_run(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]
         main(["eval", "env=memobench"])
     Path("file").write_text("")
     fake_loop.plans.clear()
+    capsys.readouterr()
     assert "is a file" in refused(["eval", "env=memobench", "output_dir=file"], fake_loop, capsys)
 
 

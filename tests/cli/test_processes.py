@@ -48,19 +48,14 @@ assert not found, found
 """
 
 
+@pytest.mark.slow  # LeRobot's import, in each process; the discovery itself is part of the tests of a second writer
 @pytest.mark.parametrize(
     "first",
     [
-        "from lerobot.utils.import_utils import register_third_party_plugins as r; r()",
-        *(
-            pytest.param(code, marks=pytest.mark.slow)
-            for code in (
-                "import lerobot.scripts.lerobot_eval as s; s.register_third_party_plugins()",
-                "import lerobot_policy_memobench, lerobot.policies, lerobot.envs",
-                "import lerobot.envs, lerobot.policies, lerobot_policy_memobench",
-                "import lerobot_memobench.registration",
-            )
-        ),
+        "import lerobot.scripts.lerobot_eval as s; s.register_third_party_plugins()",
+        "import lerobot_policy_memobench, lerobot.policies, lerobot.envs",
+        "import lerobot.envs, lerobot.policies, lerobot_policy_memobench",
+        "import lerobot_memobench.registration",
     ],
 )
 def test_configurations_are_registered_without_the_simulator(first: str) -> None:
