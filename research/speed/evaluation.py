@@ -264,9 +264,9 @@ def rollouts_apart(environment: Mapping[str, str]) -> Iterator[Apart]:
 @contextmanager
 def _ready() -> Iterator[None]:
     """Make a process ready for rollouts, as `lerobot eval` does."""
-    from lerobot_memobench.run.lerobot_commands import load_command
+    from lerobot_memobench.jobs.threads import ACTING, use_threads
 
-    load_command("eval")
+    use_threads(ACTING)
     import lerobot_memobench.registration  # noqa: F401 - makes the policy known
 
     logging.disable(logging.WARNING)

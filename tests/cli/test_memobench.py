@@ -1,171 +1,116 @@
-"""The command ``memobench``."""
+"""The command ``memobench``: help, mistakes, and the output of its commands."""
 
 from __future__ import annotations
 
+import csv
+import errno
+import io
 import json
+import os
 import re
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.cli.memobench import COMMANDS, ELSEWHERE, main
-from lerobot_memobench.envs.episode_log import EpisodeLog
-from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.cli.memobench import COMMANDS, main
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 
 
-@pytest.fixture
-def task_folder(tmp_path: Path) -> Path:
-    """A copy of one task, as a user's own folder."""
-    from lerobot_memobench.tasks.catalogue import get_task
-
-    folder = tmp_path / "mine" / TASK
-    folder.mkdir(parents=True)
-    for file in get_task(TASK).folder.iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
-    return folder
+# --- help and mistakes ---
 
 
-def log_episode(folder: Path, **changes: object) -> None:
-    EpisodeLog(folder).append(
-        {
-            "task": TASK,
-            "memory_type": "temporal",
-            "episode": 0,
-            "seed": 7,
-            "success": True,
-            "checkpoints": [{"operation": "S", "first_step": 1, "ordered_step": 1}],
-            **changes,
-        }
-    )
-
-
-def test_tasks_as_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["tasks"]) == 0
+@pytest.mark.parametrize("columns", ["80", "200"])
+def test_help_lists_every_command_in_its_group(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    assert main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert f"{len(task_names())} tasks" in out
-    assert TASK in out
+    places = [out.index(f"─ {group} ") for group in COMMANDS]
+    assert places == sorted(places)
+    for (group, commands), begin, end in zip(COMMANDS.items(), places, [*places[1:], len(out)], strict=True):
+        for command in commands:
+            name = command.__name__.replace("_", "-")
+            assert re.search(rf"^│ {name} ", out[begin:end], re.MULTILINE), (group, name)
+    assert max(len(line) for line in out.splitlines()) <= int(columns)
+    assert main([]) == 0
 
 
-@pytest.mark.parametrize("up", [0, 1])
-def test_tasks_of_a_folder_as_json(task_folder: Path, capsys: pytest.CaptureFixture[str], up: int) -> None:
-    folder = [task_folder, task_folder.parent][up]
-    assert main(["tasks", "--dir", str(folder), "--json"]) == 0
-    (task,) = json.loads(capsys.readouterr().out)
-    assert set(task) == {
-        "name", "memory_type", "family", "language", "objects", "fixtures", "goal", "checkpoints", "state_dim",
-    }  # fmt: skip
-    assert task["name"] == TASK
-    assert task["state_dim"] == 51 or task["state_dim"] > 30  # the compiled model's own
-    assert all(len(checkpoint["language"]) == 3 for checkpoint in task["checkpoints"])
-
-
-def test_report_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("a", "b"):
-        log_episode(tmp_path / name)
-    assert main(["report", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
-    out = capsys.readouterr().out
-    assert out.count("average of memory types") == 2
-    assert str(tmp_path / "b") in out.replace("\n", "")
-    assert json.loads((tmp_path / "a" / "report.json").read_text())["average"]["SR"] == 100.0
+def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert re.fullmatch(r"memobench \d+\.\d+\S* \(LeRobot \d+\.\d+\S*\)\n", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "named"),
     [
         (["tasks", "--dir", "nowhere"], "is not a folder"),
         (["tasks", "--dir", "."], "found no"),
         (["report", "nowhere"], "is not a folder"),
         (["report", "."], "no episode log"),
         (["report"], "Missing argument"),
-        (["generate", "--tasks", "stov", "--out", "x"], "found 'stov' among the tasks"),
+        (["generate", "--tasks", "stov", "--out", "x"], "'stov'"),
         (["generate", "--episodes", "0", "--out", "x"], "episodes"),
         (["generate"], "--out"),
         (["generate", "--referent", "rnd", "--out", "x"], "random"),
         (["cache", "nowhere"], "nowhere"),
         (["cache", ".", "--size", "huge"], "tiny"),
+        (["recipe", "train_papr"], "'train_paper'"),
         (["frobnicate"], "No such command"),
     ],
 )
-def test_mistakes_are_one_sentence(
+def test_mistakes_are_one_line(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     words: list[str],
-    message: str,
+    named: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
     assert main(words) == 2
     out, err = capsys.readouterr()
-    assert message in err
+    assert named in err
     assert err.startswith("memobench: ")
     assert err.count("\n") == 1
     assert out == ""
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--help"]) == 0
+# --- tasks ---
+
+
+def test_tasks_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tasks"]) == 0
     out = capsys.readouterr().out
-    for command in ("tasks", "generate", "cache", "report", "doctor"):
-        assert command in out
+    assert f"{len(task_names())} tasks" in out
+    assert TASK in out
+    shutil.copytree(get_task(TASK).folder, tmp_path / "temporal" / TASK)  # a folder of own tasks
+    for folder in (tmp_path, tmp_path / "temporal" / TASK):
+        assert main(["tasks", "--dir", str(folder), "--json"]) == 0
+        (task,) = json.loads(capsys.readouterr().out)
+        assert set(task) == {
+            "name", "memory_type", "family", "language", "objects", "fixtures", "goal", "checkpoints", "state_dim",
+        }  # fmt: skip
+        assert task["name"] == TASK
+        assert task["state_dim"] > 30  # of the compiled model
+    shutil.copytree(get_task(TASK).folder, tmp_path / "lacking")
+    (tmp_path / "lacking" / "task_config.meta.json").unlink()
+    assert main(["tasks", "--dir", str(tmp_path)]) == 1
+    printed = capsys.readouterr()
+    assert printed.out.startswith("1 task of")
+    assert "lacking/task_config.meta.json is missing" in printed.err
 
 
-def test_help_lists_every_command_once_in_its_group(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--help"]) == 0
-    out = capsys.readouterr().out
-    names = [one if isinstance(one, str) else one.__name__.replace("_", "-") for one in _names()]
-    sections = [line for line in out.splitlines() if line.endswith(":") and not line.startswith(" ")]
-    assert sections == ["Options:", *(f"{group}:" for group in COMMANDS)]
-    listed = [line.split()[0] for line in out[out.index("Look around:") :].splitlines() if line.startswith("  ")]
-    assert [name for name in listed if name in names] == names
-    assert main([]) == 0
-    assert capsys.readouterr().out == out
-
-
-def test_help_cuts_no_description(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main(["--help"]) == 0
-    out = capsys.readouterr().out
-    assert "..." not in out[out.index("Look around:") :]
-    assert max(len(line) for line in out.splitlines()) <= 80
-
-
-def _names() -> list[object]:
-    return [one for group in COMMANDS.values() for one in group]
-
-
-def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--version"]) == 0
-    assert re.fullmatch(r"memobench \d+\.\d+\S* \(LeRobot \d+\.\d+\S*\)\n", capsys.readouterr().out)
-
-
-@pytest.mark.parametrize("words", [[], ["env=memobench", "--seed=3"], ["--help"]])
-@pytest.mark.parametrize("command", ELSEWHERE)
-def test_moved_commands_name_the_command_to_give(
-    command: str, words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([command, *words]) == 2
-    message = capsys.readouterr().err
-    assert f"{command!r}; give: {ELSEWHERE[command]}" in " ".join(message.split())
-    assert message.count("\n") == 1
-
-
-def test_commands_without_lerobot_do_not_import_it() -> None:
-    code = (
-        "import sys; from lerobot_memobench.cli.memobench import main; status = main(['tasks']); "
-        "heavy = {'lerobot', 'torch', 'mujoco'} & set(sys.modules); print(sorted(heavy), file=sys.stderr)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stderr.strip() == "[]"
+# --- generate ---
 
 
 @pytest.mark.parametrize("solved", [2, 1, 0])
-def test_generate_tells_what_became_of_every_seed(
+def test_generate_reports_every_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], solved: int
 ) -> None:
     from lerobot_memobench.datasets import generation
@@ -187,40 +132,108 @@ def test_generate_tells_what_became_of_every_seed(
     words = ["generate", "--tasks", TASK, "--episodes", "2", "--out", str(out), "--no-images", "--referent", "random"]
     words += ["--slurm", "--partition=cpu --time=8:00:00"]
     assert main(words) == (0 if solved == 2 else 1)
-    assert callable(asked.pop("notify"))
-    assert asked == {
-        "tasks": [TASK],
-        "episodes": 2,
-        "prompted_episodes": None,
-        "out": out,
-        "seed_base": 10_000,
-        "referent": "random",
-        "images": False,
-        "image_size": 256,
-        "demonstration_prompt": True,
-        "perturb": False,
-        "workers": 1,
-        "finish": False,
-        "slurm": generation.slurm_of(out, ("--partition=cpu", "--time=8:00:00")),
-    }
+    given = {"tasks": [TASK], "episodes": 2, "out": out, "referent": "random", "images": False, "seed_base": 10_000}
+    given["slurm"] = generation.slurm_of(out, ("--partition=cpu", "--time=8:00:00"))
+    assert {key: asked[key] for key in given} == given
     printed = capsys.readouterr().out
     assert ("no dataset was written" in printed) == (solved == 0)
     assert ("it slipped" in printed) == (solved < 2)
 
 
-def test_a_tree_of_tasks_lists_what_loads_and_names_what_does_not(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+# --- report and compare ---
+
+
+def evaluation(folder: Path, replan_steps: int = 5, successes: int = 2) -> str:
+    records = [
+        {
+            "task": "a_task",
+            "memory_type": "temporal",
+            "episode": k,
+            "seed": 7 + k,
+            "referent": "fixed",
+            "replan_steps": replan_steps,
+            "success": k < successes,
+            "checkpoints": [
+                {"operation": "S", "first_step": 3, "ordered_step": 3},
+                {"operation": "U", "first_step": 5 if k < successes else None, "ordered_step": None},
+            ],
+        }
+        for k in range(4)
+    ]
+    write_episodes(folder, records)
+    return str(folder)
+
+
+def test_a_report_is_printed_and_written_beside_the_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
+    assert main(["report", f"p={a}", f"p={b}"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("average of memory types") == 2
+    assert "SR 75.0 at 20" in out
+    assert "75.0 [30.1–95.4]" in out
+    found = json.loads((tmp_path / "a" / "report.json").read_text())
+    assert set(found) == {"tasks", "memory_types", "average", "failures", "prefix", "inputs"}
+    assert main(["report", a, "--format", "json"]) == 0
+    assert json.loads(capsys.readouterr().out)["average"]["SR"] == found["average"]["SR"] == 50.0
+
+
+def test_a_report_is_written_in_several_formats(tmp_path: Path) -> None:
+    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", successes=3)
+    out, paper = tmp_path / "out", tmp_path / "paper"
+    words = ["--format", "csv", "--format", "json", "--format", "latex"]
+    assert main(["report", a, b, *words, "--out", str(out)]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["report.csv", "report.json", "report.tex", "tables"]
+    tables = {path.stem: list(csv.DictReader(path.open())) for path in sorted((out / "tables").iterdir())}
+    assert list(tables) == ["failures", "memory-types", "overview", "prefix", "tasks"]
+    found = json.loads((out / "report.json").read_text())["evaluations"]
+    for row, (name, figures) in zip(tables["tasks"], found.items(), strict=True):
+        rates, intervals = figures["tasks"]["a_task"], figures["intervals"]["tasks"]["a_task"]
+        assert (row["evaluation"], row["task"], int(row["n"])) == (name, "a_task", rates["n"])
+        for metric in ("SR", "MSR", "MUR"):
+            assert float(row[metric]) == rates[metric]
+            assert [float(row[f"{metric} {bound}"]) for bound in ("low", "high")] == intervals[metric]
+        assert row["MCR"] == row["MCR low"] == ""
+    prefix = tables["prefix"][0]
+    assert [float(prefix[f"c{k} any order"]) for k in (1, 2)] == found["a"]["prefix"]["a_task"]
+    assert [float(prefix[f"c{k} in order"]) for k in (1, 2)] == found["a"]["ordered_prefix"]["a_task"]
+    assert [row["object SR"] for row in tables["overview"]] == ["", ""]
+    assert [float(row["average SR"]) for row in tables["overview"]] == [50.0, 75.0]
+    assert main(["report", a, "--format", "json", "--with", "paper", "--out", str(paper)]) == 0
+    assert len(json.loads((paper / "report.json").read_text())["paper"]) == 43
+
+
+def test_two_evaluations_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
+    assert main(["compare", a, b]) == 2
+    assert "replan_steps: 5 and 20" in capsys.readouterr().err
+    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "json"]) == 0
+    assert json.loads(capsys.readouterr().out)["differences"][0]["difference"] == 25.0
+    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "csv"]) == 0
+    first = next(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert (first["metric"], first["pairs"], first["difference"]) == ("SR", "4", "25.0")
+
+
+@pytest.mark.parametrize(("option", "number"), [("--out", errno.ENOSPC), ("--html", errno.EROFS)])
+def test_a_disk_that_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, option: str, number: int
 ) -> None:
-    import shutil
+    """The error is one line, and existing files are whole."""
+    a, out = evaluation(tmp_path / "a"), tmp_path / "out"
+    assert main(["report", a, option, str(out)]) == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    assert before
+    inner = Path.write_bytes
 
-    from lerobot_memobench.tasks.catalogue import get_task
+    def refuse(path: Path, content: bytes) -> int:
+        if out in path.parents:
+            raise OSError(number, os.strerror(number), str(path))
+        return inner(path, content)
 
-    whole = get_task(TASK).folder
-    shutil.copytree(whole, tmp_path / "temporal" / TASK)
-    shutil.copytree(whole, tmp_path / "temporal" / "lacking")
-    (tmp_path / "temporal" / "lacking" / "task_config.meta.json").unlink()
-    assert main(["tasks", "--dir", str(tmp_path)]) == 1
-    printed = capsys.readouterr()
-    assert printed.out.startswith("1 task of")
-    assert printed.err.count("\n") == 1
-    assert "lacking/task_config.meta.json is missing" in printed.err
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", refuse)
+        capsys.readouterr()
+        assert main(["report", a, option, str(out)]) == 2
+    err = capsys.readouterr().err
+    assert f"cannot be written ({os.strerror(number)})" in err
+    assert err.count("\n") == 1
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before

@@ -1,4 +1,4 @@
-"""What `make setup` installs from: pinned, hashed, and without any registry's address."""
+"""`make setup` installs pinned, hashed packages; no file names a registry."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def canonical(name: str) -> str:
 
 
 @pytest.mark.parametrize("name", LOCKS)
-def test_every_pin_has_hashes_and_no_line_an_address(name: str) -> None:
+def test_pins_have_hashes_and_no_addresses(name: str) -> None:
     text = (ROOT / name).read_text()
     assert "://" not in text
     blocks = re.split(r"\n(?=[A-Za-z0-9])", text)
@@ -44,7 +44,7 @@ def test_every_pin_has_hashes_and_no_line_an_address(name: str) -> None:
         assert "--hash=sha256:" in block
 
 
-def test_the_lock_answers_to_pyproject() -> None:
+def test_the_lock_agrees_with_pyproject() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     wanted = [
         *project["project"]["dependencies"],
@@ -60,20 +60,20 @@ def test_the_lock_answers_to_pyproject() -> None:
         assert requirement.specifier.contains(version), f"{line} is locked at {version}; run `make lock`"
 
 
-def test_what_needs_a_desktop_or_a_compiler_is_left_out() -> None:
+def test_desktop_packages_are_not_locked() -> None:
     locked = pins("requirements.lock")
     assert "opencv-python-headless" in locked
     assert not {"opencv-python", "pynput", "evdev"} & set(locked)
 
 
 @pytest.mark.parametrize("script", ["scripts/setup", "scripts/lock", ".ci/run"])
-def test_scripts_are_sound_and_executable(script: str) -> None:
+def test_scripts_parse_and_are_executable(script: str) -> None:
     path = ROOT / script
     assert path.stat().st_mode & 0o111
     subprocess.run(["bash", "-n", path], check=True)
 
 
-def test_late_imports_are_compiled_although_bytecode_is_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_imports_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, library = tmp_path / "src", tmp_path / "library"
     for folder in (source / "deep", library):
         folder.mkdir(parents=True)
@@ -95,7 +95,7 @@ def executable(path: Path, text: str) -> None:
 
 
 def without_ffmpeg(folder: Path) -> str:
-    """Return a PATH of one folder with what the system has, but for ffmpeg."""
+    """Return a PATH of one folder with all programs of the system except ffmpeg."""
     (folder / "system").mkdir()
     for place in ("/usr/sbin", "/sbin", "/usr/bin", "/bin", "/usr/local/bin"):
         for program in Path(place).glob("*"):
@@ -104,8 +104,8 @@ def without_ffmpeg(folder: Path) -> str:
     return str(folder / "system")
 
 
-def test_setup_removes_only_its_own_and_compiles_once_where_that_can_be(tmp_path: Path) -> None:
-    """The installers are stand-ins here, and so are the system's libraries: nothing is fetched."""
+def test_setup_removes_only_its_own_packages(tmp_path: Path) -> None:
+    """The installers and the system's libraries are replaced: no download."""
     for name in ("requirements.lock", "pyproject.toml", ".python-version", "scripts/setup", *LOCKS[1:]):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
@@ -116,12 +116,12 @@ def test_setup_removes_only_its_own_and_compiles_once_where_that_can_be(tmp_path
     executable(tmp_path / ".venv/bin/python", '[ "$1" = -c ] && exit 0; echo "$*" >>calls; exit 1')
     executable(tmp_path / "bin/ffmpeg", "exit 0")
     environment = {**os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}"}
-    said = []
+    printed = []
     for _ in range(2):
         done = subprocess.run([tmp_path / "scripts/setup"], env=environment, capture_output=True, text=True, check=True)
-        said.append(done.stderr)
-    assert "could not be compiled; going on" in said[0]
-    assert said[1] == ""
+        printed.append(done.stderr)
+    assert "could not be compiled; going on" in printed[0]
+    assert printed[1] == ""
     assert (tmp_path / "calls").read_text() == "scripts/compile_imports.py src\n"
     packages = [call for call in (tmp_path / "uv_calls").read_text().splitlines() if call.startswith("pip ")]
     assert [call.split()[1] for call in packages] == ["install", "uninstall", "install"], "no `sync`: it removes others"
@@ -130,7 +130,7 @@ def test_setup_removes_only_its_own_and_compiles_once_where_that_can_be(tmp_path
 
 
 @pytest.mark.parametrize("may", [True, False])
-def test_setup_says_which_system_packages_it_installs_before_it_does(tmp_path: Path, may: bool) -> None:
+def test_setup_lists_system_packages_first(tmp_path: Path, may: bool) -> None:
     for name in ("requirements.lock", "pyproject.toml", ".python-version", "scripts/setup", *LOCKS[1:]):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
@@ -142,20 +142,20 @@ def test_setup_says_which_system_packages_it_installs_before_it_does(tmp_path: P
     executable(tmp_path / "bin/apt-get", 'echo "apt-get $*" >&2')
     environment = {**os.environ, "PATH": f"{tmp_path / 'bin'}:{without_ffmpeg(tmp_path)}"}
     done = subprocess.run([tmp_path / "scripts/setup"], env=environment, capture_output=True, text=True, check=True)
-    said = done.stderr.splitlines()
-    installed = [line.split()[-1] for line in said if line.startswith("apt-get install")]
+    printed = done.stderr.splitlines()
+    installed = [line.split()[-1] for line in printed if line.startswith("apt-get install")]
     if not may:
         assert not installed
         assert "will be installed" not in done.stderr
         assert "ask for: apt-get install" in done.stderr
         return
-    assert said[0].startswith("setup: these system packages"), "before uv, Python and everything else"
-    assert said[0].split("as root: ")[1].split() == installed
+    assert printed[0].startswith("setup: these system packages"), "before uv, Python and everything else"
+    assert printed[0].split("as root: ")[1].split() == installed
     assert installed == ["ffmpeg"]
 
 
 def test_no_file_names_a_package_registry() -> None:
-    """Where packages come from is the machine's affair."""
+    """The machine decides on the registry."""
     names = re.compile(r"pypi\.org|pythonhosted\.org|--index-url|--extra-index-url|download\.pytorch\.org")
     files = ["Makefile", "pyproject.toml", "README.md", *LOCKS, ".ci/run", "scripts/setup", "scripts/lock"]
     for name in files:

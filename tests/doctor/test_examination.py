@@ -17,7 +17,7 @@ import pytest
 from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.cli.console import console
-from lerobot_memobench.cli.doctor import finding_table
+from lerobot_memobench.cli.memobench import finding_table
 from lerobot_memobench.doctor import examination
 from lerobot_memobench.doctor.examination import Finding, exit_status
 from lerobot_memobench.doctor.golden import SIDE, TOLERANCE, difference, read_golden, shrink

@@ -43,7 +43,7 @@ from lerobot_memobench.evaluation.metrics import failure_of, seed_base
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.protocol import ENDED, EXECUTION, IDLE_STEPS, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
 from lerobot_memobench.run.card import first_variant_mismatch
-from lerobot_memobench.run.merging import merge_and_report
+from lerobot_memobench.run.shards import merge_and_report
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation

@@ -20,7 +20,7 @@ from lerobot_memobench.evaluation.records import read_protocol, read_rollouts, r
 from lerobot_memobench.evaluation.report import build, write_report
 from lerobot_memobench.evaluation.report_tables import failures_table
 from lerobot_memobench.evaluation.tables import WRITERS
-from lerobot_memobench.run.merging import merge
+from lerobot_memobench.run.shards import merge
 from lerobot_memobench.tasks.failures import FAILURES
 from tests.support import logs
 from tests.support.logs import SETTINGS, evaluation, rollout

@@ -24,7 +24,7 @@ from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec
-from lerobot_memobench.run.lerobot_commands import call_lerobot
+from lerobot_memobench.run.arguments import call_lerobot
 from lerobot_memobench.training import loop
 from lerobot_memobench.training.configuration import read_training
 

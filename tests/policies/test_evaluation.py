@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +54,6 @@ def test_trained_checkpoints_are_evaluated(
         (TASK, HORIZON, 6)
     ] * 2
     assert sorted(episode["episode"] for episode in episodes) == [0, 1]
-    assert json.loads((out / "eval_info.json").read_text())
 
 
 @pytest.mark.slow

@@ -51,10 +51,10 @@ def test_a_policy_is_found_by_its_name(shipped: Path, tmp_path: Path, monkeypatc
 def test_a_name_that_is_nearly_one_is_told(shipped: Path) -> None:
     from lerobot.configs.eval import EvalPipelineConfig
 
-    from lerobot_memobench.run.arguments import choice_flags
+    from lerobot_memobench.run.arguments import choice_settings
 
     with pytest.raises(MemobenchError, match="did you mean 'memobench_small'"):
-        choice_flags(EvalPipelineConfig, "policy", "memobench_smal")
+        choice_settings(EvalPipelineConfig, "policy", "memobench_smal")
 
 
 # -- the script that ships them ------------------------------------------------------------------------------------

@@ -1,315 +1,180 @@
-"""A command line becomes LeRobot's flags; what is unknown is named with what is near."""
+"""A command line becomes LeRobot's settings; an unknown key or value is refused with the nearest known one."""
 
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
+from typing import Any
 
-import lerobot.scripts.lerobot_eval
-import lerobot.scripts.lerobot_train
+import draccus
 import pytest
-from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.arguments import (
     LerobotArguments,
-    check_task_names,
     checked_value,
-    flag_value,
+    lerobot_commands,
+    policy_config,
     read_arguments,
     recipe_file,
     recipes,
     split_arguments,
-    translate,
     whole_number,
-    without_flags,
 )
-from lerobot_memobench.run.lerobot_commands import config_class, lerobot_commands, load_command
 
 
-def test_a_line_is_taken_apart() -> None:
+@pytest.fixture(autouse=True)
+def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
+
+
+def values(command: str, *words: str) -> dict[str, str | None]:
+    return dict(read_arguments(command, split_arguments(words)).values)
+
+
+def test_a_line_is_split() -> None:
     given = split_arguments(["env=memobench", "--policy.type", "act", "-v", "--seed=3", "tasks=a=b", "--resume"])
     assert given.pairs == [("env", "memobench"), ("tasks", "a=b")]
     assert given.flags == ["--policy.type=act", "-v", "--seed=3", "--resume"]
-    assert not given.wants_help
-
-
-@pytest.mark.parametrize("word", ["memobench", "=x", "", "a b=c", "=="])
-def test_a_word_that_is_neither_is_refused(word: str) -> None:
-    with pytest.raises(MemobenchError, match="expected key=value"):
-        split_arguments(["env=memobench", word])
-
-
-def test_flags_are_found() -> None:
-    flags = ["--a.b=1", "--c=2", "--d", "--a.b=3", "--ab=4"]
-    assert flag_value(flags, "a.b") == "3"
-    assert flag_value(flags, "d") is None
-    assert LerobotArguments(tuple(flags)).has("d")
-    assert not LerobotArguments(tuple(flags)).has("a")
-    assert without_flags(flags, "a.b", "d") == ["--c=2", "--ab=4"]
-
-
-def test_numbers() -> None:
+    assert [given.value(key) for key in ("env", "seed", "resume", "x")] == ["memobench", "3", None, None]
+    assert given.without("env", "seed").pairs == [("tasks", "a=b")]
+    assert given.without("env", "seed").flags == ["--policy.type=act", "-v", "--resume"]
     assert [whole_number(text) for text in ("7", "-1", "null", None)] == [7, -1, None, None]
+    for word in ("memobench", "=x", "", "a b=c", "=="):
+        with pytest.raises(MemobenchError, match="expected key=value"):
+            split_arguments(["env=memobench", word])
 
 
-def evaluated(*words: str) -> list[str]:
-    return list(translate("eval", split_arguments(words), EvalPipelineConfig, {}).flags)
+UNDERSTOOD: list[tuple[str, list[str], dict[str, str | None]]] = [
+    ("eval", ["env=memobench"], {"env.type": "memobench"}),
+    ("train", ["policy=memobench_mem", "align=none"], {"policy.type": "memobench_mem", "policy.align": "none"}),
+    ("train", ["align=semantic", "policy=memobench_mem"], {"policy.type": "memobench_mem", "policy.align": "semantic"}),
+    ("train", ["policy=act", "seed=None", "job_name=null"], {"policy.type": "act", "seed": "null", "job_name": "null"}),
+    ("train", ["policy=act", "dataset=user/name"], {"policy.type": "act", "dataset.repo_id": "user/name"}),
+    ("train", ["policy=act", "dataset=data"], {"policy.type": "act", "dataset.repo_id": "local/data"}),
+    ("train", ["optimizer=adam", "optimizer.lr=1e-3"], {"optimizer.type": "adam", "optimizer.lr": "1e-3"}),
+    ("train", ["optimizer.type=adam", "optimizer.lr=1e-3"], {"optimizer.type": "adam", "optimizer.lr": "1e-3"}),
+    ("eval", ["--seed=1", "seed=2", "seed=3"], {"seed": "3"}),
+    ("eval", ["policy=act", "policy=diffusion"], {"policy.type": "diffusion"}),
+    ("eval", ["--policy.type=act", "policy=user/name"], {"policy.path": "user/name"}),
+    ("eval", ["policy=run", "policy.chunk_size=3"], {"policy.path": "run/checkpoints/last/pretrained_model"}),
+    ("eval", ["policy=run/checkpoints/last"], {"policy.path": "run/checkpoints/last/pretrained_model"}),
+    ("eval", ["policy=act"], {"policy.type": "act"}),  # also where a folder has that name
+    ("eval", ["policy=./act"], {"policy.path": "act"}),
+    ("eval", ["--env.type=pusht", "--policy.type", "act"], {"env.type": "pusht", "policy.type": "act"}),
+    ("eval", ["env=memobench", "replan=5"], {"env.type": "memobench", "env.replan_steps": "5"}),
+    ("train", ["config_path=file.yaml", "align=semantic"], {"config_path": "file.yaml", "policy.align": "semantic"}),
+    ("record", ["--a", "b=c"], {}),
+]
 
 
-def trained(*words: str) -> list[str]:
-    return list(translate("train", split_arguments(words), TrainPipelineConfig, {}).flags)
+@pytest.mark.parametrize(("command", "words", "found"), UNDERSTOOD, ids=[" ".join(case[1]) for case in UNDERSTOOD])
+def test_words_become_settings_of_lerobot(command: str, words: list[str], found: dict[str, str | None]) -> None:
+    for folder in (Path("run/checkpoints/last/pretrained_model"), Path("act")):
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text(json.dumps({"type": "act"}))
+    Path("data").mkdir()
+    Path("file.yaml").write_text("policy: {type: memobench_mem}\nenv: {type: memobench}")
+    result = values(command, *words)
+    assert {key: text for key, text in result.items() if key not in ("dataset.root", "policy.chunk_size")} == found
+    assert result.get("dataset.root", "data") == "data"
 
 
-def test_the_commands_of_the_readme() -> None:
-    assert evaluated("env=memobench") == ["--env.type=memobench"]
-    assert trained("policy=memobench_mem", "align=contrastive") == [
-        "--policy.type=memobench_mem",
-        "--policy.align=contrastive",
-    ]
-
-
-def test_short_forms_of_train() -> None:
-    flags = trained("policy=act", "dataset=user/name", "steps=50", "batch_size=4", "seed=1")
-    assert flags == [
-        "--policy.type=act",
-        "--dataset.repo_id=user/name",
-        "--steps=50",
-        "--batch_size=4",
-        "--seed=1",
-    ]
-
-
-def test_dotted_keys_and_untouched_flags() -> None:
-    flags = evaluated(
-        "--env.type=memobench", "--policy.type", "act", "eval.use_async_envs=false", "policy.chunk_size=10"
-    )
-    assert flags == [
-        "--env.type=memobench",
-        "--policy.type=act",
-        "--eval.use_async_envs=false",
-        "--policy.chunk_size=10",
-    ]
-
-
-def test_an_optimizer_is_chosen_like_a_policy() -> None:
-    flags = ["--optimizer.type=adam", "--optimizer.lr=1e-3"]
-    assert trained("policy=act", "optimizer=adam", "optimizer.lr=1e-3")[1:] == flags
-    assert trained("policy=act", "optimizer.type=adam", "optimizer.lr=1e-3")[1:] == flags
-    with pytest.raises(MemobenchError, match=r"needs optimizer="):
-        trained("policy=act", "optimizer.lr=1e-3")
-
-
-def test_a_type_of_a_package_that_lerobot_will_look_for_is_left_to_it() -> None:
-    flags = ["--policy.type=mine", "--policy.discover_packages_path=my_package"]
-    assert trained(*flags, "steps=1") == [*flags, "--steps=1"]
-
-
-def test_a_visual_encoder_has_a_short_form() -> None:
-    assert trained("policy=memobench_mem", "visual_encoder=package")[1:] == ["--policy.visual_encoder=package"]
-
-
-def test_the_order_of_words_does_not_matter() -> None:
-    assert "--policy.align=semantic" in trained("align=semantic", "policy=memobench_mem")
-
-
-def test_none_is_a_word_for_text_and_nothing_for_numbers() -> None:
-    assert trained("policy=memobench_mem", "align=none")[1:] == ["--policy.align=none"]
-    assert trained("policy=act", "seed=None", "job_name=null")[1:] == ["--seed=null", "--job_name=null"]
-
-
-def test_a_checkpoint_folder_is_a_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
-    folder.mkdir(parents=True)
-    (folder / "config.json").write_text(json.dumps({"type": "act"}))
-    assert evaluated("env=memobench", f"policy={folder}")[1] == f"--policy.path={folder}"
-    assert evaluated("env=memobench", f"policy={tmp_path / 'run'}")[1] == f"--policy.path={folder}"
-    monkeypatch.chdir(tmp_path / "run" / "checkpoints" / "last")
-    flags = evaluated("env=memobench", "policy=pretrained_model", "policy.chunk_size=3")
-    assert flags[1:] == ["--policy.path=pretrained_model", "--policy.chunk_size=3"]
-
-
-def test_a_name_with_a_slash_is_a_repository() -> None:
-    assert evaluated("env=memobench", "policy=lerobot/pi05_base")[1] == "--policy.path=lerobot/pi05_base"
-
-
-@pytest.mark.parametrize("holds_checkpoint", [True, False])
-def test_a_known_type_is_the_type_and_a_folder_is_a_path(
-    holds_checkpoint: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / "act").mkdir()
-    if holds_checkpoint:
-        (tmp_path / "act" / "config.json").write_text(json.dumps({"type": "diffusion"}))
-    monkeypatch.chdir(tmp_path)
-    assert evaluated("env=memobench", "policy=act", "policy.chunk_size=3")[1] == "--policy.type=act"
-    notes = [record.getMessage() for record in caplog.records]
-    told = "policy=act is the policy type; the checkpoint in the folder of that name is policy=./act"
-    assert notes == [told] * holds_checkpoint
-    if holds_checkpoint:
-        assert evaluated("env=memobench", "policy=./act")[1] == "--policy.path=act"
-
-
-def test_a_recipe_is_the_recipe_and_a_file_is_a_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / "train_paper").write_text("steps: 1")
-    monkeypatch.chdir(tmp_path)
-    assert recipe_file("train_paper") == recipes()["train_paper"]
-    assert "the file of that name is config=./train_paper" in caplog.text
-    assert recipe_file("./train_paper") == Path("train_paper")
-
-
-def test_a_dataset_folder_is_a_root(tmp_path: Path) -> None:
-    folder = tmp_path / "demos"
-    folder.mkdir()
-    assert trained("policy=act", f"dataset={folder}")[1:] == [
-        "--dataset.repo_id=local/demos",
-        f"--dataset.root={folder}",
-    ]
+def test_other_commands_get_their_arguments_as_typed() -> None:
+    given = split_arguments(["--a", "-v", "b=c", "--policy.type=x"])
+    assert read_arguments("record", given).for_parser == ("--a", "-v", "--policy.type=x", "--b=c")
+    assert {"train", "eval", "record", "dataset-viz"} <= set(lerobot_commands())
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("command", "words", "named"),
     [
-        (["env=memobensh"], "there is no env 'memobensh', did you mean 'memobench'"),
-        (["env=memobench", "policy=memobench_men"], "'memobench_mem'"),
-        (["env=memobench", "episode=3"], "no setting 'episode', did you mean 'episodes'"),
-        (["env=memobench", "env.horizn=3"], "'env.horizon'"),
-        (["env=memobench", "policy=act", "policy.chunksize=3"], "'policy.chunk_size'"),
-        (["env=memobench", "--policy.type=atc"], "there is no policy 'atc', did you mean 'act'"),
-        (["env=memobench", "episodes=many"], "episodes=many: expected a whole number"),
-        (["env=memobench", "env.demonstration_prompt=perhaps"], "expected true or false"),
-        (["env=memobench", "policy=act", "policy.dropout=x"], "expected a number"),
-        (["env=memobench", "policy=act", "align=semantic"], "ACTConfig"),
-        (["env=memobench", "align=semantic"], "name one with policy="),
-        (["policy=act", "env.horizon=3"], "needs env="),
-        (["env=memobench", "policy="], "policy= is empty"),
-        (["env=memobench", "policy=./nowhere"], "does not exist"),
-        (["env=memobench", "policy=/a/b/c"], "does not exist"),
+        ("eval", ["env=memobensh"], "'memobench'"),
+        ("eval", ["env="], "env= is empty"),
+        ("eval", ["env=memobench", "policy=memobench_men"], "'memobench_mem'"),
+        ("eval", ["env=memobench", "policy=memobench_smal"], "'memobench_small'"),
+        ("eval", ["env=memobench", "episode=3"], "'episodes'"),
+        ("eval", ["env=memobench", "env.horizn=3"], "'env.horizon'"),
+        ("eval", ["env=memobench", "policy=act", "policy.chunksize=3"], "'policy.chunk_size'"),
+        ("eval", ["env=memobench", "--policy.type=atc"], "'act'"),
+        ("eval", ["env=memobench", "episodes=many"], "a whole number"),
+        ("eval", ["env=memobench", "env.demonstration_prompt=perhaps"], "true or false"),
+        ("eval", ["env=memobench", "env.demonstration_prompt=null"], "true or false"),
+        ("eval", ["env=memobench", "policy=act", "policy.dropout=x"], "a number"),
+        ("eval", ["env=memobench", "policy=act", "align=semantic"], "ACTConfig"),
+        ("eval", ["env=memobench", "align=semantic"], "policy="),
+        ("eval", ["policy=act", "env.horizon=3"], "needs env="),
+        ("eval", ["env=memobench", "policy=./nowhere"], "does not exist"),
+        ("eval", ["env=memobench", "policy=folder"], "no config.json"),
+        ("eval", ["env=memobench", "env.horizon.x=1"], "'env.horizon.x'"),
+        ("eval", ["env=memobench", "policy=act", "policy.type.x=1"], "'policy.type.x'"),
+        ("eval", ["env=memobench", "rename_map.a=b"], """rename_map='{"a": …}'"""),
+        ("eval", ["env=memobench", "rename_map={"], "a mapping"),
+        ("eval", ["env=memobench", "rename_map=a"], "a mapping"),
+        ("eval", ["env=memobench", "eval=3"], "eval.n_episodes="),
+        ("eval", ["policy=act", "policy.discover_packages_path=not_here"], "not_here"),
+        ("eval", ["--config_path=x.yaml"], "x.yaml: there is no such file"),
+        ("eval", ["--config_path=list.yaml"], "a mapping"),
+        ("eval", ["--config_path=broken.yaml"], "neither YAML nor JSON"),
+        ("eval", ["--config_path=number.yaml"], "expected a name"),
+        ("train", ["policy=act", "optimizer.lr=1e-3"], "needs optimizer="),
+        *(("train", ["policy=act", f"dataset={name}"], "no such folder") for name in ("./nowhere", "nowhere", "/a/b")),
+        ("train", ["policy=act", "job_name=include x"], "include"),
     ],
 )
-def test_what_is_unknown_is_named_with_what_is_near(words: list[str], message: str) -> None:
+def test_mistakes_name_the_nearest_setting(command: str, words: list[str], named: str) -> None:
+    Path("folder").mkdir()
+    Path("list.yaml").write_text("[1]")
+    Path("broken.yaml").write_text("a: {")
+    Path("number.yaml").write_text("policy: {type: 3}")
     with pytest.raises(MemobenchError) as caught:
-        evaluated(*words)
-    assert message in str(caught.value)
+        _ = read_arguments(command, split_arguments(words)).for_parser
+    assert named in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_that_is_no_checkpoint_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MemobenchError, match=r"no checkpoint \(no config.json\)"):
-        evaluated("env=memobench", f"policy={tmp_path}")
+def test_recipes_go_by_name_and_files_by_path() -> None:
+    Path("train_paper").write_text("steps: 1")
+    assert recipe_file("train_paper") == recipes()["train_paper"]
+    assert recipe_file("./train_paper") == Path("train_paper")
+    for name in ("train_papr", "nowhere.yaml"):
+        with pytest.raises(MemobenchError, match=name):
+            recipe_file(name)
 
 
-@pytest.mark.parametrize("name", ["./nowhere", "nowhere", "/a/b", "a/b/c"])
-def test_a_dataset_that_can_only_be_a_folder_must_be_there(name: str) -> None:
-    with pytest.raises(MemobenchError, match="no such folder"):
-        trained("policy=act", f"dataset={name}")
+def test_arguments_are_added_and_replaced() -> None:
+    given = LerobotArguments({"seed": "3", "x": None})
+    assert given.default("seed", 7).default("env.expert_action", True).for_parser == (
+        *("--env.expert_action=true", "--seed=3", "--x"),
+    )
+    assert given.changed("seed", 5).without("x").for_parser == ("--seed=5",)
+    assert (given.has("x"), given.get("x"), given.has("y")) == (True, None, False)
 
 
-def test_a_config_file_may_hold_the_choices() -> None:
-    file = {"policy": {"type": "memobench_mem"}, "env": {"type": "memobench"}}
-    settings = translate("train", split_arguments(["align=semantic", "env.horizon=3"]), TrainPipelineConfig, file)
-    assert list(settings.flags) == ["--policy.align=semantic", "--env.horizon=3"]
+def test_a_value_may_be_null_only_where_the_type_allows() -> None:
+    for annotation in (bool, int, float):
+        for text in ("null", "none", "~"):
+            with pytest.raises(MemobenchError, match=f"key={text}"):
+                checked_value("key", annotation, text)
+            assert checked_value("key", annotation | None, text) == "null"
+    assert checked_value("key", dict[str, bool], "{content: false}") == '{"content": false}'
 
 
-def test_a_command_without_a_configuration_takes_any_key() -> None:
-    assert list(translate("dataset-viz", split_arguments(["repo-id=a/b"]), None, {}).flags) == ["--repo-id=a/b"]
+NAMES = ("run #2", "2026-11-28", "007", "on", "run: 2", "obj [v2]", "1e3", "NaN", "!x", "'a'", " x ", "é", "included")
 
 
-def test_what_is_added_never_overrides() -> None:
-    given = LerobotArguments(("--seed=3",))
-    settings = given.default("seed", 7).default("env.expert_action", True)
-    assert list(settings.flags) == ["--seed=3", "--env.expert_action=true"]
-    assert list(given.flags) == ["--seed=3"]
-
-
-def test_what_is_changed_replaces() -> None:
-    assert list(LerobotArguments(("--seed=3", "--x=1")).changed("seed", 5).flags) == ["--x=1", "--seed=5"]
-
-
-STRICT, PUBLISHED = "open_and_close_the_microwave_a_given_number_of_times", "open_and_close_the_microwave"
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["env=memobench", "suite=strict"],
-        ["env=memobench", "suite=strict", f"tasks={STRICT},spatial"],
-        ["--env.type=memobench", "--env.suite=strict", f"--env.tasks={STRICT}"],
-        ["env=memobench", f"tasks={PUBLISHED}"],
-        ["env=memobench", "--config_path=settings.yaml", f"tasks={STRICT}"],
-    ],
-)
-def test_tasks_of_the_suite_are_known(words: list[str]) -> None:
-    check_task_names(split_arguments(words))
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["env=memobench", f"tasks={STRICT}"], "task of the strict suite; set suite=strict"),
-        (["env=memobench", "suite=strict", f"tasks={PUBLISHED}"], "task of the published suite"),
-        (["env=memobench", "suite=strikt"], "suite is 'strikt'; did you mean 'strict'"),
-    ],
-)
-def test_others_are_refused_in_a_sentence(words: list[str], said: str) -> None:
-    with pytest.raises(MemobenchError) as error:
-        check_task_names(split_arguments(words))
-    assert said in str(error.value)
-
-
-def test_every_command_of_lerobot_is_there() -> None:
-    assert {"train", "eval", "record", "dataset-viz", "edit-dataset", "info"} <= set(lerobot_commands())
-
-
-def test_their_configurations_are_found() -> None:
-    assert config_class(lerobot.scripts.lerobot_eval.main) is EvalPipelineConfig
-    assert config_class(lerobot.scripts.lerobot_train.main) is TrainPipelineConfig
-
-
-@pytest.mark.parametrize("chosen", [None, "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"])
-def test_torch_waits_briefly_in_evaluations_unless_told_otherwise(
-    chosen: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = {"HOME": "/nowhere"} | ({chosen: "ACTIVE"} if chosen else {})
-    monkeypatch.setattr(os, "environ", dict(before))
-    load_command("train")
-    assert os.environ.get("GOMP_SPINCOUNT") == before.get("GOMP_SPINCOUNT")
-    load_command("eval")
-    assert os.environ.get("GOMP_SPINCOUNT") == (before.get("GOMP_SPINCOUNT") if chosen else "2000")
-    assert os.environ.get("OMP_WAIT_POLICY") == before.get("OMP_WAIT_POLICY")
-
-
-def test_a_mapping_is_handed_on_as_lerobot_reads_it_beside_a_checkpoint() -> None:
-    assert checked_value("policy.memory_settings", dict[str, bool], "{content: false}") == '{"content": false}'
-
-
-@pytest.mark.parametrize(
-    ("key", "annotation"), [("demonstration_prompt", bool), ("horizon", int), ("resume", bool), ("lr", float)]
-)
-@pytest.mark.parametrize("text", ["null", "none", "~"])
-def test_what_must_have_a_value_is_not_nothing(key: str, annotation: type, text: str) -> None:
-    with pytest.raises(MemobenchError, match=f"{key}={text}: expected"):
-        checked_value(key, annotation, text)
-    assert checked_value(key, annotation | None, text) == "null"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["env=memobench", "env.horizon.x=1"], "no setting 'env.horizon.x'"),
-        (["env=memobench", "policy=act", "policy.type.x=1"], "no setting 'policy.type.x'"),
-        (["env=memobench", "rename_map.a=b"], """say rename_map='{"a": …}'"""),
-        (["env=memobench", "rename_map={"], "rename_map={: expected a mapping"),
-        (["env=memobench", "rename_map=a"], "rename_map=a: expected a mapping"),
-        (["env="], "env= is empty; expected a name"),
-        (["env=memobench", "eval=3"], "eval=3: eval holds settings; expected one of them, such as eval.n_episodes="),
-    ],
-)
-def test_sections_and_mappings_are_told(words: list[str], said: str) -> None:
-    with pytest.raises(MemobenchError) as error:
-        read_arguments("eval", split_arguments(words))
-    assert said in str(error.value)
+def test_names_reach_lerobot_as_they_are_typed() -> None:
+    """LeRobot's commands parse them by YAML, and the settings of a checkpoint's policy by JSON."""
+    for name in NAMES:
+        Path(name).mkdir()
+        line = ["policy=memobench_small", f"dataset={name}", f"output_dir={name}", f"policy.repo_id=user/{name}"]
+        arguments = read_arguments("train", split_arguments(line))
+        flags = [flag for flag in arguments.for_parser if "policy" not in flag]
+        trained = draccus.parse(TrainPipelineConfig, args=flags)
+        assert (trained.output_dir, Path(trained.dataset.root or "")) == (Path(name), Path(name))
+        assert trained.dataset.repo_id == f"local/{name}"
+    policy: Any = policy_config(arguments)
+    assert policy.repo_id == f"user/{name}"

@@ -19,24 +19,19 @@ from lerobot_memobench.evaluation.html.data import page_data
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.policies.memory_reads import Chunk, EpisodeReads, ReadLog, find_reads, reads_file, write_reads
-from lerobot_memobench.run.merging import merge
 from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.shards import plan_shards
+from lerobot_memobench.run.shards import merge
 from tests.support.logs import record
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 MILK = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
-LINE = ["env=memobench", f"tasks={TASK}", "episodes=2", "batch_size=1", "memory_reads=true", "policy=memobench_small"]
 
 
 class Policy:
-    """A policy that tells what it is made to."""
+    """A policy with given memory reads."""
 
     def __init__(self, *rows: list[Chunk]) -> None:
         self.rows, self.watched = [*rows], False
-
-    def check_memory_reads(self) -> None:
-        """It always tells."""
 
     def watch_memory(self, watched: bool = True) -> None:
         self.watched = watched
@@ -61,15 +56,15 @@ def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
         assert not (tmp_path / "memory_reads").exists()
         ended(np.array([True, True, False]))
         assert steps_of(tmp_path, 0) == [0, 1]
-        policy.rows = [chunks, chunks, chunks]  # what a row does that is over is no part of its episode
+        policy.rows = [chunks, chunks, chunks]  # reads of a finished row are not part of its episode
         ended(np.array([True, True, False]))
     assert not policy.watched
     assert steps_of(tmp_path, 0) == [0, 1]
-    assert steps_of(tmp_path, 1) is None  # a logged episode rests and plans nothing
+    assert steps_of(tmp_path, 1) is None  # a logged episode plans no chunk
     assert steps_of(tmp_path, 2) == [0, 1, 2]
 
 
-def test_a_rollout_that_breaks_off_leaves_only_whole_episodes(tmp_path: Path) -> None:
+def test_a_rollout_that_fails_writes_no_part_of_an_episode(tmp_path: Path) -> None:
     policy: Any = Policy([{"step": 0, "entries": [0], "weights": [1.0]}])
     with pytest.raises(ZeroDivisionError), ReadLog(tmp_path, 7, "fixed").noting("a_task", policy, [7]):
         raise ZeroDivisionError
@@ -77,8 +72,8 @@ def test_a_rollout_that_breaks_off_leaves_only_whole_episodes(tmp_path: Path) ->
     assert not reads_file(tmp_path, "a_task", 0).exists()
 
 
-def test_reads_of_evidence_stand_at_their_own_episode(tmp_path: Path) -> None:
-    """Four episodes of two scenes, in two parts, of which the second goes on after its first episode."""
+def test_reads_of_evidence_belong_to_their_episode(tmp_path: Path) -> None:
+    """Four episodes of two scenes, in two parts; the second part is resumed after its first episode."""
     for part, number in (("a", 0), ("a", 1), ("b", 2), ("b", 3)):
         env = gym.vector.SyncVectorEnv([partial(evidence, tmp_path / part)])
         policy: Any = Policy([{"step": 0, "entries": [0], "weights": [number / 10]}])
@@ -113,20 +108,11 @@ def evidence(folder: Path) -> MemobenchEnv:
     )
 
 
-def test_it_is_asked_of_a_policy_with_a_memory() -> None:
-    assert plan_line(LINE).options.memory_reads
-    assert not plan_line([word for word in LINE if "reads" not in word]).options.memory_reads
-    for policy, told in (("memobench_small_memoryless", "memory=none"), ("memobench_random", "memobench_random")):
-        with pytest.raises(MemobenchError, match=f"memory_reads=true .*{told}"):
-            plan_line([*LINE[:-1], f"policy={policy}"])
-    with pytest.raises(MemobenchError, match="memory_reads=yes: expected true or false"):
-        plan_line([*LINE[:-2], "memory_reads=yes"])
-
-
-def test_parts_are_asked_for_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    jobs = plan_shards(plan_line([*LINE, "shards=2", "output_dir=out"]), ("program",), print)
-    assert ["memory_reads=true" in job.arguments for job in jobs] == [True, True]
+def test_memory_reads_need_a_policy_with_a_memory() -> None:
+    line = ["env=memobench", f"tasks={TASK}", "episodes=2", "batch_size=1", "memory_reads=true"]
+    assert plan_line([*line, "policy=memobench_small"]).options.memory_reads
+    with pytest.raises(MemobenchError, match="memory=none"):
+        plan_line([*line, "policy=memobench_small_memoryless"])
 
 
 # --- files on the report's timeline ---
@@ -144,12 +130,12 @@ def found_of(folder: Path, protocol: dict[str, Any] | None = None, **changes: An
     return chunks.get(1), notes
 
 
-def test_what_was_read_is_found_on_the_timeline(tmp_path: Path) -> None:
+def test_reads_are_placed_on_the_timeline(tmp_path: Path) -> None:
     write_reads(reads_file(tmp_path, "a_task", 0), READS)
     found, notes = found_of(tmp_path)
     rounded = {"step": 5, "entries": [-1, 0, 4], "weights": [0.25, 0.1235, 0.5]}
     assert (found, notes) == ([rounded, CHUNKS[1]], [])
-    # The policy began to count behind the prompt that it did not see; a strict task's clock counts it all the same.
+    # The policy began to count after the prompt; the clock of a strict task counts the prompt.
     found, _ = found_of(tmp_path, {"prompt_in": "reset"})
     assert [chunk["step"] for chunk in found] == [8, 12]
     assert found[0]["entries"] == [-1, 3, 7]
@@ -158,7 +144,7 @@ def test_what_was_read_is_found_on_the_timeline(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "named"),
     [
         ({"seed": 8}, "not of the rollout"),
         ({"referent": "fixed"}, "not of the rollout"),
@@ -168,12 +154,11 @@ def test_what_was_read_is_found_on_the_timeline(tmp_path: Path) -> None:
         ({"chunks": [{"step": "5", "entries": [], "weights": []}]}, "expected an integer"),
     ],
 )
-def test_another_rollouts_file_is_left_out_and_told(tmp_path: Path, changes: dict[str, Any], told: str) -> None:
+def test_the_file_of_another_rollout_is_left_out(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
     write_reads(reads_file(tmp_path, "a_task", 0), READS | changes)
     found, (note,) = found_of(tmp_path)
     assert found is None
-    assert note.startswith("1 file of memory_reads left out, the first because ")
-    assert told in note
+    assert named in note
 
 
 @pytest.mark.parametrize(
@@ -181,7 +166,7 @@ def test_another_rollouts_file_is_left_out_and_told(tmp_path: Path, changes: dic
     [b"", b"no gzip", gzip.compress(b"{}")[:-4], gzip.compress(b"[1]")],
     ids=["empty", "plain", "cut off", "a list"],
 )
-def test_a_damaged_file_is_left_out_and_told(tmp_path: Path, content: bytes) -> None:
+def test_a_damaged_file_is_left_out_with_a_note(tmp_path: Path, content: bytes) -> None:
     path = reads_file(tmp_path, "a_task", 0)
     path.parent.mkdir()
     path.write_bytes(content)

@@ -1,9 +1,12 @@
-"""The loop over steps that spares pictures: the same episodes as LeRobot's, action for action, with fewer pictures."""
+"""The rollout loop: LeRobot's episodes, action for action, with fewer pictures; and the seeds of batches."""
 
 from __future__ import annotations
 
+import pkgutil
+import random
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval
 from numpy.typing import NDArray
 
+from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs import episode
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
@@ -22,7 +26,17 @@ from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memory_reads import ReadLog, find_reads
-from lerobot_memobench.run.rollout import Actor, roll
+from lerobot_memobench.run import rollout as rollouts
+from lerobot_memobench.run.rollout import (
+    KNOWN,
+    Actor,
+    BatchSeeds,
+    batch_seed,
+    digest,
+    has_planned_action,
+    needs_observation,
+    roll,
+)
 from lerobot_memobench.sim.object_layout import SIZE
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -120,8 +134,6 @@ FIRST, LAST = PROMPT, PROMPT + HORIZON
 WITHOUT = {key: value for key, value in MEMORY.items() if not key.startswith("memory_")} | {"memory": "none"}
 CASES: dict[str, tuple[str, dict[str, Any], list[int]]] = {
     "expert": ("memobench_expert", {}, [0, FIRST, LAST]),
-    "random": ("memobench_random", {}, [0, FIRST, LAST]),
-    "memory": ("memobench_mem", MEMORY, list(range(LAST + 1))),
     "memory of every fourth": ("memobench_mem", {**MEMORY, "memory_stride": 4}, [0, 4, FIRST, 8, 10, 12, 14, LAST]),
     "no memory": ("memobench_mem", WITHOUT, [0, FIRST, 10, 14, LAST]),
 }
@@ -131,10 +143,10 @@ def logged(folder: Path) -> list[dict[str, Any]]:
     return [{key: value for key, value in line.items() if key != "wall_s"} for line in read_episodes(folder)]
 
 
-@pytest.mark.parametrize("rows", [pytest.param(1, marks=pytest.mark.slow), 2])
 @pytest.mark.parametrize("case", [*CASES, "act"])
-def test_a_rollout_is_lerobots(case: str, rows: int, drawn: list[int], tmp_path: Path) -> None:
+def test_a_rollout_equals_lerobots(case: str, drawn: list[int], tmp_path: Path) -> None:
     name, fields, looked = CASES.get(case, ("act", ACT, []))
+    rows = 2
     theirs = rolled(True, rows, tmp_path / "theirs", name, **fields)
     everything = len(drawn)
     drawn.clear()
@@ -146,7 +158,7 @@ def test_a_rollout_is_lerobots(case: str, rows: int, drawn: list[int], tmp_path:
     assert logged(tmp_path / "ours") == logged(tmp_path / "theirs")
     if case in CASES:
         assert sorted(drawn) == sorted(rows * looked)
-    else:  # whether it sees the prompt is the environment's to say
+    else:  # the environment decides whether it observes the prompt
         assert len(drawn) < everything
 
 
@@ -171,13 +183,12 @@ DIFFUSION |= {"diffusion_step_embed_dim": 16, "crop_shape": (84, 84), "pretraine
 @pytest.mark.parametrize(
     ("name", "fields", "spares", "obs_type"),
     [
-        ("act", ACT, True, BOTH),
         ("diffusion", DIFFUSION, False, OBJECTS),
         ("memobench_expert", {}, True, OBJECTS),
         ("memobench_random", {}, True, BOTH),
     ],
 )
-def test_a_rollout_on_objects_is_lerobots(
+def test_a_rollout_on_objects_equals_lerobots(
     name: str, fields: dict[str, Any], spares: bool, obs_type: str, drawn: list[int], found: list[int], tmp_path: Path
 ) -> None:
     theirs = rolled(True, 2, tmp_path / "theirs", name, obs_type=obs_type, **fields)
@@ -191,14 +202,14 @@ def test_a_rollout_on_objects_is_lerobots(
     assert (len(found) < everything) == spares
 
 
-def test_a_memory_of_pictures_refuses_to_be_shown_objects_alone(tmp_path: Path) -> None:
-    with pytest.raises(MemobenchError, match=r"no picture, .* set env.obs_type=pixels_agent_pos, or"):
+def test_a_memory_of_pictures_refuses_objects_alone(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match=r"env\.obs_type=pixels_agent_pos"):
         rolled(False, 1, tmp_path, "memobench_mem", obs_type=OBJECTS, **MEMORY)
 
 
 @pytest.mark.parametrize("use_async", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> None:
-    """By the word of a vector environment, in this process or in workers, until the next reset."""
+def test_unneeded_pictures_are_not_drawn(use_async: bool, tmp_path: Path) -> None:
+    """A call of the vector environment, in this process or in workers, lasts until the next reset."""
     config = MemobenchEnvConfig(tasks=HIGHLIGHT, demonstration_prompt=False, render="fast", log_dir=str(tmp_path))
     ((env,),) = (suite.values() for suite in config.create_envs(2, use_async).values())
     move = np.full((2, 7), 0.7, np.float32)
@@ -216,30 +227,20 @@ def test_what_nobody_watches_is_not_drawn(use_async: bool, tmp_path: Path) -> No
         env.close()
 
 
-def test_a_recorded_episode_is_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
-    """Two of three episodes are recorded, whoever needs frames."""
+def test_recorded_episodes_are_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
+    """One of two episodes is recorded; of the other the needed pictures are drawn."""
     from lerobot_memobench.envs.video import LAST_FRAMES
     from lerobot_memobench.evaluation.html.write import frame_count
 
-    rolled(False, 3, tmp_path, "memobench_random", videos=2)
-    recorded = sorted((tmp_path / "videos").iterdir())
-    assert [video.name for video in recorded] == [f"{HIGHLIGHT}.0.mp4", f"{HIGHLIGHT}.1.mp4"]
-    assert {frame_count(video) for video in recorded} == {LAST + 1 + LAST_FRAMES}
-    assert len(drawn) == 2 * (LAST + 1) + 3
-
-
-def test_the_command_draws_and_records_no_more_than_asked(drawn: list[int], tmp_path: Path) -> None:
-    from lerobot_memobench.cli.lerobot import main
-
     words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "env.render=fast", "videos=1"]
     assert main(["eval", "env=memobench", *words, f"output_dir={tmp_path}"]) == 0
-    assert [path.relative_to(tmp_path / "videos") for path in (tmp_path / "videos").rglob("*")] == [
-        Path(f"{HIGHLIGHT}.0.mp4")
-    ]
+    (recorded,) = (tmp_path / "videos").rglob("*")
+    assert recorded.name == f"{HIGHLIGHT}.0.mp4"
+    assert frame_count(recorded) == LAST + 1 + LAST_FRAMES
     assert len(drawn) == LAST + 1 + 3
 
 
-def test_what_chunks_read_is_noted_as_each_episode_ends(tmp_path: Path) -> None:
+def test_memory_reads_are_written_as_episodes_end(tmp_path: Path) -> None:
     name, fields, _ = CASES["memory of every fourth"]
     plain = rolled(False, 2, tmp_path / "plain", name, **fields)
     noted = rolled(False, 2, tmp_path / "noted", name, reads=ReadLog(tmp_path / "noted", 7, "fixed"), **fields)
@@ -257,19 +258,79 @@ def test_what_chunks_read_is_noted_as_each_episode_ends(tmp_path: Path) -> None:
     assert not (tmp_path / "plain" / "memory_reads").exists()
 
 
-def test_the_default_batch_of_an_object_policy_changes_no_episode(tmp_path: Path) -> None:
-    """Ten rows in one process by default, or as many as there are episodes; each row acts as it would alone."""
-    from lerobot_memobench.cli.lerobot import main
-
-    words = ["policy=memobench_small", f"tasks={STOVE},{HIGHLIGHT}", "episodes=2", "horizon=80", "device=cpu"]
-    for name, more in (("default", []), ("alone", ["batch_size=1"])):
+def test_the_batch_size_of_an_object_policy_changes_no_episode(tmp_path: Path) -> None:
+    """One process with a row per episode, by default; each row acts as it would alone."""
+    words = ["policy=memobench_small", f"tasks={STOVE}", "episodes=2", "horizon=60", "device=cpu"]
+    found = []
+    for name, more, size in (("default", [], 2), ("alone", ["batch_size=1"], 1)):
         assert main(["eval", "env=memobench", *words, *more, f"output_dir={tmp_path / name}"]) == 0
-    sizes = [read_evaluation(tmp_path / name)["runs"][0]["batch_size"] for name in ("default", "alone")]
-    assert sizes == [2, 1]
-    own = {"wall_s", "run"}
-    default, alone = (
-        [{key: value for key, value in line.items() if key not in own} for line in read_episodes(tmp_path / name)]
-        for name in ("default", "alone")
-    )
-    assert default == alone
-    assert len(default) == 4
+        assert read_evaluation(tmp_path / name)["runs"][0]["batch_size"] == size
+        lines = read_episodes(tmp_path / name)
+        found.append([{key: value for key, value in line.items() if key not in ("wall_s", "run")} for line in lines])
+    assert len(found[0]) == 2
+    assert found[0] == found[1]
+
+
+# --- LeRobot's functions that the loop was written for ---
+
+READ = {
+    "lerobot.envs.utils.preprocess_observation": ("10196a71b8af",),
+    **{f"{module}.{name}.select_action": policy.read for (module, name), policy in KNOWN.items()},
+    "lerobot.policies.smolvla.modeling_smolvla.SmolVLAPolicy._prepare_batch": ("57d81cd4cddd",),
+}
+"""Function -> first digits of the hash of its source in LeRobot 0.6.1, and in its main where they differ."""
+
+
+@pytest.mark.parametrize("function", READ)
+def test_lerobots_functions_have_not_changed(function: str) -> None:
+    found = digest(pkgutil.resolve_name(function))
+    assert found in READ[function], f"{function} has changed ({found}): compare run/rollout.py, then note its hash"
+
+
+@pytest.mark.parametrize("read", [True, False])
+def test_a_changed_policy_needs_every_observation(read: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    policy = ACTPolicy.__new__(ACTPolicy)
+    vars(policy).update(config=SimpleNamespace(temporal_ensemble_coeff=None), _action_queue=[1])
+    if not read:
+        monkeypatch.setattr(rollouts, "digest", lambda function: "another")
+    assert (needs_observation(policy)(), has_planned_action(policy)()) == (not read, read)
+    pi05 = KNOWN["lerobot.policies.pi05.modeling_pi05", "PI05Policy"]
+    for memory in (False, True):  # a visual memory takes in a picture at every step
+        acting = SimpleNamespace(config=SimpleNamespace(use_visual_memory=memory), _action_queue=[1])
+        assert pi05.planned(acting) is not memory
+
+
+# --- seeds ---
+
+
+def draws(first: int, history: int = 0, seed: int = 7, own: int = 0) -> list[float]:
+    """Random numbers of a policy in the batch that starts at ``first``, after a history of other draws."""
+    policy = SimpleNamespace(name="diffusion", _generator=torch.Generator().manual_seed(own))
+    seeds = BatchSeeds(policy, seed)
+    torch.manual_seed(7)
+    torch.rand(history)
+    for k in range(3 if history else 0):
+        seeds.begin("a_task", 100 + k)
+        torch.rand(1, generator=policy._generator)
+    seeds.begin("a_task", first)
+    return [
+        torch.rand(1).item(),
+        random.random(),
+        np.random.rand(),  # noqa: NPY002 - LeRobot seeds it
+        torch.rand(1, generator=policy._generator).item(),
+    ]
+
+
+def test_draws_depend_on_the_batch_alone() -> None:
+    assert draws(27) == draws(27, history=5)
+    assert all(a != b for a, b in zip(draws(27), draws(28), strict=True))
+    assert all(a != b for a, b in zip(draws(27), draws(27, seed=8), strict=True))
+    assert draws(27, own=1)[3] == draws(27, own=1, history=5)[3] != draws(27, own=2)[3]
+    torch.manual_seed(7)
+    BatchSeeds(SimpleNamespace(name="memobench_mem"), 7).begin("a_task", 9)  # it seeds its noise itself
+    assert torch.initial_seed() == 7
+    seeds = {batch_seed(7, task, first) for task in ("a", "b") for first in range(500)}
+    assert len(seeds) == 1000
+    assert all(0 <= seed < 2**32 for seed in seeds)

@@ -1,4 +1,4 @@
-"""What the commands share: where they print, how far a run is, a failure in one sentence, whose tasks and scenes."""
+"""Output shared by the commands: tables, progress, errors; and their common options."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, PUBLISHED, STRICT
 USAGE_ERROR = 2
 
 WITH_PARENT = "--with-parent"
-"""First argument of a process of `lerobot` that is to end when its standard input closes: whoever wanted it is gone."""
+"""First argument of a `lerobot` process that ends when its standard input closes, with the process that started it."""
 
-#: Columns when the output is no terminal: task names are long, and a log file has no edge.
+#: Columns when the output is not a terminal: task names are long, and a log file has no edge.
 WIDTH_OF_A_FILE = 140
 
-#: Seconds of a run that say how fast it goes on: some tasks take several times as long as others.
+#: Seconds over which the speed of a run is averaged: some tasks take several times as long as others.
 SPEED_PERIOD = 600.0
 
 
 class Suite(StrEnum):
-    """Which thirty tasks are meant."""
+    """The suite: one set of thirty tasks."""
 
     PUBLISHED = PUBLISHED
     STRICT = STRICT
 
 
 class World(StrEnum):
-    """Which scenes are meant."""
+    """The world: one set of scenes."""
 
     MEMOBENCH = MEMOBENCH
     LIBERO = LIBERO
@@ -69,7 +69,7 @@ OfSuite = Annotated[
 def console() -> Console:
     """Return a console as wide as the terminal, or wide enough for the tables where there is none.
 
-    What stands in brackets is printed as it is: most of it comes out of files.
+    It prints brackets as they are, since texts come from files.
     """
     return Console(width=None if sys.stdout.isatty() else WIDTH_OF_A_FILE, highlight=False, markup=False)
 
@@ -79,25 +79,24 @@ def say(text: object) -> None:
     console().print(str(text), soft_wrap=True)
 
 
-def tell(text: str) -> None:
-    """Tell the user on stderr what may matter and stops nothing."""
+def note(text: str) -> None:
+    """Print a message on stderr."""
     print(text, file=sys.stderr)
 
 
 class Count:
-    """How far a run is: a bar on a terminal, a line for each piece of work in a file, both with the time left."""
+    """Progress of a run: a bar on a terminal, a line for each piece of work in a file, both with the time left."""
 
     def __init__(self, progress: Progress, unit: str, total: int | None) -> None:
         self._progress, self._bar = progress, progress.add_task(unit, total=total)
 
     def __call__(self, done: int, total: int, what: str = "", *, trouble: str | None = None, found: int = 0) -> None:
-        """Say that ``done`` of ``total`` are done.
+        """Show that ``done`` of ``total`` pieces of work are done.
 
         Args:
-            done, total: pieces of work.
-            what: the newest one; "" prints nothing.
-            trouble: what is wrong with it, printed on a terminal as well.
-            found: how many of those done are an earlier run's: they say nothing about the speed of this one.
+            what: name of the newest piece; "" prints no line.
+            trouble: its failure, printed on a terminal as well.
+            found: pieces that an earlier run has done; they are left out of the speed.
         """
         if done <= found:
             self._progress.reset(self._bar, total=total, completed=done)
@@ -110,7 +109,7 @@ class Count:
             return
         elif done <= found:
             if done == found:
-                screen.print(f"{found}/{total} are there already")
+                screen.print(f"{found}/{total} were done earlier")
         else:
             screen.print(f"{done}/{total} {what}{self._left()}", soft_wrap=True, markup=False)
 
@@ -121,7 +120,7 @@ class Count:
 
 @contextmanager
 def counting(screen: Console, unit: str, total: int | None = None) -> Iterator[Count]:
-    """Show how far a run is while the context lasts; what it yields is told of every piece of work."""
+    """Show the progress of a run; call the yielded `Count` after every piece of work."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     quiet = not screen.is_terminal
     with Progress(*columns, console=screen, disable=quiet, speed_estimate_period=SPEED_PERIOD) as progress:
@@ -129,13 +128,9 @@ def counting(screen: Console, unit: str, total: int | None = None) -> Iterator[C
 
 
 BACKBONE = "policy.pretrained_backbone_weights"
-"""Where LeRobot's policies with a backbone of torchvision's, such as act and diffusion, name its weights."""
+"""The weights of the torchvision backbone in LeRobot's policies such as act and diffusion."""
 FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)
-"""What torch raises where it cannot fetch weights."""
-
-
-AT_A_PROMPT = "EOF when reading a line"
-"""Python's message where Ctrl-D is typed at a prompt; the end of a file or of a pipe is an `EOFError` too."""
+"""Errors of torch where it cannot fetch weights."""
 
 
 def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str) -> int:
@@ -145,11 +140,11 @@ def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str
 
 
 def run_command(call: Callable[[], object], program: str, again: str) -> int:
-    """Run a command; return the exit status. Errors a user can mend are one sentence on stderr, status 2.
+    """Run a command; return the exit status. A user's mistake is one line on stderr, status 2.
 
     Args:
         program: as it is typed, such as ``memobench``.
-        again: how to go on, said when SIGTERM ends it or a worker process is killed.
+        again: how to resume, printed when SIGTERM ends it or a worker process is killed.
     """
     try:
         with saying_how_to_go_on(program, lambda: again):
@@ -159,8 +154,6 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
     except typer.Exit as stop:
         return stop.exit_code
     except Exception as error:
-        if isinstance(error, EOFError) and str(error) == AT_A_PROMPT:
-            return 130
         message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
         if message is not None and type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
             print(message())
@@ -174,7 +167,7 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
 
 
 def one_sentence(error: BaseException) -> str | None:
-    """Return what to tell the user in one line, or None for a failure that needs its traceback."""
+    """Return the message for the user in one line, or None for a failure that needs its traceback."""
     errors = list(chain(error))
     for found in errors:
         if isinstance(found, MemobenchError):
@@ -182,7 +175,7 @@ def one_sentence(error: BaseException) -> str | None:
     from draccus.utils import ParsingError
 
     if isinstance(errors[0], ParsingError):
-        # draccus hides what a configuration's own check says behind "couldn't instantiate".
+        # draccus hides the message of a configuration's own check behind "couldn't instantiate".
         return _line(next((e for e in reversed(errors) if isinstance(e, ValueError | TypeError)), errors[0]))
     if isinstance(errors[0], ImportError) and "required but not installed" in str(errors[0]):
         return _line(errors[0])  # LeRobot's own words for a missing extra
@@ -191,33 +184,33 @@ def one_sentence(error: BaseException) -> str | None:
     refusal = disk_refusal(error)
     if refusal is not None:
         named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)
-        where = f" {os.fsdecode(named)}" if isinstance(named, str | bytes) else ""
-        return f"the disk does not take{where or ' what is written'} ({refusal}): make room, or name another folder"
+        where = f"{os.fsdecode(named)} " if isinstance(named, str | bytes) else ""
+        return f"{where}cannot be written ({refusal}): make room, or name another folder"
     fetched = next((found for found in errors if isinstance(found, FETCHING)), None)
     if fetched is not None and _came_through(fetched, "torch.hub"):
         return (
             "the pretrained weights of a backbone are not on this machine and could not be fetched "
             f"({_line(fetched)[:200]}); "
-            f"{BACKBONE}=null begins with random ones, a checkpoint brings its own all the same"
+            f"{BACKBONE}=null begins with random ones; a checkpoint replaces them in either case"
         )
     hub = next((found for found in errors if _is_hub_error(found)), None)
-    told = "" if hub is None else f"{_address(errors)}{_line(hub)[:200]}"
-    if hub is not None and any(_came_through(found, "lerobot.datasets.") for found in errors):
+    if hub is None:
+        return None
+    reason = f"{_address(errors)}{_line(hub)[:200]}"
+    if any(_came_through(found, "lerobot.datasets.") for found in errors):
         return (
-            f"the dataset is not on this machine and could not be fetched from the hub ({told}); name a "
-            "folder that is here, dataset=<folder>, or make one: `memobench generate --tasks object --episodes 5 --out "
+            f"the dataset is not on this machine and could not be fetched from the hub ({reason}); name a folder on "
+            "this machine, dataset=<folder>, or make one: `memobench generate --tasks object --episodes 5 --out "
             "outputs/demonstrations`, then dataset=outputs/demonstrations"
         )
-    if hub is not None:
-        return (
-            f"what was asked for is not on this machine and could not be fetched from the hub ({told}); "
-            "name a folder that is here: dataset=<folder> or policy=<folder>"
-        )
-    return None
+    return (
+        f"a repository is not on this machine and could not be fetched from the hub ({reason}); name a folder on this "
+        "machine: dataset=<folder> or policy=<folder>"
+    )
 
 
 def _came_through(error: BaseException, package: str) -> bool:
-    """Whether a module of a package was at work when an error arose."""
+    """Return whether an error passed through a module of a package."""
     frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
     return any(str(frame.f_globals.get("__name__")).startswith(package) for frame in frames)
 
@@ -232,9 +225,9 @@ def _is_hub_error(error: BaseException) -> bool:
 
 
 def _address(errors: Sequence[BaseException]) -> str:
-    """Return what the hub was asked for and a colon, "" where no error tells it: a misspelt folder is seen there."""
+    """Return the address that the hub was asked for and a colon, "" where it is not known. It shows a misspelling."""
     for error in errors:
-        with suppress(AttributeError, RuntimeError):  # others than httpx's, and those before anything was asked
+        with suppress(AttributeError, RuntimeError):  # not an error of httpx, or raised before the request
             return f"{error.request.url}: "  # type: ignore[attr-defined]
         if offline := re.search(r"Cannot reach (\S+): ", str(error)):
             return f"{offline[1]}: "

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Referent(StrEnum):
-    """Who chooses the goal of object and procedural tasks."""
+    """The goals of object and procedural tasks."""
 
     FIXED = "fixed"
     RANDOM = "random"
@@ -48,7 +48,7 @@ def generate(
     image_size: Annotated[int, typer.Option(min=16, help="Height and width of the images, pixels.")] = 256,
     demonstration_prompt: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
     perturb: Annotated[
-        bool, typer.Option("--perturb", help="Move the arm off its way at random; action is what the expert does then.")
+        bool, typer.Option("--perturb", help="Disturb the arm at random; actions are the expert's corrections.")
     ] = False,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
@@ -161,7 +161,7 @@ def convert(
     for note in summary.notes:
         say(f"note: {note}")
     if summary.folder is None:
-        say("no dataset was written: nothing could be used")
+        say("no dataset was written: no demonstration could be used")
     else:
         say(f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}")
     return summary.exit_status

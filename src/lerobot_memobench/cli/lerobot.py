@@ -1,8 +1,7 @@
-"""The command ``lerobot``: ``lerobot <name> key=value …`` runs LeRobot's own ``lerobot-<name>``.
+"""The command ``lerobot``: ``lerobot <name> key=value …`` runs LeRobot's ``lerobot-<name>``.
 
-``key=value`` becomes ``--key=value`` after a check against the command's settings; whatever starts with
-``--`` is passed on untouched. ``lerobot eval env=memobench`` and ``lerobot train policy=…`` also get the
-benchmark's defaults (``run.plan``, ``training.command``).
+``lerobot eval env=memobench`` and ``lerobot train`` check their settings, set the benchmark's defaults and run loops of
+their own (``run.plan``, ``training.command``). For any other command ``key=value`` becomes ``--key=value``.
 """
 
 from __future__ import annotations
@@ -14,26 +13,39 @@ import threading
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from lerobot_memobench.cli.console import WITH_PARENT, run_command, tell
+from lerobot_memobench.cli.console import WITH_PARENT, console, counting, note, run_command, say
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import as_path
+from lerobot_memobench.io import as_path, count_of
+from lerobot_memobench.jobs.processes import saying_how_to_go_on
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 from lerobot_memobench.run.arguments import (
+    CONFIG_FILE,
+    RUN_OPTIONS,
     SHORT_FORMS,
-    check_task_names,
+    Arguments,
+    LerobotArguments,
+    call_lerobot,
     is_of_benchmark,
+    lerobot_commands,
     read_arguments,
     split_arguments,
 )
-from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands
+
+if TYPE_CHECKING:
+    from lerobot_memobench.jobs.processes import Advance
+    from lerobot_memobench.run.plan import EvaluationPlan
+    from lerobot_memobench.run.run import EvaluationReport
+
+SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.lerobot", WITH_PARENT)
+"""Arguments of Python that start the process of one part."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     line = [as_path(word) for word in (sys.argv[1:] if argv is None else argv)]
-    again = f"begin anew with: {shlex.join(['lerobot', *line])}"
-    return run_command(partial(run, line), "lerobot", again)
+    return run_command(partial(run, line), "lerobot", f"start again with: {shlex.join(['lerobot', *line])}")
 
 
 def run(line: Sequence[str]) -> int:
@@ -50,14 +62,12 @@ def run(line: Sequence[str]) -> int:
     if name == "train":
         from lerobot_memobench.training.command import train
 
-        return train(given, line[1:], tell)
-    check_task_names(given)
+        return train(given, line[1:], note)
     if name == "eval":
         use_threads(ACTING)  # before torch is imported
-        from lerobot_memobench.cli.evaluate import evaluate, evaluate_elsewhere
-
-        ours = is_of_benchmark(given) and not given.wants_help
-        return evaluate(given, ("lerobot", *line)) if ours else evaluate_elsewhere(given)
+        if is_of_benchmark(given) and not given.wants_help:
+            return evaluate(given, ("lerobot", *line))
+        return call_lerobot(name, read_other(given).for_parser)
     return call_lerobot(name, read_arguments(name, given).for_parser)
 
 
@@ -72,7 +82,7 @@ def overview(commands: Iterable[str]) -> str:
             "  lerobot train policy=memobench_mem align=contrastive dataset=<folder>",
             "  lerobot train config=train_paper dataset=<folder>            the paper's recipe (memobench recipe)",
             "",
-            "`lerobot eval --help` and `lerobot train --help` explain these short forms; any other setting goes by its",
+            "`lerobot eval --help` and `lerobot train --help` explain these short forms. Every other setting has its",
             "full name (policy.optimizer_lr=1e-4), as listed there.",
             "",
             "commands: " + ", ".join(sorted(commands)),
@@ -80,8 +90,113 @@ def overview(commands: Iterable[str]) -> str:
     )
 
 
+# --- eval ---
+
+
+def evaluate(given: Arguments, command: Sequence[str]) -> int:
+    """Run ``lerobot eval`` on the benchmark.
+
+    Args:
+        command: the whole command line, for the card.
+    """
+    from lerobot_memobench.run.plan import make_plan, take_run_options
+    from lerobot_memobench.run.settings import read_settings
+
+    options, given = take_run_options(given)
+    plan = make_plan(read_settings(given), options, command)
+    with saying_how_to_go_on("lerobot", lambda: f"resume with: {plan.resuming_command}"):
+        return evaluate_in_parts(plan) if options.shards else evaluate_here(plan)
+
+
+def read_other(given: Arguments) -> LerobotArguments:
+    """Return LeRobot's arguments for an evaluation of another environment than the benchmark, checked.
+
+    Raises:
+        MemobenchError: no environment is named, an option is the benchmark's, or the checkpoint is not complete.
+    """
+    from lerobot_memobench.policies.checkpoint import check_checkpoint
+
+    for key, _ in given.pairs:
+        if key in RUN_OPTIONS:
+            raise MemobenchError(f"{key}= belongs to the benchmark: name it with env=memobench")
+    arguments = read_arguments("eval", given)
+    if given.wants_help:
+        return arguments
+    if not arguments.has("env.type") and not arguments.has(CONFIG_FILE):
+        raise MemobenchError("name an environment: env=memobench")
+    if (path := arguments.get("policy.path")) is not None:
+        check_checkpoint(path)
+    return arguments
+
+
+def evaluate_here(plan: EvaluationPlan) -> int:
+    """Run an evaluation, or a part of one, and print its report."""
+    from lerobot_memobench.run.run import run_evaluation
+
+    with counting(console(), "episodes") as count:
+        report = run_evaluation(plan, note, say, count)
+    if report is None:
+        print(f"part {plan.options.shard} holds no episode: there are fewer batches than parts")
+        return 0
+    return print_report(report)
+
+
+def evaluate_in_parts(plan: EvaluationPlan) -> int:
+    """Run all parts of an evaluation as jobs, merge them and print the report; 1 when episodes are missing."""
+    from lerobot_memobench.cli.lerobot import merge_and_print  # Slurm unpickles it; this module may be `__main__`
+    from lerobot_memobench.run.shards import plan_shards, run_shards, slurm_of
+
+    jobs = plan_shards(plan, SHARD_PROGRAM, note)
+    with counting(console(), "parts", len(jobs)) as count:
+
+        def advance(news: Advance) -> None:
+            count(news.done, news.total, news.task_name, found=news.found)
+
+        report = run_shards(plan, jobs, advance, finish=merge_and_print)
+    if report is not None:
+        return print_report(report)
+    say(f"jobs are submitted; the last of them merges the parts in {plan.output.absolute()}")
+    if (slurm := slurm_of(plan)) is not None:
+        say(slurm.summary)
+    return 0
+
+
+def merge_and_print(out: Path, folders: Sequence[Path]) -> int:
+    """Merge parts into ``out`` and print the report; return 1 when episodes that were asked for are missing."""
+    from lerobot_memobench.run.shards import merge_and_report
+
+    return print_report(merge_and_report(out, folders))
+
+
+def print_report(report: EvaluationReport) -> int:
+    """Print a report; return 1 when episodes that were asked for are missing."""
+    from lerobot_memobench.evaluation.headline import headline
+    from lerobot_memobench.evaluation.report import table
+    from lerobot_memobench.evaluation.report_tables import failure_line
+
+    screen, run = console(), report.run
+    screen.print()
+    screen.print(headline([run]), style="bold")
+    screen.print(table(run.summary), crop=False)
+    screen.print(failure_line(run.summary))
+    for line in run.notes:
+        screen.print(f"note: {line}")
+    print(f"report: {report.page}")
+    if not report.absent:
+        return 0
+    task, episode = report.absent[0]
+    say(
+        f"note: missing: {count_of(len(report.absent), 'episode')}, the first is {task}, episode {episode}; run their "
+        "parts with resume=true and merge again"
+    )
+    return 1
+
+
+# --- the process of one part ---
+
+
 def end_with_the_parent() -> None:
-    """End this process when standard input closes: the process that wanted a part of an evaluation is gone."""
+    """End this process when its standard input closes: the process that started it has ended."""
     source = sys.stdin.fileno()
 
     def watch() -> None:

@@ -1,58 +1,234 @@
-"""The command ``memobench``: everything that is not one of LeRobot's own commands.
+"""The command ``memobench``: everything besides LeRobot's own commands.
 
-Options are named as the functions they call name them. Modules that need LeRobot, torch or MuJoCo are
-imported by the commands that use them, so that the others answer at once.
+Options have the names of the functions' parameters. Modules that need LeRobot, torch or MuJoCo are imported by the
+commands that use them, so that the other commands start at once.
 """
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer.core import TyperGroup
+from rich.table import Table
+from rich.text import Text
 
 from lerobot_memobench.cli import data
-from lerobot_memobench.cli.conformance import conformance
-from lerobot_memobench.cli.console import run_app
+from lerobot_memobench.cli.console import Suite, WhichSuite, console, note, run_app, say
 from lerobot_memobench.cli.data import cache, generate
-from lerobot_memobench.cli.doctor import doctor
 from lerobot_memobench.cli.report import compare, merge, report, rerun
-from lerobot_memobench.cli.sealed import test_sealed
-from lerobot_memobench.cli.tasks import objects, recipe, tasks
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import as_path
+from lerobot_memobench.evaluation.tables import Unbroken
+from lerobot_memobench.io import as_path, count_of
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
+from lerobot_memobench.protocol import SEALED
+from lerobot_memobench.tasks.catalogue import (
+    CATALOGUE_DIR,
+    find_tasks,
+    get_task,
+    load_task,
+    task_names,
+    task_number,
+    task_record,
+)
+from lerobot_memobench.tasks.task import PUBLISHED, Task
 
-__all__ = ["app", "main"]
+if TYPE_CHECKING:
+    from lerobot_memobench.doctor.examination import Finding
+
+COLOURS = {
+    **{"ok": "green", "warning": "yellow"},
+    **{"passed": "green", "failed": "red", "no memory": "yellow", "not checked": "yellow"},
+}
+"""Status of the doctor's findings, and outcome of a conformance check -> its colour."""
 
 
-class Grouped(TyperGroup):
-    """Commands listed under what they are for."""
+# --- look around ---
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write one section per panel, in the order of the commands."""
-        found = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        shown = [(name, one) for name, one in found if one is not None and not one.hidden]
-        width, names = formatter.width - 6, max(len(name) for name, _ in shown)
-        for panel in dict.fromkeys(getattr(one, "rich_help_panel", None) for _, one in shown):
-            members = [(name, one) for name, one in shown if getattr(one, "rich_help_panel", None) == panel]
-            with formatter.section(str(panel)):
-                formatter.write_dl(
-                    [(name.ljust(names), one.get_short_help_str(width - names)) for name, one in members]
-                )
 
+def tasks(
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything about each task as JSON.")] = False,
+    suite: WhichSuite = Suite.PUBLISHED,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue."),
+    ] = None,
+) -> int:
+    """List the benchmark's tasks, or those of a folder."""
+    found, problems = load_tasks(folder, suite)
+    if as_json:
+        from lerobot_memobench.sim.simulation import Simulation
+
+        # State sizes come from the compiled models.
+        print(json.dumps([task_record(task, Simulation(task).state_dim) for task in found], indent=1))
+    else:
+        console().print(Unbroken(task_table(found), column=1), crop=False)
+    for problem in problems:
+        note(f"memobench: {problem}")
+    return 1 if problems else 0
+
+
+def load_tasks(folder: Path | None, suite: str = PUBLISHED) -> tuple[list[Task], list[str]]:
+    """Return the tasks of a suite, or those below a folder with the errors of those that cannot be loaded.
+
+    Raises:
+        MemobenchError: there is no task, or none can be loaded.
+    """
+    if folder is None:
+        return [get_task(name) for name in task_names(suite=suite)], []
+    found, problems = [], []
+    for place in find_tasks(folder):
+        try:
+            found.append(load_task(place))
+        except MemobenchError as error:
+            problems.append(str(error))
+    if not found:
+        raise MemobenchError(problems[0])
+    return found, problems
+
+
+def task_table(found: Sequence[Task]) -> Table:
+    """Return one row per task; ``tasks=`` and ``--tasks`` take the numbers, a user's own tasks have none."""
+    suites = {task.suite for task in found}
+    title = count_of(len(found), "task") + (f" of the {suites.pop()} suite" if len(suites) == 1 else "")
+    table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
+    for name in ("no.", "task", "memory type", "checkpoints", "demonstration prompt", "instruction"):
+        table.add_column(name, justify="right" if name == "no." else "left")
+    for k, task in enumerate(found):
+        if k and task.memory_type != found[k - 1].memory_type:
+            table.add_section()
+        prompt = task.prompt.kind if task.prompt else ""
+        number = str(task_number(task.name)) if CATALOGUE_DIR in task.folder.parents else ""
+        table.add_row(number, task.name, task.memory_type, task.operations, prompt, task.title)
+    return table
+
+
+def objects(
+    as_json: Annotated[bool, typer.Option("--json", help="Print slots, fields and classes as JSON.")] = False,
+) -> None:
+    """Print the layout of object observations. Slots, the fields of each, the classes by index."""
+    from lerobot_memobench.sim.object_layout import SLOTS
+    from lerobot_memobench.sim.object_slots import layout
+
+    found = layout()
+    if as_json:
+        print(json.dumps(found, indent=1))
+        return
+    say(f"{SLOTS} slots, one after another; of each:")
+    for field in found["fields"]:
+        say(f"  {field['start']:>2}  {field['name']} ({field['size']})")
+    say("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(found["classes"])))
+
+
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> int:
+    """Check that this machine can run the benchmark. Each problem comes with its fix."""
+    from dataclasses import asdict
+
+    from lerobot_memobench.doctor.examination import examine, exit_status
+
+    findings = examine()
+    if as_json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=1))
+    else:
+        console().print(finding_table(findings))
+    return exit_status(findings)
+
+
+def finding_table(findings: Sequence[Finding]) -> Table:
+    """Return one row per finding, with the fix below the problem."""
+    table = Table(header_style="bold", pad_edge=False, show_lines=False)
+    for name in ("checked", "", "found"):
+        table.add_column(name, overflow="fold")
+    for finding in findings:
+        found = Text(finding.detail)
+        if finding.fix:
+            found.append("\nfix: ", "bold").append(finding.fix)
+        table.add_row(finding.what, Text(finding.status, COLOURS[finding.status]), found)
+    return table
+
+
+# --- train ---
+
+
+def recipe(
+    name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
+) -> int:
+    """Print the file of a training recipe. As in `lerobot-train --config_path=$(memobench recipe train_paper)`."""
+    from lerobot_memobench.run.arguments import recipe_file, recipes
+
+    if name is not None:
+        print(recipe_file(name))
+        return 0
+    table = Table(header_style="bold", pad_edge=False)
+    table.add_column("recipe", no_wrap=True)
+    table.add_column("trains")
+    for key, path in recipes().items():
+        table.add_row(key, path.read_text().splitlines()[0].removeprefix("# "))
+    console().print(table)
+    return 0
+
+
+def conformance(
+    settings: Annotated[
+        list[str],
+        typer.Argument(
+            help="policy=…: a checkpoint folder, a policy of the package or of a plugin, or a type with settings "
+            "policy.x=…; dataset=…: demonstrations as its inputs, made up when left out; obs_type=…",
+            metavar="policy=…",
+        ),
+    ],
+) -> int:
+    """Check the memory of a policy. Rows are independent, reset forgets, the prompt reaches the memory, training has
+    the history of a rollout, and more. Status 1 where a check fails.
+    """
+    from lerobot_memobench.conformance.checks import Outcome, run_checks
+    from lerobot_memobench.conformance.subject import load_subject
+
+    with tempfile.TemporaryDirectory() as folder:
+        subject = load_subject(settings, Path(folder))
+        results = run_checks(subject)
+    table = Table("check", "outcome", "", title=f"Conformance of {subject.name}", title_justify="left")
+    for result in results:
+        table.add_row(result.check, Text(result.outcome, COLOURS[result.outcome]), result.sentence)
+    console().print(table)
+    failed = [result.check for result in results if result.outcome is Outcome.FAILED]
+    say(f"failed: {', '.join(failed)}" if failed else "No check failed.")
+    return 1 if failed else 0
+
+
+# --- results ---
+
+
+def test_sealed(
+    settings: Annotated[
+        list[str],
+        typer.Argument(help="As for `lerobot eval env=memobench`: policy=…, suite=…, tasks=….", metavar="policy=…"),
+    ],
+) -> int:
+    """Evaluate on the sealed seeds, and count the start. Seeds 100007 to 100056, once per release, when all settings
+    are chosen: output and card hold the number of this policy's run.
+    """
+    from lerobot_memobench.cli.lerobot import run
+
+    return run(["eval", "env=memobench", *settings, f"split={SEALED}"])
+
+
+# --- the program ---
 
 app = typer.Typer(
     name="memobench",
-    cls=Grouped,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,
+    rich_markup_mode="markdown",
 )
 
 COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
@@ -63,43 +239,18 @@ COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 
-GO_ON = ("generate", "cache", "convert", "push")
+RESUMED = ("generate", "cache", "convert", "push")
 """Commands that continue when given again; any other starts over."""
 LEARN = ("cache",)
-"""Commands whose own process trains or encodes; every other simulates, or computes next to nothing."""
+"""Commands that train or encode in their own process; the others simulate, or compute little."""
 
 for group, commands in COMMANDS.items():
     for command in commands:
-        flags = {"ignore_unknown_options": command is test_sealed}  # which hands them to LeRobot
+        flags = {"ignore_unknown_options": command is test_sealed}  # it passes them to `lerobot eval`
         app.command(rich_help_panel=group, context_settings=flags)(command)
 
 
-ELSEWHERE = {
-    "eval": "lerobot eval env=memobench policy=CHECKPOINT tasks=object",
-    "train": "lerobot train policy=memobench_mem dataset=FOLDER",
-    "html": "memobench report FOLDER --html OUT",
-    "figures": "memobench report FOLDER --figures OUT; the paper's: python examples/paper_figures.py",
-    "controls": "memobench compare A B; of evidence and granularity: memobench report A B",
-    "demo": "make demo",
-    "gallery": "python scripts/gallery.py --out FOLDER",
-}
-"""Commands of LeRobot's and of earlier releases -> the command to give instead."""
-
-
-def _refuse(name: str) -> None:
-    """Make ``memobench <name>`` an error that names the command to give instead."""
-
-    def refuse(words: Annotated[list[str] | None, typer.Argument()] = None) -> None:
-        raise MemobenchError(f"`memobench` has no command {name!r}; give: {ELSEWHERE[name]}")
-
-    app.command(name, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})(refuse)
-
-
-for name in ELSEWHERE:
-    _refuse(name)
-
-
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         print(f"memobench {version('lerobot_policy_memobench')} (LeRobot {version('lerobot')})")
         raise typer.Exit
@@ -108,7 +259,7 @@ def _say_version(wanted: bool) -> None:
 @app.callback(epilog="Evaluations and training are LeRobot's commands: `lerobot eval --help`, `lerobot train --help`.")
 def options(
     shown: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_say_version, help="Print the version and exit.")
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
 ) -> None:
     """MEMOBench: a process-level memory benchmark for robot manipulation, as a LeRobot plugin."""
@@ -118,9 +269,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     words = [as_path(word) for word in (sys.argv[1:] if argv is None else argv)]
     use_threads(LEARNING if words and words[0] in LEARN else ACTING)
-    begins = "go on" if words and words[0] in GO_ON else "begin anew"
-    again = f"{begins} with: {shlex.join(['memobench', *words])}"
-    return run_app(app, words, "memobench", again)
+    verb = "resume" if words and words[0] in RESUMED else "start again"
+    return run_app(app, words, "memobench", f"{verb} with: {shlex.join(['memobench', *words])}")
 
 
 if __name__ == "__main__":

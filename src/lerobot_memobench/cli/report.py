@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import console, say, tell
+from lerobot_memobench.cli.console import console, note, say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
@@ -91,8 +91,8 @@ def report(
         from lerobot_memobench.evaluation.html.write import write_html
 
         written = write_html(folders, html, task_dir)
-        for note in written.notes:
-            say(f"note: {note}")
+        for line in written.notes:
+            say(f"note: {line}")
         say(f"{count_of(written.rollouts, 'episode')}, {written.videos} with a video")
         say(f"open {written.page}")
 
@@ -108,7 +108,7 @@ def _write_beside_log(run: Run) -> None:
         with locked(run.folder, run.folder):
             write_report(run.folder)
     except (OSError, HeldError) as error:  # a read-only archive, or an evaluation that runs
-        tell(f"memobench: {run.folder} is not written to ({getattr(error, 'strerror', None) or error})")
+        note(f"memobench: {run.folder} is not written to ({getattr(error, 'strerror', None) or error})")
 
 
 def compare(
@@ -147,8 +147,8 @@ def merge(
     ] = None,
 ) -> int:
     """Join the parts of an evaluation and report the whole. They ran with shard=i/n. Status 1: some are missing."""
-    from lerobot_memobench.cli.evaluate import merge_and_print
-    from lerobot_memobench.run.merging import part_folders
+    from lerobot_memobench.cli.lerobot import merge_and_print
+    from lerobot_memobench.run.shards import part_folders
 
     return merge_and_print(out, folders or part_folders(out))
 
@@ -157,11 +157,12 @@ def rerun(
     card: Annotated[Path, typer.Argument(help="The folder of an evaluation, or its evaluation.json.")],
     out: Annotated[Path | None, typer.Option(help="Folder of the repetition; a dated one when left out.")] = None,
     server: Annotated[
-        str | None, typer.Option(help="Where the card's policy server is here, host:port; 127.0.0.1 needs no saying.")
+        str | None,
+        typer.Option(help="Address of the card's policy server, host:port; optional on 127.0.0.1."),
     ] = None,
 ) -> int:
     """Repeat the evaluation of a card and compare every episode. Status 1: one ended differently."""
-    from lerobot_memobench.cli.evaluate import evaluate_here
+    from lerobot_memobench.cli.lerobot import evaluate_here
     from lerobot_memobench.run.rerun import repeat
 
     return repeat(card, out, server, evaluate_here, say)

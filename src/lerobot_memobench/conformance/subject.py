@@ -24,8 +24,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.protocol import CLOCK, EXECUTION
-from lerobot_memobench.run.arguments import SHORT_FORMS, read_arguments, split_arguments
-from lerobot_memobench.run.plan import policy_config
+from lerobot_memobench.run.arguments import SHORT_FORMS, policy_config, read_arguments, split_arguments
 from lerobot_memobench.run.rollout import has_planned_action, needs_observation
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 

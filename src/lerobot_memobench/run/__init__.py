@@ -1,1 +1,1 @@
-"""How is an evaluation run, gone on with, shared out, merged, repeated?"""
+"""Plan, run, resume, divide, merge and repeat an evaluation."""

@@ -1,44 +1,46 @@
-"""A command line becomes LeRobot's flags: ``lerobot train policy=memobench_mem align=contrastive`` and the like.
+"""Parse a command line of LeRobot: ``lerobot train policy=memobench_mem align=contrastive`` and the like.
 
-``key=value`` is checked against the dataclasses that LeRobot's parser (draccus) fills, so that a mistake is told in one
-sentence before anything runs. Short forms stand for LeRobot's names, ``policy=``, ``env=`` and ``dataset=`` choose, and
-``config=`` names a recipe. What begins with ``--`` is passed on untouched. LeRobot's parser reads the result.
+``key=value`` is checked against the dataclasses that LeRobot's parser (draccus) fills, so that a mistake is reported
+before anything runs. Short forms are translated to LeRobot's names, ``policy=``, ``env=`` and ``dataset=`` choose, and
+``config=`` names a recipe. Arguments that begin with ``--`` are passed on unchecked.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import logging
+import sys
 import typing
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import resources
+from functools import cache
+from importlib import metadata, resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import draccus
 import yaml
 from draccus.parsers.config_parsers import JSONParser, YAMLParser
 from draccus.utils import DecodingError, is_choice_type, is_enum, is_literal, is_union
 
+from lerobot_memobench.policies.lerobot_config import overrides, quiet
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import (
+    check_checkpoint,
     checkpoint_folder,
     checkpoint_type,
-    folder_with_checkpoint,
     looks_local,
     shipped_policies,
 )
-from lerobot_memobench.run.lerobot_commands import config_class, load_command, register_plugins
-from lerobot_memobench.tasks.catalogue import check_suite, resolve_tasks
-from lerobot_memobench.tasks.task import PUBLISHED
 
-logger = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
 
 RECIPE, CONFIG_FILE = "config", "config_path"
 """Our key and LeRobot's for a configuration file."""
 DATASET = "dataset"
+PREFIX = "lerobot-"
 
 COMMON: dict[str, tuple[str, ...]] = {
     **{key: (f"policy.{key}",) for key in ("align", "size", "perception", "detector", "visual_encoder", "device")},
@@ -61,28 +63,24 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "train": {**COMMON, "episodes": ("dataset.episodes",)},
 }
-"""Command -> short form -> the fields it sets, of which those that exist are set. `cli/lerobot_<command>.txt` explains
-them."""
-RUN_OPTIONS = (
-    *("split", "memory_reads", "resume"),
-    *("shard", "shards", "workers", "slurm"),
-)
-"""Keys of `lerobot eval env=memobench` that are none of LeRobot's (`plan.RunOptions`)."""
+"""Command -> short form -> the fields it sets, as far as they exist. `cli/lerobot_<command>.txt` explains them."""
+RUN_OPTIONS = ("split", "memory_reads", "resume", "shard", "shards", "workers", "slurm")
+"""Keys of `lerobot eval env=memobench` that LeRobot does not have (`plan.RunOptions`)."""
 TRAINING_OPTIONS = ("prompt_frames", "obs_type")
-"""Keys of `lerobot train` that are none of LeRobot's (`training.take_training_options`)."""
+"""Keys of `lerobot train` that LeRobot does not have (`training.take_training_options`)."""
 OPTIONS = {"eval": RUN_OPTIONS, "train": TRAINING_OPTIONS}
 
 
-# --- what is typed ---
+# --- the words of a command line ---
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """A command line after ``lerobot <name>``, taken apart.
+    """A command line after ``lerobot <name>``, split.
 
     Attributes:
         pairs: (key, value) of every ``key=value``, in order.
-        flags: everything from ``--…`` on; a value that was typed behind its flag is joined to it by ``=``.
+        flags: every ``--…``, with its value joined to it by ``=``.
     """
 
     pairs: list[tuple[str, str]] = field(default_factory=list)
@@ -94,17 +92,19 @@ class Arguments:
         return any(flag in ("-h", "--help") for flag in self.flags)
 
     def value(self, key: str) -> str | None:
-        """Return what ``key=`` says last, else what ``--key`` does."""
-        return dict(self.pairs).get(key, flag_value(self.flags, key))
+        """Return the last value of ``key=``, else of ``--key=``; None without either."""
+        flags = dict(flag.removeprefix("--").split("=", 1) for flag in self.flags if "=" in flag)
+        return dict(self.pairs).get(key, flags.get(key))
 
     def without(self, *keys: str) -> Arguments:
-        """Return arguments that say nothing of these keys, as a pair or a flag."""
-        pairs = [(key, value) for key, value in self.pairs if key not in keys]
-        return Arguments(pairs, without_flags(self.flags, *keys))
+        """Return arguments without these keys, as pairs and as flags."""
+        named = {f"--{key}" for key in keys}
+        flags = [flag for flag in self.flags if flag.partition("=")[0] not in named]
+        return Arguments([pair for pair in self.pairs if pair[0] not in keys], flags)
 
 
 def split_arguments(line: Sequence[str]) -> Arguments:
-    """Take a command line apart.
+    """Split a command line.
 
     Raises:
         MemobenchError: an argument is neither ``key=value`` nor a flag nor a flag's value.
@@ -124,7 +124,7 @@ def split_arguments(line: Sequence[str]) -> Arguments:
 def joined(line: Sequence[str]) -> list[str]:
     """Return a command line with ``--key value`` as ``--key=value``."""
     found: list[str] = []
-    open_flag = False  # the word before was `--flag` without `=`: this one may be its value
+    open_flag = False  # the previous word was `--flag` without `=`: this word may be its value
     for word in line:
         is_flag = word.startswith("-") and word != "-"
         if open_flag and not is_flag:
@@ -135,143 +135,12 @@ def joined(line: Sequence[str]) -> list[str]:
     return found
 
 
-def flag_value(flags: Sequence[str], key: str) -> str | None:
-    """Return the value of ``--key=value`` among flags; the last one counts."""
-    found = [flag.partition("=")[2] for flag in flags if flag.startswith(f"--{key}=")]
-    return found[-1] if found else None
-
-
-def without_flags(flags: Sequence[str], *keys: str) -> list[str]:
-    """Return the flags without ``--key`` and its value, for each of these keys."""
-    named = {f"--{key}" for key in keys}
-    return [flag for flag in flags if flag.partition("=")[0] not in named]
-
-
 def whole_number(text: str | None) -> int | None:
-    """Return the whole number that a value is, None when it is none."""
+    """Return a text as a whole number, None where it is not one."""
     try:
         return int(text) if text is not None else None
     except ValueError:
         return None
-
-
-def check_task_names(given: Arguments) -> None:
-    """Refuse unknown task names before LeRobot's import, which takes many seconds.
-
-    Raises:
-        MemobenchError: a task that the catalogue does not have.
-    """
-
-    def either(short: str, full: str) -> str | None:
-        return dict(given.pairs).get(short, given.value(full))
-
-    own_folder, suite = given.value("env.task_dir"), either("suite", "env.suite")
-    in_a_file = suite is None and given.value(CONFIG_FILE) is not None
-    if either("env", "env.type") == "memobench" and not own_folder and not in_a_file:
-        tasks = either("tasks", "env.tasks")
-        resolve_tasks("all" if tasks is None else tasks, check_suite(suite or PUBLISHED))
-
-
-# --- what LeRobot is called with ---
-
-
-@dataclass(frozen=True)
-class LerobotArguments:
-    """The arguments of one of LeRobot's commands. They never change: others are another object.
-
-    Attributes:
-        flags: LeRobot's, as they are typed: ``--key=value``, or ``--key`` alone.
-        config: the command's configuration class; None for a command that has none (plain argparse).
-        chosen: fields such as ``policy`` and ``env`` -> the class chosen for them, on the line or in a file.
-    """
-
-    flags: tuple[str, ...]
-    config: type | None = None
-    chosen: Mapping[str, type] = field(default_factory=dict)
-
-    @property
-    def for_parser(self) -> tuple[str, ...]:
-        """The flags for LeRobot's parser: texts that it would read as YAML or JSON values are quoted."""
-        known = {} if self.config is None else dict(settings(self.config, self.chosen))
-        return tuple(for_parser(flag, known) for flag in self.flags)
-
-    def get(self, key: str) -> str | None:
-        """Return the value of ``--key``, None without one."""
-        return flag_value(self.flags, key)
-
-    def has(self, key: str) -> bool:
-        """Return whether ``--key`` is given, with or without a value."""
-        return len(without_flags(self.flags, key)) < len(self.flags)
-
-    def default(self, key: str, value: object) -> LerobotArguments:
-        """Return arguments with ``--key=value`` where nobody has set it yet."""
-        if self.has(key):
-            return self
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        return replace(self, flags=(*self.flags, f"--{key}={text}"))
-
-    def changed(self, key: str, value: object) -> LerobotArguments:
-        """Return arguments with ``--key=value``, whatever was set before."""
-        return self.without(key).default(key, value)
-
-    def without(self, *keys: str) -> LerobotArguments:
-        """Return arguments that say nothing of these keys."""
-        return replace(self, flags=tuple(without_flags(self.flags, *keys)))
-
-    def choosing(self, key: str, name: str) -> LerobotArguments:
-        """Return arguments that choose the registered type ``name`` for a field such as ``policy``."""
-        assert self.config is not None
-        chosen = {**self.chosen, key: registries(self.config)[key][name]}
-        return replace(self.changed(f"{key}.type", name), chosen=chosen)
-
-
-def for_parser(flag: str, known: Mapping[str, Any]) -> str:
-    """Return a flag for LeRobot's parser: a text that it would read as a YAML or JSON value is quoted.
-
-    Args:
-        known: dotted key -> type of each setting.
-    """
-    key, _, text = flag.removeprefix("--").partition("=")
-    kind = without_none(known.get(key))
-    if kind not in (str, Path) or key.rpartition(".")[2] in CHOICE_KEYS or text in NO_VALUE:
-        return flag
-    if text.startswith(INCLUDE):
-        if kind is not Path and not key.endswith(("root", "_dir")):
-            raise MemobenchError(
-                f"found {key}={text}; LeRobot's parser takes text that begins with {INCLUDE} for a file"
-            )
-        text = f"./{text}"
-    try:
-        is_plain = all(parser.parse_string(text) == text for parser in (YAMLParser, JSONParser))
-    except yaml.YAMLError:
-        is_plain = False
-    return f"--{key}={text if is_plain else json.dumps(text, ensure_ascii=False)}"
-
-
-def read_arguments(command: str, given: Arguments) -> LerobotArguments:
-    """Return what a command line means to LeRobot's command of that name; imports that command.
-
-    Raises:
-        MemobenchError: an unknown key or value, named with the nearest known one.
-    """
-    config = config_class(load_command(command))
-    register_plugins()
-    load_packages(given)
-    return translate(command, given, config, read_config_file(given.value(CONFIG_FILE)))
-
-
-def load_packages(given: Arguments) -> None:
-    """Import the packages that LeRobot is told to look for plugins in, so that what they register is known."""
-    from lerobot.configs import parser
-
-    named = [f"--{key}={value}" for key, value in given.pairs]
-    for flag in (*given.flags, *named):
-        key, _, value = flag.partition("=")
-        if key.endswith(f".{CHOICE_KEYS[-1]}"):
-            try:
-                parser.load_plugin(value)
-            except (parser.PluginLoadError, ImportError) as error:
-                raise MemobenchError(f"{key.removeprefix('--')}={value} cannot be imported ({error})") from None
 
 
 def is_of_benchmark(given: Arguments) -> bool:
@@ -281,23 +150,261 @@ def is_of_benchmark(given: Arguments) -> bool:
     return dict(given.pairs).get("env", given.value("env.type") or in_file) == "memobench"
 
 
+# --- LeRobot's commands ---
+
+
+def lerobot_commands() -> dict[str, metadata.EntryPoint]:
+    """Return name -> entry point of every command of the installed LeRobot (``eval``: ``lerobot-eval``)."""
+    return {
+        entry.name.removeprefix(PREFIX): entry
+        for entry in metadata.distribution("lerobot").entry_points
+        if entry.group == "console_scripts" and entry.name.startswith(PREFIX)
+    }
+
+
+def load_command(name: str) -> Callable[[], Any]:
+    """Return the main function of a LeRobot command, which reads ``sys.argv``. The import takes many seconds.
+
+    Raises:
+        MemobenchError: LeRobot was installed without the extra that the command needs.
+    """
+    try:
+        entry: Callable[[], Any] = lerobot_commands()[name].load()
+    except ImportError as error:
+        raise MemobenchError(f"{PREFIX}{name} needs a package that is not installed: {error}") from error
+    return entry
+
+
+def call_lerobot(command: str, flags: Sequence[str]) -> int:
+    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``."""
+    entry = load_command(command)
+    before = sys.argv
+    sys.argv = [f"{PREFIX}{command}", *flags]
+    try:
+        status = entry()
+    except SystemExit as stop:
+        status = stop.code
+    finally:
+        sys.argv = before
+    if status is None or isinstance(status, int):
+        return status or 0
+    print(status, file=sys.stderr)  # as Python does with such a status
+    return 1
+
+
+@cache
+def register_plugins() -> None:
+    """Let LeRobot find its plugins as its own commands do, once per process, without its log lines."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    with quiet():
+        register_third_party_plugins()
+
+
+def load_plugins(given: Arguments) -> None:
+    """Register LeRobot's plugins, and import the packages that ``…discover_packages_path`` names."""
+    import lerobot.envs
+    import lerobot.policies
+    import lerobot.rewards  # noqa: F401 - they register LeRobot's own types
+    from lerobot.configs import parser
+
+    register_plugins()
+    for flag in (*given.flags, *(f"--{key}={value}" for key, value in given.pairs)):
+        key, _, value = flag.removeprefix("--").partition("=")
+        if key.endswith(f".{CHOICE_KEYS[-1]}"):
+            try:
+                parser.load_plugin(value)
+            except (parser.PluginLoadError, ImportError) as error:
+                raise MemobenchError(f"{key}={value} cannot be imported ({error})") from None
+
+
+@dataclass(frozen=True)
+class LerobotArguments:
+    """The arguments of one of LeRobot's commands. Changes return another object.
+
+    Attributes:
+        values: LeRobot's full name of each setting -> its text; None for a flag without a value.
+        config: the command's configuration class; None for a command whose arguments are passed on.
+        chosen: fields such as ``policy`` and ``env`` -> the class chosen for them, on the line or in a file.
+        others: arguments passed on as they were typed.
+    """
+
+    values: Mapping[str, str | None]
+    config: type | None = None
+    chosen: Mapping[str, type] = field(default_factory=dict)
+    others: tuple[str, ...] = ()
+
+    @property
+    def for_parser(self) -> tuple[str, ...]:
+        """The arguments for LeRobot's parser: texts that it would read as YAML or JSON values are quoted."""
+        known = {} if self.config is None else setting_types(self.config, self.chosen)
+        flags = (f"--{k}" if v is None else f"--{k}={quoted(k, v, known)}" for k, v in self.values.items())
+        return (*self.others, *flags)
+
+    def get(self, key: str) -> str | None:
+        """Return the value of a setting, None without one."""
+        return self.values.get(key)
+
+    def has(self, key: str) -> bool:
+        """Return whether a setting is given, with or without a value."""
+        return key in self.values
+
+    def default(self, key: str, value: object) -> LerobotArguments:
+        """Return arguments with a setting, unless it is given."""
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        return replace(self, values={key: text, **self.values})
+
+    def changed(self, key: str, value: object) -> LerobotArguments:
+        """Return arguments with a setting in place of a given one."""
+        return self.without(key).default(key, value)
+
+    def without(self, *keys: str) -> LerobotArguments:
+        """Return arguments without these settings."""
+        return replace(self, values={key: text for key, text in self.values.items() if key not in keys})
+
+    def configuration(self, key: str) -> Any:
+        """Return the configuration of a choice such as ``policy``.
+
+        None where none is chosen, it is not on this machine, or a configuration file sets parts of it.
+
+        Raises:
+            MemobenchError: a value is no YAML. Others come from the configuration's own checks.
+        """
+        from lerobot.configs import PreTrainedConfig
+
+        if key not in self.chosen or self.has(CONFIG_FILE):
+            return None
+        path, changes = self.get(f"{key}.path"), overrides(key, self.for_parser)
+        try:
+            with quiet():
+                if path is not None:
+                    return PreTrainedConfig.from_pretrained(path, cli_overrides=changes)
+                return draccus.parse(self.chosen[key], args=changes)
+        except yaml.YAMLError as error:  # LeRobot reads every value as YAML
+            problem = " ".join(str(error).split())
+            raise MemobenchError(
+                f"a value of {key}. cannot be read ({problem}); put it in quotes within quotes"
+            ) from None
+
+
+def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
+    """Return the policy's configuration, see `LerobotArguments.configuration`.
+
+    Raises:
+        MemobenchError: the checkpoint is not complete.
+    """
+    if (path := arguments.get("policy.path")) is not None:
+        check_checkpoint(path)
+    found: PreTrainedConfig | None = arguments.configuration("policy")
+    return found
+
+
+def env_config(arguments: LerobotArguments) -> EnvConfig | None:
+    """Return the environment's configuration, see `LerobotArguments.configuration`."""
+    found: EnvConfig | None = arguments.configuration("env")
+    return found
+
+
+def quoted(key: str, text: str, known: Mapping[str, Any]) -> str:
+    """Return a value for LeRobot's parser: a text that it would read as a YAML or JSON value is quoted.
+
+    Args:
+        known: type of each setting.
+    """
+    kind = without_none(known.get(key))
+    if kind not in (str, Path) or key.rpartition(".")[2] in CHOICE_KEYS or text in NO_VALUE:
+        return text
+    if text.startswith(INCLUDE):
+        if kind is not Path and not key.endswith(("root", "_dir")):
+            raise MemobenchError(f"found {key}={text}; LeRobot's parser reads {INCLUDE}… as the name of a file")
+        text = f"./{text}"
+    try:
+        is_plain = all(parser.parse_string(text) == text for parser in (YAMLParser, JSONParser))
+    except yaml.YAMLError:
+        is_plain = False
+    return text if is_plain else json.dumps(text, ensure_ascii=False)
+
+
+# --- from words to settings ---
+
+
+def read_arguments(command: str, given: Arguments) -> LerobotArguments:
+    """Return the arguments of LeRobot's command of that name for a command line.
+
+    Those of ``eval`` and ``train`` are checked; those of other commands are passed on.
+
+    Raises:
+        MemobenchError: an unknown key or value, named with the nearest known one.
+    """
+    if command not in SHORT_FORMS:
+        return LerobotArguments({}, others=(*given.flags, *(f"--{key}={value}" for key, value in given.pairs)))
+    from lerobot.configs.eval import EvalPipelineConfig
+    from lerobot.configs.train import TrainPipelineConfig
+
+    load_plugins(given)
+    config = EvalPipelineConfig if command == "eval" else TrainPipelineConfig
+    return translate(command, given, config, read_config_file(given.value(CONFIG_FILE)))
+
+
+def translate(command: str, given: Arguments, config: type, file: Mapping[str, Any]) -> LerobotArguments:
+    """Turn a command line into LeRobot's arguments. Of a repeated key the last value counts.
+
+    Args:
+        command: ``eval`` or ``train``.
+        config: the configuration class of the command.
+        file: content of the file named by ``config_path``; it may hold the policy and the environment.
+
+    Raises:
+        MemobenchError: an unknown key or value, named with the nearest known one.
+    """
+    values: dict[str, str | None] = {}
+    for flag in given.flags:
+        key, equals, value = flag.partition("=")
+        if key.startswith("--") and flag != "--help":
+            values[key.removeprefix("--")] = value if equals else None
+    choices = registries(config)
+    choosing = {*choices, *({DATASET} & field_types(config).keys())}
+    for key, value in given.pairs:
+        section, _, name = key.rpartition(".")
+        if key in choosing:
+            for one in CHOICE_KEYS[:2]:
+                values.pop(f"{key}.{one}", None)
+            values |= choice_settings(config, key, value)
+        elif section in choices and name in CHOICE_KEYS:
+            values[key] = value
+    # The fields of the policy and the environment are known once these are, wherever they appear in the line.
+    found = {key: chosen_class(config, key, values, file) for key in choices}
+    chosen = {key: choice for key, choice in found.items() if choice is not None}
+    known, short = setting_types(config, chosen), SHORT_FORMS[command]
+    for key, value in given.pairs:
+        if key in choosing or (key in values and key.rpartition(".")[2] in CHOICE_KEYS):
+            continue
+        # replan= sets the policy's interval and the environment's, for the log; either may not exist.
+        fields = [each for each in short.get(key, ()) if each in known]
+        if key in short and not fields:
+            owner, _, name = short[key][0].partition(".")
+            if owner in chosen:
+                raise MemobenchError(f"{key}= sets {owner}.{name}, and {chosen[owner].__name__} has no such field")
+            raise MemobenchError(f"{key}= sets {name} of the {owner}: name one with {owner}=")
+        try:
+            values |= {each: checked_value(key, setting_type(known, each), value) for each in fields or [key]}
+        except KeyError:
+            keys = [*known, *short, *OPTIONS[command]]
+            raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, keys)}") from None
+    others = tuple(flag for flag in given.flags if flag == "--help" or not flag.startswith("--"))
+    return LerobotArguments(values, config, chosen, others)
+
+
 def with_file(given: Arguments, file: Mapping[str, Any], config: type) -> Arguments:
-    """Return a command line that says what a configuration file says where the line does not.
+    """Return a command line with the settings of a configuration file that it does not set itself.
 
     LeRobot would read the file beneath the line, where the benchmark's defaults would hide it.
     """
-    chosen = {key for key in registries(config) if dict(given.pairs).get(key) or _is_named(given, key)}
-    found = [
-        (key, value)
-        for key, value in flattened(file, dict(settings(config, {})))
-        if not (key.partition(".")[0] in chosen and key.partition(".")[2] in ("", *CHOICE_KEYS[:2]))
-        and given.value(key) is None
-    ]
-    return replace(given, pairs=[*found, *given.pairs])
-
-
-def _is_named(given: Arguments, key: str) -> bool:
-    return any(given.value(f"{key}.{word}") is not None for word in CHOICE_KEYS[:2])
+    named = {key for key in registries(config) if any(given.value(k) for k in (key, f"{key}.type", f"{key}.path"))}
+    hidden = {name for key in named for name in (key, f"{key}.type", f"{key}.path")}
+    found = flattened(file, setting_types(config, {}))
+    pairs = [(key, value) for key, value in found if key not in hidden and given.value(key) is None]
+    return replace(given, pairs=[*pairs, *given.pairs])
 
 
 def flattened(file: Mapping[str, Any], known: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str]]:
@@ -311,142 +418,77 @@ def flattened(file: Mapping[str, Any], known: Mapping[str, Any], before: str = "
             yield key, value if isinstance(value, str) else json.dumps(value)
 
 
-def translate(command: str, given: Arguments, config: type | None, file: Mapping[str, Any]) -> LerobotArguments:
-    """Turn a command line into LeRobot's arguments.
+# --- values of policy=, env=, dataset= …: a registered type, a checkpoint, a repository, a folder ---
 
-    Args:
-        command: LeRobot's command without ``lerobot-``.
-        config: the configuration class of the command, None when it has none.
-        file: content of the file named by ``config_path``; it may hold the policy and the environment.
+
+def choice_settings(config: type, key: str, value: str) -> dict[str, str]:
+    """Return the settings for a choice such as ``policy=``, of a command with this configuration.
 
     Raises:
-        MemobenchError: an unknown key or value, named with the nearest known one.
-    """
-    if config is None:
-        return LerobotArguments((*given.flags, *(f"--{key}={value}" for key, value in given.pairs)))
-    choices = registries(config)
-    choosing = {*choices, *({DATASET} & field_types(config).keys())}
-    others = [pair for pair in given.pairs if pair[0] not in choosing]
-    flags = list(given.flags)
-    for key, value in given.pairs:
-        flags += choice_flags(config, key, value) if key in choosing else []
-    for key in choosing:
-        _check_named_once(key, given.pairs, flags)
-    # Fields of the policy and the environment are known once these are, wherever they stand in the line.
-    explicit = [*flags, *(f"--{key}={value}" for key, value in others)]
-    found = {key: chosen_class(config, key, explicit, file) for key in choices}
-    chosen = {key: choice for key, choice in found.items() if choice is not None}
-    known, short = dict(settings(config, chosen)), SHORT_FORMS.get(command, {})
-    for key, value in others:
-        # replan= sets the policy's interval and tells the environment, which writes it down; either may be missing.
-        fields = [each for each in short.get(key, ()) if each in known]
-        if key in short and not fields:
-            raise _nothing_to_set(key, short[key][0], chosen)
-        try:
-            flags += [f"--{each}={checked_value(key, setting_type(known, each), value)}" for each in fields or [key]]
-        except KeyError:
-            keys = [*known, *short, *OPTIONS.get(command, ())]
-            raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, keys)}") from None
-    # LeRobot takes the first of some that are given twice and the last of others.
-    once = {flag.partition("=")[0]: flag for flag in flags}
-    return LerobotArguments(tuple(once.values()), config, chosen)
-
-
-def _check_named_once(key: str, pairs: Sequence[tuple[str, str]], flags: Sequence[str]) -> None:
-    named = {f"{key}={value}" for name, value in pairs if name == key}
-    if len(named) < 2:
-        named = {flag for flag in flags if flag.startswith((f"--{key}.type=", f"--{key}.path="))}
-    if len(named) > 1:
-        raise MemobenchError(f"there are two answers to which {key} is meant, {' and '.join(sorted(named))}; name one")
-
-
-def _nothing_to_set(key: str, target: str, chosen: Mapping[str, type]) -> MemobenchError:
-    owner, _, name = target.partition(".")
-    if owner in chosen:
-        kind = chosen[owner].__name__
-        return MemobenchError(f"{key}= sets {target}, which this {owner} ({kind}) does not have")
-    return MemobenchError(f"{key}= sets {name} of the {owner}: name one with {owner}=")
-
-
-# --- what policy=, env=, dataset= … choose: a registered type, a checkpoint, a repository, a folder ---
-
-
-def choice_flags(config: type, key: str, value: str) -> list[str]:
-    """Return the flags for what chooses, such as ``policy=``, of a command with this configuration.
-
-    Raises:
-        MemobenchError: there is no such thing, with what is near.
+        MemobenchError: it does not exist, with near names.
     """
     if not value:
         raise MemobenchError(f"{key}= is empty; expected a name")
     if key == DATASET:
-        return dataset_flags(value)
+        return dataset_settings(value)
     known = registries(config)[key]
     path = checkpoint_of(value, known) if key == "policy" else None
     if path is not None:
-        return [f"--policy.path={path}"]
+        return {"policy.path": path}
     if value not in known:
         others = shipped_policies() if key == "policy" else {}
         raise MemobenchError(f"there is no {key} {value!r}, {nearest(value, [*known, *others])}")
-    return [f"--{key}.type={value}"]
+    return {f"{key}.type": value}
 
 
 def checkpoint_of(value: str, known: Collection[str]) -> str | None:
-    """Return the checkpoint folder or the repository that ``policy=`` means; None where it means a type.
+    """Return the checkpoint folder or the repository that ``policy=`` names; None where it names a type.
 
-    A known name is what has it, wherever the command is run: a folder of that name is named by a path.
+    A known name has precedence over a folder of that name, which a path such as ``./act`` names.
     """
-    if value in (*known, *shipped_policies()) and folder_with_checkpoint(value) is not None:
-        what = "the policy type" if value in known else "the policy of the package"
-        logger.warning("policy=%s is %s; the checkpoint in the folder of that name is policy=./%s", value, what, value)
     folder = None if value in known else checkpoint_folder(value)
     if folder is not None:
         return str(folder)
     if value not in known and (looks_local(value) or Path(value).is_dir()):
-        what = "holds no checkpoint (no config.json)" if Path(value).is_dir() else "does not exist"
+        problem = "holds no checkpoint (no config.json)" if Path(value).is_dir() else "does not exist"
         raise MemobenchError(
-            f"policy={value}: this folder {what}; expected a checkpoint such as "
+            f"policy={value}: this folder {problem}; expected a checkpoint such as "
             "outputs/train/<run>/checkpoints/last/pretrained_model, or a policy type"
         )
     return value if "/" in value else None
 
 
-def dataset_flags(value: str) -> list[str]:
-    """Return the flags for ``dataset=``: a folder here, or a repository's id."""
+def dataset_settings(value: str) -> dict[str, str]:
+    """Return the settings for ``dataset=``: a folder here, or a repository's id."""
     path = Path(value).expanduser()
     if path.is_dir():
-        return [f"--dataset.repo_id=local/{path.resolve().name}", f"--dataset.root={path}"]
+        return {"dataset.repo_id": f"local/{path.resolve().name}", "dataset.root": str(path)}
     if looks_local(value) or "/" not in value:
         raise MemobenchError(
             f"dataset={value}: there is no such folder; expected one that `memobench generate` wrote, "
             "or a repository such as user/name"
         )
-    return [f"--dataset.repo_id={value}"]
+    return {"dataset.repo_id": value}
 
 
-def chosen_class(config: type, key: str, flags: Sequence[str], file: Mapping[str, Any]) -> type | None:
-    """Return the class that flags or a configuration file choose for a field such as ``policy``.
+def chosen_class(config: type, key: str, values: Mapping[str, str | None], file: Mapping[str, Any]) -> type | None:
+    """Return the class that settings or a configuration file choose for a field such as ``policy``.
 
-    None when nothing is chosen, or when it is not known here.
+    None without a choice, or when a repository is not on this machine.
     """
     known = registries(config)[key]
-    path = flag_value(flags, f"{key}.path")
-    name = flag_value(flags, f"{key}.type")
+    path, name = values.get(f"{key}.path"), values.get(f"{key}.type")
     section = file.get(key)
     if not path and not name and isinstance(section, Mapping):
-        path, name = (_text(key, section, word) for word in ("path", "type"))
+        for word in ("path", "type"):
+            if not isinstance(section.get(word), str | None):
+                raise MemobenchError(f"found {key}.{word}: {str(section[word])[:80]} in {CONFIG_FILE}; expected a name")
+        path, name = section.get("path"), section.get("type")
     if path:
         name = checkpoint_type(path)
-    elif name and name not in known and not any(".discover_packages_path=" in flag for flag in flags):
+    elif name and name not in known:
         raise MemobenchError(f"there is no {key} {name!r}, {nearest(name, known)}")
     return known.get(name) if name else None
-
-
-def _text(key: str, section: Mapping[str, Any], word: str) -> str | None:
-    value = section.get(word)
-    if value is not None and not isinstance(value, str):
-        raise MemobenchError(f"the configuration file says {key}.{word}: {str(value)[:80]}; expected a name")
-    return value
 
 
 # --- recipes and configuration files ---
@@ -459,18 +501,14 @@ def recipes() -> dict[str, Path]:
 
 
 def recipe_file(value: str) -> Path:
-    """Return the file of a recipe: one shipped, by its name, or a YAML or JSON file.
+    """Return the file of a recipe: a shipped recipe by its name, or a YAML or JSON file; ``./name`` is a file.
 
     Raises:
-        MemobenchError: there is none.
+        MemobenchError: it does not exist.
     """
     known = recipes()
     path = Path(value).expanduser()
     if value in known:
-        if path.is_file():
-            logger.warning(
-                "%s=%s is the shipped recipe; the file of that name is %s=./%s", RECIPE, value, RECIPE, value
-            )
         return known[value]
     if path.is_file():
         return path
@@ -510,7 +548,7 @@ def read_config_file(given: str | None) -> dict[str, Any]:
     except OSError as error:
         raise MemobenchError(f"{CONFIG_FILE}={given} cannot be read ({error.strerror or error})") from None
     except (yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:
-        # Beside its own errors, PyYAML lets through those of dates, numbers and keys that are none.
+        # PyYAML also raises errors of dates, numbers and keys.
         problem = " ".join(str(error).split())
         raise MemobenchError(f"{CONFIG_FILE}={given} is neither YAML nor JSON: {problem}") from None
     if not isinstance(content, dict):
@@ -518,10 +556,10 @@ def read_config_file(given: str | None) -> dict[str, Any]:
     return content
 
 
-# --- the settings of a command and the values that they take: read from its dataclasses, as draccus does ---
+# --- names, types and values of settings, read from dataclasses as draccus does ---
 
 CHOICE_KEYS = ("type", "path", "discover_packages_path")
-"""What LeRobot's parser understands beside the fields of a choice: ``--policy.type``."""
+"""Keys of a choice that LeRobot's parser reads besides its fields: ``--policy.type``."""
 NO_VALUE = ("", "null", "~")
 """Texts that LeRobot's parser reads as an empty text or as None."""
 INCLUDE = "include"
@@ -542,7 +580,7 @@ def without_none(annotation: Any) -> Any:
 
 
 def registries(config: type) -> dict[str, dict[str, type]]:
-    """Return field -> name -> class of what may be chosen for it, such as for ``policy``."""
+    """Return field -> name -> class of the types that may be chosen for it, such as for ``policy``."""
     return {
         key: {str(name): choice for name, choice in kind.get_known_choices().items()}
         for key, kind in ((name, without_none(annotation)) for name, annotation in field_types(config).items())
@@ -550,20 +588,22 @@ def registries(config: type) -> dict[str, dict[str, type]]:
     }
 
 
-def settings(config: type, chosen: Mapping[str, type], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted key and the type of each setting, sections and choices among them.
+def setting_types(config: type, chosen: Mapping[str, type], before: str = "") -> dict[str, Any]:
+    """Return dotted key -> type of each setting, sections and choices among them.
 
     Args:
         chosen: dotted key of a choice (``policy``) -> the class chosen for it.
     """
+    found: dict[str, Any] = {}
     for name, annotation in field_types(config).items():
         key, kind = before + name, without_none(annotation)
         if is_choice_type(kind):
-            yield from ((f"{key}.{word}", str) for word in CHOICE_KEYS)
+            found |= {f"{key}.{word}": str for word in CHOICE_KEYS}
             annotation = kind = chosen.get(key, kind)
-        yield key, annotation
+        found[key] = annotation
         if has_settings(kind):
-            yield from settings(kind, chosen, key + ".")
+            found |= setting_types(kind, chosen, key + ".")
+    return found
 
 
 def has_settings(kind: Any) -> bool:
@@ -572,7 +612,7 @@ def has_settings(kind: Any) -> bool:
 
 
 def setting_type(known: Mapping[str, Any], key: str) -> Any:
-    """Return the type of one of the `settings`; ``Any`` where LeRobot's parser alone decides.
+    """Return the type of one of the `setting_types`; ``Any`` where LeRobot's parser alone decides.
 
     Raises:
         KeyError: there is no such setting. MemobenchError: it belongs to a choice that has not been made
@@ -591,10 +631,8 @@ def setting_type(known: Mapping[str, Any], key: str) -> Any:
     if is_choice_type(kind) and "." not in owner:
         raise MemobenchError(f"{key!r} needs {owner}=: name one before setting something of it")
     if typing.get_origin(kind) is dict:
-        raise MemobenchError(
-            f"found {key}=, and {owner} is a mapping that is given whole; say {owner}="
-            f"'{{\"{key.removeprefix(owner)[1:]}\": …}}'"
-        )
+        inner = key.removeprefix(owner)[1:]
+        raise MemobenchError(f"found {key}=; {owner} is one mapping: give {owner}='{{\"{inner}\": …}}'")
     if has_settings(kind) or kind in (*PLAIN, str) or is_literal(kind) or is_enum(kind):
         raise KeyError(key)
     return Any
@@ -604,7 +642,7 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
     """Return ``text`` as LeRobot's parser reads it, after a check against the field's type.
 
     Raises:
-        MemobenchError: the value cannot be one of this field.
+        MemobenchError: the field cannot have this value.
     """
     kind = without_none(annotation)
     if text in ("null", "~") or (kind in PLAIN and text.lower() == "none"):  # for text, `align=none` is a value
@@ -619,8 +657,8 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
             raise MemobenchError(f"{key}={text}: expected {PLAIN[kind]}") from None
         return plain
     if has_settings(kind):
-        names = [f"{key}.{name}" for name in field_types(kind)]
-        raise MemobenchError(f"{key}={text[:80]}: {key} holds settings; expected one of them, such as {names[0]}=")
+        first = next(iter(field_types(kind)))
+        raise MemobenchError(f"{key}={text[:80]}: {key} holds settings; expected one of them, such as {key}.{first}=")
     if typing.get_origin(kind) is dict:
         try:
             found = yaml.safe_load(text)
@@ -628,7 +666,7 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
             found = None
         if not isinstance(found, dict):
             raise MemobenchError(f'{key}={text[:80]}: expected a mapping, such as {key}=\'{{"name": "other"}}\'')
-        return json.dumps(found, default=str)  # beside a checkpoint LeRobot reads JSON alone
+        return json.dumps(found, default=str)  # next to a checkpoint LeRobot reads JSON only
     if is_literal(kind):
         known = named = [str(value) for value in typing.get_args(kind)]
     elif is_enum(kind):
@@ -642,5 +680,5 @@ def checked_value(key: str, annotation: Any, text: str) -> str:
 
 
 def is_true(key: str, text: str | None) -> bool:
-    """Return the truth value that an option of ours is given; not given, it is false."""
+    """Return the truth value of an option; false where it is not given."""
     return text is not None and checked_value(key, bool, text) == "true"

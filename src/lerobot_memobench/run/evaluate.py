@@ -1,9 +1,9 @@
-"""The evaluation loop: a policy, the environments of each task, and the batches of episodes that are missing."""
+"""The evaluation loop: run a policy in the environments of each task, batch after batch."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
 from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
 
 Advance = Callable[[int, int, str], None]
-"""Called after each batch with the episodes that have ended, those that are to be run, and the task's name."""
+"""Called after each batch with the number of episodes that ended, of those to be run, and the task's name."""
 
 
 def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: Advance) -> None:
@@ -35,7 +35,7 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
         begin: called once, after the policy is loaded and before the first scene.
 
     Raises:
-        MemobenchError: the policy and the environment do not fit. Whatever LeRobot raises.
+        MemobenchError: the policy and the environment do not fit. Any error of LeRobot.
     """
     policy: Any = plan.policy
     device = get_safe_torch_device(policy.device)
@@ -60,7 +60,7 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
             batch = range(plan.seed + runs.start, plan.seed + runs.stop)
             env = environments.of(task, len(batch))
             seeds.begin(task.name, batch.start)
-            with _noting(reads, actor.policy, task, batch) as ended:
+            with nullcontext() if reads is None else reads.noting(task.name, actor.policy, batch) as ended:
                 roll(env, actor, batch, ended)
             done += len(batch)
             advance(done, total, task.name)
@@ -79,7 +79,7 @@ class Environments:
         self._env: Any = None
 
     def of(self, task: PlannedTask, rows: int) -> Any:
-        """Return the environment of a task with so many rows, after closing any other."""
+        """Return the environment of a task with a number of rows, after closing any other."""
         if self._key != (task, rows):
             self.close()
             self._env, self._key = self._opened(task.folder, rows, self._use_async), (task, rows)
@@ -97,7 +97,7 @@ def load_actor(plan: EvaluationPlan) -> Actor:
     policy, environment = copy(plan.policy), plan.environment
     policy.pretrained_path = None if plan.policy_path is None else Path(plan.policy_path)
     renamed = dict(plan.settings.rename_map)
-    with quiet() if plan.policy_path is None else nullcontext():  # LeRobot warns that it has no weights
+    with quiet() if plan.policy_path is None else nullcontext():  # LeRobot warns that there are no weights
         loaded = make_policy(cfg=policy, env_cfg=environment, rename_map=renamed).eval()
     before, after = make_pre_post_processors(
         policy_cfg=policy,
@@ -109,35 +109,3 @@ def load_actor(plan: EvaluationPlan) -> Actor:
     )
     env_before, env_after = make_env_pre_post_processors(env_cfg=environment, policy_cfg=policy)
     return Actor(loaded, (env_before, before), (after, env_after))
-
-
-def _noting(reads: ReadLog | None, policy: Any, task: PlannedTask, seeds: Sequence[int]) -> AbstractContextManager[Any]:
-    return nullcontext() if reads is None else reads.noting(task.name, policy, seeds)
-
-
-def lerobot_summary(records: Iterable[Mapping[str, Any]], tasks: Iterable[PlannedTask]) -> dict[str, Any]:
-    """Return the rates of a log in the form of LeRobot's ``eval_info.json``; an episode's reward is its success."""
-    solved: dict[str, list[bool]] = {}
-    for record in records:
-        solved.setdefault(record["task"], []).append(bool(record["success"]))
-    there = [task for task in tasks if task.name in solved]
-    groups: dict[str, list[bool]] = {}
-    for task in there:
-        groups.setdefault(task.suite, []).extend(solved[task.name])
-    return {
-        "per_task": [
-            {"task_group": task.suite, "task_id": task.number, "metrics": _metrics(solved[task.name])} for task in there
-        ],
-        "per_group": {name: _mean(found) for name, found in groups.items()},
-        "overall": _mean([value for found in groups.values() for value in found]),
-    }
-
-
-def _metrics(solved: Sequence[bool]) -> dict[str, Any]:
-    rewards = [float(value) for value in solved]
-    return {"sum_rewards": rewards, "max_rewards": rewards, "successes": [*solved], "video_paths": []}
-
-
-def _mean(solved: Sequence[bool]) -> dict[str, Any]:
-    mean = sum(solved) / len(solved)
-    return {"avg_sum_reward": mean, "avg_max_reward": mean, "pc_success": 100 * mean, "n_episodes": len(solved)}

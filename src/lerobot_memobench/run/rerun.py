@@ -1,75 +1,80 @@
 """Repeat the evaluation that a card describes and compare every episode.
 
-A card is data that anybody may have written. Its settings decide which packages are imported and which files are read,
-so only known settings of the environment, the policy and the evaluation are accepted: none that name code, a place to
-write to or another machine, and as places to read from only folders of this machine. Anything else is refused by name,
-and so is more than `MOST` of something, and a card that does not name the outcome of every episode.
+A card is data that anybody may have written. Its settings decide which packages are imported and which files are read.
+So only known settings of the environment, the policy and the evaluation are accepted. None of them may name code, a
+folder to write to or another machine; files to read are those of this machine. Numbers have limits, and the card must
+hold the outcome of every episode.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import datetime as dt
-import json
 import re
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
+from annotated_types import Ge, Le
 from draccus.utils import is_enum, is_literal, is_union
 from lerobot.configs.eval import EvalPipelineConfig
 
+from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.envs.episode_log import MOST_EPISODES, OMITTED, differences, read_log
 from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import EnvSettings, revision
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreements
-from lerobot_memobench.io import Malformed, checked, count_of
+from lerobot_memobench.io import Malformed, checked, count_of, parsed
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.protocol import HORIZON, SEALED
 from lerobot_memobench.run.arguments import (
     PLAIN,
+    Arguments,
     checked_value,
     chosen_class,
-    register_plugins,
+    load_plugins,
     setting_type,
+    setting_types,
     without_none,
 )
-from lerobot_memobench.run.arguments import settings as settings_of
-from lerobot_memobench.run.card import checkpoint_files, detector_hash, first_variant_mismatch, tree_hash
-from lerobot_memobench.run.machine import PACKAGES, drawn_with, versions
+from lerobot_memobench.run.card import PACKAGES, detector_hash, first_variant_mismatch, drawn_with, versions
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
-from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of_flags
+from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
 from lerobot_memobench.tasks.task import PUBLISHED
 
-REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
-"""Settings of a policy by which more than numbers changes. All other numbers and truth values are accepted."""
-WORDS = (
-    *("size", "perception", "align", "subgoal_level", "memory_fusion", "memory_camera", "detector"),
-    *("dtype", "dialect", "gripper"),
-)
-"""Texts of a policy that name one of several known things."""
-NOTES = ("label", "keys")
-"""Text that is printed on a card, or sent to the policy's server."""
-SERVERS = ("host", "servers")
-
-MOST = {"horizon": 10 * HORIZON, "episodes": MOST_EPISODES, "videos": MOST_EPISODES, "batch_size": 512}
 MOST_STEPS = 100 * HORIZON
-"""Limits for a card: setting -> its largest number, and control steps of an episode with its pauses."""
+"""Most control steps of an episode with its pauses."""
+MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
+"""Setting of the environment -> its largest number."""
 NAMED = {"success", "steps", "checkpoints"}
-"""Fields that a card must name of an episode, since a repetition could contradict nothing else."""
+"""Fields that a card must name of an episode: a repetition compares them."""
 OF_EARLIER_VERSIONS = re.compile(r"--(eval\.recording.*|job_name=.*|env\.render_every=1|env\.max_parallel_tasks=1)")
 """Flags on cards of earlier versions on which no outcome depends."""
 
-FLAG = re.compile(r"--([\w.]+)=(.*)", re.DOTALL)
+REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
+"""Settings of a policy that change more than numbers. All other numbers and truth values are accepted."""
+SERVERS = ("host", "servers")
 WORD = re.compile(r"[\w.,+' ()-]*")
 DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d{1,3})?")
 SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
 OBSERVATION = re.compile(r"[\w./-]+")
-NOTHING = ("null", "none", "None", "~")
+NULLS = ("null", "none", "None", "~")
+
+
+class CardSettings(TypedDict, total=False):
+    """The settings of an evaluation on a card, see `EvaluationSettings`."""
+
+    env: dict[str, Any]
+    policy: dict[str, str]
+    seed: int | None
+    episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)] | None
+    batch_size: Annotated[int, Ge(0), Le(512)] | None
+    use_async_envs: bool | None
+    rename_map: dict[str, str]
 
 
 def repeat(
@@ -93,25 +98,14 @@ def repeat(
     """
     card = repeatable_card(path, server)
     check_policy(card)
-    if (otherwise := first_variant_mismatch(card["episodes"])) is not None:
-        raise MemobenchError(
-            f"the card's episodes drew their variants otherwise ({otherwise}): an earlier version ran them, which did "
-            f"not draw in balance; repeat it with that version ({_version_of(card)})"
-        )
-    told = card["protocol"]
-    for name, here in revision(told.get("suite", PUBLISHED)).items():
-        if (there := told.get(name, OMITTED[name])) != here:
-            raise MemobenchError(
-                f"the card's protocol of strict tasks has {name}={there}, and this version {name}={here}: an earlier "
-                f"version ran it; repeat it with that version ({_version_of(card)})"
-            )
+    check_version(card)
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_card(card, out)
     check_extent(card, plan)
     if status := evaluate(plan):
         return status
-    problems = differences(told, protocol_of(plan.log))
+    problems = differences(card["protocol"], protocol_of(plan.log))
     problems += disagreements(card["episodes"], read_log(plan.log), "here")
     if not problems:
         say(f"repeated: {count_of(len(card['episodes']), 'episode')}, as on the card")
@@ -120,26 +114,20 @@ def repeat(
     return 1
 
 
-def _version_of(card: Mapping[str, Any]) -> str:
-    """Return the package's version and commit by which a card was last run."""
-    run = card["runs"][-1]
-    return f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
-
-
 def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
-    """Return the card of an evaluation that has ended, with ``asked``, its settings, checked by `allowed_settings`.
+    """Return the card of a finished evaluation, with ``asked``, its settings, checked by `allowed_settings`.
 
     Args:
         path: the card's file or its folder.
-        server: where the policy's server is here (``host:port``, or several with commas); as on the card when None.
+        server: address of the policy's server (``host:port``, or several with commas); the card's when None.
 
     Raises:
-        MemobenchError: there is none, it holds nothing to compare with, or a setting that no card may hold.
+        MemobenchError: there is no card, it holds no episodes, or a setting is refused.
     """
     card = read_evaluation(path, whole=True)
     if not card["episodes"]:
-        raise MemobenchError(f"{path} holds no episodes to compare with; expected that of an evaluation that has ended")
-    return {**card, "asked": allowed_settings(asked_of(card), server)}
+        raise MemobenchError(f"{path} holds no episodes to compare with; expected the card of a finished evaluation")
+    return {**card, "asked": allowed_settings(settings_on(card), server)}
 
 
 def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> EvaluationPlan:
@@ -150,21 +138,24 @@ def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> Evaluation
     return make_plan(replace(card["asked"], output_dir=str(out)), options, ("memobench", "rerun"))
 
 
+# --- whether this machine and version can repeat it ---
+
+
 def check_extent(card: Mapping[str, Any], plan: EvaluationPlan) -> None:
-    """Refuse a card whose flags run something else than its episodes, or whose episodes may take too long.
+    """Refuse a card whose settings run other episodes than it names, or whose episodes may take too long.
 
     Raises:
         MemobenchError: success, steps or checkpoints of an episode of its protocol are not on the card, an episode of
             another protocol is, or an episode may take more than `MOST_STEPS`.
     """
-    asked, grid, environment = card["protocol"], plan.grid, plan.environment
+    asked, grid = card["protocol"], plan.grid
     tasks = sorted(task.name for task in grid.tasks)
     if (tasks, grid.runs) != (sorted(asked["tasks"]), asked["episodes"]):
         raise MemobenchError(
             f"the card's settings run {grid.runs} episodes of {len(tasks)} tasks, and its protocol names "
-            f"{asked['episodes']} of {len(asked['tasks'])}; expected a card that we wrote"
+            f"{asked['episodes']} of {len(asked['tasks'])}; expected a card of `lerobot eval`"
         )
-    most = longest(environment.settings)
+    most = longest(plan.environment.settings)
     if most > MOST_STEPS:
         raise MemobenchError(
             f"an episode of the card may take {most:,} control steps; expected at most {MOST_STEPS:,}, so run its "
@@ -173,41 +164,57 @@ def check_extent(card: Mapping[str, Any], plan: EvaluationPlan) -> None:
     wanted = {episode for cell in grid.cells(plan.options.shard) for episode in grid.episodes(cell)}
     named = {(e["task"], e["episode"]) for e in card["episodes"] if "not_run" in e or {*e} >= NAMED}
     for task, episode in sorted(wanted ^ named)[:1]:
-        lacks = "does not name success, steps and checkpoints of" if (task, episode) in wanted else "does not ask for"
+        problem = "lacks success, steps or checkpoints of" if (task, episode) in wanted else "does not ask for"
         raise MemobenchError(
-            f"the card {lacks} {task}, episode {episode}, so it cannot be repeated; expected the outcome of each of "
-            f"the {count_of(len(wanted), 'episode')} of its protocol, as on the card of a finished evaluation"
+            f"the card {problem} {task}, episode {episode}; expected the outcome of each of the "
+            f"{count_of(len(wanted), 'episode')} of its protocol, as on the card of a finished evaluation"
         )
 
 
-def check_policy(card: Mapping[str, Any]) -> None:
-    """Refuse to repeat an evaluation with another policy.
+def check_version(card: Mapping[str, Any]) -> None:
+    """Refuse a card of an earlier version whose scenes this version draws or runs differently.
 
     Raises:
-        MemobenchError: the checkpoint is another one, or the card does not identify it.
+        MemobenchError: it names that version.
+    """
+    run, protocol = card["runs"][-1], card["protocol"]
+    version = f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
+    problem = first_variant_mismatch(card["episodes"])
+    for name, here in revision(protocol.get("suite", PUBLISHED)).items():
+        if (there := protocol.get(name, OMITTED[name])) != here:
+            problem = problem or f"{name}={there} on the card, {name}={here} here"
+    if problem is not None:
+        raise MemobenchError(f"an earlier version ran the card ({problem}); repeat it with that version ({version})")
+
+
+def check_policy(card: Mapping[str, Any]) -> None:
+    """Refuse to repeat an evaluation with another checkpoint or detector.
+
+    Raises:
+        MemobenchError: one of them differs, or the card does not identify it.
     """
     given = card["asked"].policy_path
     if given is None:
         return
-    folder = local_folder(given)
-    assert folder is not None  # `repeatable_card` has found it
-    found, told = tree_hash(checkpoint_files(folder)), card["policy"].get("sha256")
-    if found != told:
-        raise MemobenchError(
-            f"the checkpoint {given} is not the one that was evaluated (sha256 {found[:12]}, on the card "
-            f"{str(told)[:12]}); its results would be another policy's"
-        )
-    settings, detector = card["policy"].get("settings", {}), card["policy"].get("detector_sha256")
-    here = detector_hash(settings)
-    if here != detector:
-        raise MemobenchError(
-            f"the detector {settings.get('detector')} is not the one that was used (sha256 {str(here)[:12]}, on the "
-            f"card {str(detector)[:12]}); the results would be another policy's"
-        )
+    policy = card["policy"]
+    pairs = (
+        (f"checkpoint {given}", tree_hash(checkpoint_files(Path(given))), policy.get("sha256")),
+        (
+            f"detector {policy.get('settings', {}).get('detector')}",
+            detector_hash(policy.get("settings", {})),
+            policy.get("detector_sha256"),
+        ),
+    )
+    for name, here, there in pairs:
+        if here != there:
+            raise MemobenchError(
+                f"the {name} is not the one on the card (sha256 {str(here)[:12]} here, {str(there)[:12]} on the card); "
+                "the results would be those of another policy"
+            )
 
 
 def differences_here(card: Mapping[str, Any]) -> list[str]:
-    """Return in what this machine differs from those that a card's runs were made on."""
+    """Return the differences between this machine and those of a card's runs."""
     here = drawn_with({"versions": versions()})
     notes = []
     for run in card["runs"]:
@@ -224,156 +231,115 @@ def differences_here(card: Mapping[str, Any]) -> list[str]:
 # --- settings that a card may hold ---
 
 
-def asked_of(card: Mapping[str, Any]) -> EvaluationSettings:
-    """Return the settings of a card, also of one from when cards held LeRobot's flags.
+def settings_on(card: Mapping[str, Any]) -> EvaluationSettings:
+    """Return the settings of a card, also of an earlier card with LeRobot's flags; their values are not checked yet.
 
     Raises:
         MemobenchError: they have another form.
     """
     if "settings" in card:
-        try:
-            return EvaluationSettings(**checked(card["settings"], dict[str, Any]))
-        except (Malformed, TypeError):
-            raise MemobenchError("the card's settings have unknown fields; expected a card that we wrote") from None
-    flags = card.get("flags")
-    if not isinstance(flags, list) or not all(isinstance(flag, str) and FLAG.fullmatch(flag) for flag in flags):
-        raise MemobenchError("the card's flags are no list of --key=value; expected a card that we wrote")
-    if {flag for flag in flags if flag.startswith("--env.type=")} != {"--env.type=memobench"}:
-        raise MemobenchError("the card does not say --env.type=memobench; expected an evaluation of the benchmark")
-    for key, value in (flag.removeprefix("--").split("=", 1) for flag in flags):
-        if key.rpartition(".")[2] in REACHING_OUT:
-            raise _refused(key, value, "which no card sets that is repeated")
-    kept = [flag for flag in flags if not OF_EARLIER_VERSIONS.fullmatch(flag)]
-    return settings_of_flags(flag.replace("--env.task=", "--env.tasks=", 1) for flag in kept)
+        found = card["settings"]
+        for name, value in found.items():
+            if name not in CardSettings.__annotations__:
+                raise _refused(name, value, "no card sets it")
+        return EvaluationSettings(**found)
+    flags = (flag for flag in card.get("flags", ()) if not OF_EARLIER_VERSIONS.fullmatch(flag))
+    values = dict(flag.removeprefix("--").partition("=")[::2] for flag in flags)
+    if (kind := values.get("env.type")) != "memobench":
+        raise MemobenchError(f"found env.type={kind} on the card; expected an evaluation of the benchmark")
+    if "env.task" in values:
+        values["env.tasks"] = values.pop("env.task")
+    return typed_settings(values)
 
 
 def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> EvaluationSettings:
     """Return a card's settings, checked, with the policy's checkpoint by its folder.
 
     Args:
-        server: where the policy is asked, in place of the card's address; None for the card's.
+        server: address of the policy's server, in place of the card's.
 
     Raises:
-        MemobenchError: one of them is none that a card may hold.
+        MemobenchError: a card may not hold one of them.
     """
-    _check_environment(asked.env)
-    for name, kind in (("seed", int), ("episodes", int), ("batch_size", int), ("use_async_envs", bool)):
-        value = getattr(asked, name)
-        if value is not None and (not isinstance(value, kind) or isinstance(value, bool) != (kind is bool)):
-            raise _refused(name, value, f"expected {PLAIN[kind]}")
-        _check_most(name, value)
+    try:
+        checked(vars(asked), CardSettings)
+    except Malformed as error:
+        raise MemobenchError(f"the card's settings: {error}; run its command yourself if you trust it") from None
     if asked.output_dir is not None:
-        raise _refused("output_dir", asked.output_dir, "which no card sets")
-    if not _renames_observations(asked.rename_map):
+        raise _refused("output_dir", asked.output_dir, "no card sets it")
+    if not all(OBSERVATION.fullmatch(name) for pair in asked.rename_map.items() for name in pair):
         raise _refused("rename_map", asked.rename_map, "expected names of observations")
-    return replace(asked, policy=_allowed_policy(asked.policy, server))
-
-
-def _check_environment(env: Any) -> None:
-    """Refuse other settings of the environment than `EnvSettings`, tasks and a folder of tasks that is here."""
-    known = {name for name in ENVIRONMENT if name not in ("log_dir", "resume")}
-    for name, value in _items("env", env):
-        if name not in known:
-            raise _refused(f"env.{name}", value, "which is no setting of this evaluation")
+    for name, value in asked.env.items():
+        if name not in ENVIRONMENT or name in ("log_dir", "resume"):
+            raise _refused(f"env.{name}", value, "no card sets it")
         if name == "tasks" and not (isinstance(value, str) and WORD.fullmatch(value)):
             raise _refused("env.tasks", value, "expected names of tasks")
         if name == "task_dir" and value is not None and not (isinstance(value, str) and Path(value).is_dir()):
-            raise _refused("env.task_dir", value, "expected a folder that is here")
-        _check_most(name, value, "env.")
-    EnvSettings(**{name: value for name, value in env.items() if name not in OWN})
+            raise _refused("env.task_dir", value, "expected a folder on this machine")
+        if name in MOST and isinstance(value, int) and value > MOST[name]:
+            raise _refused(f"env.{name}", value, f"expected at most {MOST[name]:,}")
+    EnvSettings(**{name: value for name, value in asked.env.items() if name not in OWN})
+    return replace(asked, policy=_allowed_policy(dict(asked.policy), server))
 
 
-def _check_most(name: str, value: Any, section: str = "") -> None:
-    if name in MOST and isinstance(value, int) and value > MOST[name]:
-        raise _refused(section + name, value, f"expected at most {MOST[name]:,}")
-
-
-def _items(section: str, found: Any) -> Iterable[tuple[str, Any]]:
-    if not isinstance(found, Mapping):
-        raise _refused(section, found, "expected settings by name")
-    return found.items()
-
-
-def _allowed_policy(policy: Any, server: str | None) -> dict[str, str]:
+def _allowed_policy(policy: dict[str, str], server: str | None) -> dict[str, str]:
     """Return the settings of a card's policy, checked; its checkpoint is a folder of this machine.
 
-    Of a repository, it is the copy in the hub's cache: nothing is fetched.
+    Of a repository, it is the copy in the hub's cache, without a download.
     """
-    told = dict(_items("policy", policy))
-    for name, value in told.items():
-        if not isinstance(value, str):
-            raise _refused(f"policy.{name}", value, "expected text")
-    if (path := told.get("path")) is not None:
+    if (path := policy.get("path")) is not None:
         try:
             folder = local_folder(path)
         except (ValueError, RuntimeError, OSError):  # neither a path nor a repository
             folder = None
         if folder is None:
-            raise MemobenchError(
-                f"the checkpoint {path[:80]!r} (policy.path) is not here; put it there to repeat the evaluation"
-            )
-        told["path"] = str(folder.absolute())
+            raise MemobenchError(f"the checkpoint {path[:80]!r} (policy.path) is not on this machine; copy it there")
+        policy["path"] = str(folder.absolute())
     if server is not None:
-        if told.get("type") != "memobench_remote":
-            raise MemobenchError(f"--server {server} is for a policy that runs in a server, and the card's does not")
-        told = {name: value for name, value in told.items() if name not in (*SERVERS, "port")}
-    register_plugins()
-    choosing = [f"--policy.{name}={told[name]}" for name in ("path", "type") if name in told]
-    chosen = chosen_class(EvalPipelineConfig, "policy", choosing, {})
-    known = {} if chosen is None else dict(settings_of(chosen, {}))
-    kept = {name: value if name in ("path", "type") else _checked(known, name, value) for name, value in told.items()}
-    return kept if server is None else {**kept, "servers": server}
+        if policy.get("type") != "memobench_remote":
+            raise MemobenchError(f"--server {server} needs a card of policy.type=memobench_remote")
+        policy = {name: value for name, value in policy.items() if name not in (*SERVERS, "port")}
+    load_plugins(Arguments())
+    named = {f"policy.{name}": policy.get(name) for name in ("path", "type")}
+    chosen = chosen_class(EvalPipelineConfig, "policy", named, {})
+    known = {} if chosen is None else setting_types(chosen, {})
+    for name, value in policy.items():
+        if name not in ("path", "type"):
+            policy[name] = _checked(known, name, value)
+    return policy if server is None else {**policy, "servers": server}
 
 
 def _checked(known: Mapping[str, Any], name: str, value: str) -> str:
-    """Return a value of a policy's setting as LeRobot reads it, if it names nothing but what is on this machine."""
+    """Return a value of a policy's setting as LeRobot reads it, if it stays on this machine."""
     key = f"policy.{name}"
-    for names, (holds, expected) in EXPECTED.items():
-        if name in names:
-            if not holds(value):
-                raise _refused(key, value, f"expected {expected}")
-            return value
+    if name in TEXTS:
+        accepts, expected = TEXTS[name]
+        if not accepts(value):
+            raise _refused(key, value, f"expected {expected}")
+        return value
     try:
         kind = setting_type(known, name)
     except KeyError:
-        raise _refused(key, value, "which is no setting of this evaluation") from None
+        raise _refused(key, value, "the policy has no such setting") from None
     if name.rpartition(".")[2] in REACHING_OUT:
-        raise _refused(key, value, "which no card sets that is repeated")
-    if value in NOTHING:
+        raise _refused(key, value, "no card sets it")
+    if value in NULLS:
         return value
     parts = typing.get_args(kind) if is_union(kind) else (kind,)
     kind = without_none(kind)
     if dataclasses.is_dataclass(kind) or typing.get_origin(kind) is dict:
-        raise _refused(key, value, "which no card sets that is repeated")
+        raise _refused(key, value, "no card sets it")
     if any(part in (str, Path, Any, object) for part in parts):
-        raise _refused(key, value, "which may name a file or a repository")
-    if not (kind in PLAIN or is_enum(kind) or is_literal(kind) or _holds_numbers(value)):
-        raise _refused(key, value, "expected numbers")
+        raise _refused(key, value, "it may name a file or a repository")
+    if not (kind in PLAIN or is_enum(kind) or is_literal(kind)):
+        try:
+            checked(parsed(value), bool | float | list[bool | float | list[bool | float]])
+        except Malformed:
+            raise _refused(key, value, "expected numbers") from None
     return checked_value(key, kind, value)
 
 
-def _parsed(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        return None
-
-
-def _holds_numbers(text: str) -> bool:
-    """Whether a text is a JSON number or list of them, or of lists of them."""
-    found = _parsed(text)
-    lists = found if isinstance(found, list) else [found]
-    parts = [part for item in lists for part in (item if isinstance(item, list) else [item])]
-    return all(isinstance(part, int | float) for part in parts)
-
-
-def _renames_observations(found: Any) -> bool:
-    return isinstance(found, Mapping) and all(
-        isinstance(name, str) and OBSERVATION.fullmatch(name) for pair in found.items() for name in pair
-    )
-
-
-def _all_here(text: str) -> bool:
+def _are_here(text: str) -> bool:
     return all(SERVER.fullmatch(part.strip()) for part in text.split(","))
 
 
@@ -384,16 +350,20 @@ def _is_device_here(text: str) -> bool:
     return found is not None and int((found[2] or ":0")[1:]) < max(1, torch.cuda.device_count())
 
 
-EXPECTED: dict[tuple[str, ...], tuple[Callable[[str], Any], str]] = {
-    WORDS: (WORD.fullmatch, "words"),
-    NOTES: (str.isprintable, "a line of text"),
-    SERVERS: (_all_here, "this machine (127.0.0.1); name the server that you trust by --server host:port"),
-    ("device",): (_is_device_here, "cpu, mps, cuda or cuda:<number of a GPU that is here>"),
+TEXTS: dict[str, tuple[Callable[[str], Any], str]] = {
+    **dict.fromkeys(
+        (
+            *("size", "perception", "align", "subgoal_level", "memory_fusion", "memory_camera", "detector"),
+            *("dtype", "dialect", "gripper"),
+        ),
+        (WORD.fullmatch, "words"),
+    ),
+    **dict.fromkeys(("label", "keys"), (str.isprintable, "a line of text")),
+    **dict.fromkeys(SERVERS, (_are_here, "this machine (127.0.0.1); name a server that you trust by --server")),
+    "device": (_is_device_here, "cpu, mps, cuda or cuda:<number of a GPU that is here>"),
 }
+"""Text setting of a policy -> the check of its value, and the expected values."""
 
 
 def _refused(key: str, value: Any, why: str) -> MemobenchError:
-    return MemobenchError(
-        f"the card sets {key}={str(value)[:80]!r}, {why}; a card is data and is not repeated with it: run its command "
-        "yourself if you trust it"
-    )
+    return MemobenchError(f"the card sets {key}={str(value)[:80]!r}: {why}; run its command yourself if you trust it")

@@ -1,9 +1,9 @@
 """Roll out a policy in a batch of environments, one episode per row.
 
-The loop is LeRobot's: observation, processors, ``select_action``, processors, step. It differs in what it skips.
-Pictures are drawn only where the policy reads them; the processors of observations do not run at a step whose action
-is planned already. LeRobot seeds once per run; here the caller seeds each batch, so that an evaluation that is resumed
-or shared among machines draws the same numbers as an undisturbed one.
+The loop is LeRobot's: observation, processors, ``select_action``, processors, step. It skips unneeded work: pictures
+are drawn only where the policy reads them, and the processors of observations do not run at a step whose action is
+already planned. LeRobot seeds once per run; here the caller seeds each batch, so that an evaluation that is resumed or
+shared among machines draws the same numbers as an undisturbed one.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from lerobot_memobench.protocol import CLOCK
 PIXELS, PHASE, STEP = "pixels", "phase", "step"
 """Keys of the environment's observations; ``phase`` is 0 in the demonstration prompt and 1 in the execution."""
 KEEPS_ITS_NOISE = ("memobench_mem",)
-"""Policies that seed the noise of each episode from torch's initial seed, which must stay that of the run."""
+"""Policies that seed the noise of each episode from torch's initial seed: it must remain the seed of the run."""
 
 Ended = Callable[[NDArray[np.bool_]], None]
-"""Called after each step with the rows (B,) whose episode is over."""
+"""Called after each step with the finished rows (B,)."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = Non
         seeds: one per row.
     """
     actor.policy.reset()
-    # Without the option a frozen row would rest until the rollout after this one.
+    # Without the option a frozen row would stay frozen for this rollout.
     observation, _ = env.reset(seed=list(seeds), options={NEW_ROLLOUT_OPTION: True})
     limit = env.call("_max_episode_steps")[0]
     check_env_attributes_and_types(env)
@@ -88,7 +88,7 @@ def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = Non
 
 
 class Inputs:
-    """The inputs of a policy during a rollout, as new as the policy needs them."""
+    """The inputs of a policy during a rollout, updated as often as the policy needs."""
 
     def __init__(self, env: Any, actor: Actor) -> None:
         self._env, self._actor = env, actor
@@ -108,8 +108,8 @@ class Inputs:
     def of(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Return the policy's inputs.
 
-        Where its next action is planned, they are the last ones with the present clock. Where it reads no pictures,
-        the last pictures stand in.
+        Where its next action is planned, they are the previous inputs with the present clock. Where it reads no
+        pictures, they contain the previous pictures.
         """
         begins = self._phase is None or bool((observation[PHASE] != self._phase).any())
         self._phase = np.array(observation[PHASE])
@@ -131,7 +131,7 @@ class Inputs:
         return self._last
 
 
-# --- what a policy needs ---
+# --- the observations that a policy needs ---
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ class ChunkPolicy:
     """One of LeRobot's policies that plan action chunks.
 
     Attributes:
-        planned: whether the next action of one is planned.
-        read: `digest` of each ``select_action`` of which this is known.
+        planned: returns whether a policy's next action is planned.
+        read: `digest` of each version of ``select_action`` for which ``planned`` was written.
     """
 
     planned: Callable[[Any], bool]
@@ -154,7 +154,7 @@ KNOWN: dict[tuple[str, str], ChunkPolicy] = {
     ("lerobot.policies.pi0.modeling_pi0", "PI0Policy"): ChunkPolicy(
         lambda policy: bool(policy._action_queue), ("a330b536084c",)
     ),
-    # Its visual memory takes in the pictures of every step.
+    # Its visual memory reads the pictures of every step.
     ("lerobot.policies.pi05.modeling_pi05", "PI05Policy"): ChunkPolicy(
         lambda policy: not getattr(policy.config, "use_visual_memory", False) and bool(policy._action_queue),
         ("a330b536084c", "41d18fe29b12"),
@@ -182,16 +182,16 @@ def needs_observation(policy: Any) -> Callable[[], bool]:
 def has_planned_action(policy: Any) -> Callable[[], bool]:
     """Return the check, made after an action, whether a policy has planned the next one.
 
-    Its ``select_action`` then reads ``observation.phase`` and ``observation.step`` and nothing else. A policy defines
-    it as a method of that name. LeRobot's are known by the source of ``select_action``, since a subclass may act
-    otherwise (`diffusion` queues pictures at every step); of any other policy the answer is no.
+    Its ``select_action`` then reads ``observation.phase`` and ``observation.step`` only. A policy defines it as a
+    method of that name. LeRobot's policies are recognised by the source of ``select_action``, since a subclass may act
+    differently (`diffusion` queues pictures at every step); for any other policy the answer is no.
     """
     own: Callable[[], bool] | None = getattr(policy, "has_planned_action", None)
     if own is not None:
         return own
     acts: Any = getattr(type(policy), "select_action", None)
     for (module, name), known in KNOWN.items():
-        # A policy of a module that was not imported is not this one.
+        # A module that was not imported has no policy here.
         theirs: Any = getattr(getattr(sys.modules.get(module), name, None), "select_action", None)
         if theirs is not None and acts is theirs and digest(theirs) in known.read:
             return lambda: known.planned(policy)
@@ -199,7 +199,7 @@ def has_planned_action(policy: Any) -> Callable[[], bool]:
 
 
 def digest(function: Callable[..., Any]) -> str | None:
-    """Return the first digits of the hash of a function's source; None where it has none."""
+    """Return the first digits of the hash of a function's source; None without a source."""
     try:
         source = inspect.getsource(inspect.unwrap(function))
     except (OSError, TypeError):
@@ -219,7 +219,7 @@ class BatchSeeds:
 
     def __init__(self, policy: Any, seed: int) -> None:
         self._policy, self._seed = policy, seed
-        # A setting of the policy may have chosen the seeds of its own generators: they still count.
+        # The seeds of the policy's own generators may come from its settings: they are included.
         owned = vars(policy).items()
         self._own = {name: value.initial_seed() for name, value in owned if isinstance(value, torch.Generator)}
 

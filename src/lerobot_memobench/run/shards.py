@@ -1,33 +1,54 @@
-"""``lerobot eval … shards=8``: the parts of an evaluation as jobs of their own, then merged.
+"""Run the parts of an evaluation as jobs (``lerobot eval … shards=8``), and merge parts into one evaluation.
 
-A part is the same command with ``shard=i/n resume=true`` in a process of its own, here or on another machine that sees
-the same folder; so a killed part is gone on with, and a finished one is left alone.
+A part is the same command with ``shard=i/n resume=true`` in a process of its own, here or on another machine that has
+the same folder. So a killed part is resumed, and a finished part is skipped.
 """
 
 from __future__ import annotations
 
+import functools
+import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.policies.lerobot_config import parameters_of
+from lerobot_memobench.envs.episode_log import EXTENT, POLICY, differences, has_log, key_of, read_log, write_episodes
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of, read_evaluation, write_protocol
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import disagreement
+from lerobot_memobench.evaluation.records import read_protocol
+from lerobot_memobench.evaluation.report import write_report
+from lerobot_memobench.io import draft_of
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import LARGE, sharing
-from lerobot_memobench.policies.lerobot_config import parameters_of
-from lerobot_memobench.protocol import SEALED
-from lerobot_memobench.run.card import card_of
-from lerobot_memobench.run.merging import SHARDS, merge_held
-from lerobot_memobench.run.plan import EvaluationPlan, Shard
-from lerobot_memobench.run.run import EvaluationReport, Tell, check_folder, check_new, logged, made, resumed_card
+from lerobot_memobench.policies.memory_reads import MEMORY_READS
+from lerobot_memobench.run.card import card_of, first_variant_mismatch, extended, with_episodes, write_card
+from lerobot_memobench.run.plan import EvaluationPlan, Shard, with_changes
+from lerobot_memobench.run.run import (
+    VIDEOS,
+    EvaluationReport,
+    Note,
+    check_folder,
+    check_new,
+    logged,
+    made,
+    resumed_card,
+)
 
 LOGS = "logs"
+SHARDS = "shard-*-of-*"
+"""Folders of the parts of an evaluation, in its own."""
+
+
+# --- parts as jobs ---
 
 
 @dataclass(frozen=True)
@@ -36,21 +57,21 @@ class ShardJob:
 
     Attributes:
         program: arguments of Python that start ``lerobot`` in a process which ends when its standard input does.
-        flags: LeRobot's, without folders.
+        words: the command line of the evaluation after ``lerobot eval``, without folders and run options.
         out: folder of the evaluation.
-        episodes: (task, episode) of those that the part consists of.
+        episodes: (task, episode) of the part.
         directory: where relative paths are looked up.
-        beside: parts that run at once on the machine, this one included.
+        at_once: parts that run at the same time on its machine.
     """
 
     program: tuple[str, ...]
-    flags: tuple[str, ...]
+    words: tuple[str, ...]
     shard: Shard
     out: Path
     episodes: frozenset[tuple[str, int]]
     referent: str
     directory: Path
-    beside: int = 1
+    at_once: int = 1
 
     @property
     def folder(self) -> Path:
@@ -59,22 +80,22 @@ class ShardJob:
 
     @property
     def task_name(self) -> str:
-        """What the job is called where progress is told."""
+        """Name of the job in messages on progress."""
         return f"part {self.shard}"
 
     @property
     def seed(self) -> int:
-        """The part's number: jobs are told apart by it."""
+        """The part's number, which identifies the job."""
         return self.shard.number
 
     @property
     def arguments(self) -> list[str]:
         """The command line of the part, after ``lerobot``."""
-        return ["eval", f"output_dir={self.out}", f"shard={self.shard}", "resume=true", *self.flags]
+        return ["eval", *self.words, f"output_dir={self.out}", f"shard={self.shard}", "resume=true"]
 
     @property
     def messages(self) -> Path:
-        """File of what the part's process prints."""
+        """File for the output of the part's process."""
         return self.out / LOGS / f"{self.shard.folder}.log"
 
     def finished(self) -> bool:
@@ -86,10 +107,10 @@ class ShardJob:
         return None
 
     def run(self) -> None:
-        """Run the part in a process of its own, which ends when this one does.
+        """Run the part in a process of its own, which ends when this process does.
 
         Raises:
-            MemobenchError: it failed, with its own last word.
+            MemobenchError: it failed, with its error message.
         """
         self.messages.parent.mkdir(parents=True, exist_ok=True)
         with self.messages.open("ab") as file:
@@ -99,7 +120,7 @@ class ShardJob:
                 stdin=subprocess.PIPE,
                 stdout=file,
                 stderr=file,
-                env=sharing(self.beside),
+                env=sharing(self.at_once),
             )
             try:
                 status = process.wait()
@@ -108,69 +129,51 @@ class ShardJob:
                 process.wait()
                 raise
         if status:
+            lines = self.messages.read_text(errors="replace").splitlines()
+            errors = [line.removeprefix("lerobot: ") for line in lines if line.startswith("lerobot: ")]
             raise MemobenchError(
-                f"{self.task_name} ended with {self._reason(status)} (see {self.messages}); the same command "
-                "with resume=true goes on"
+                f"{self.task_name} ended with {errors[-1] if errors else f'status {status}'} (see {self.messages}); "
+                "resume by the same command with resume=true"
             )
 
-    def _reason(self, status: int) -> str:
-        """Return the sentence with which the process ended, its status where it left none."""
-        lines = self.messages.read_text(errors="replace").strip().splitlines()
-        said = [line.removeprefix("lerobot: ") for line in lines if line.startswith("lerobot: ")]
-        return said[-1] if said else f"status {status}"
 
-
-def plan_shards(plan: EvaluationPlan, program: Sequence[str], tell: Tell) -> list[ShardJob]:
+def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> list[ShardJob]:
     """Return a job for each part of an evaluation.
 
     Args:
         program: see `ShardJob`.
-        tell: told what matters and stops nothing.
+        note: called with notes.
 
     Raises:
-        MemobenchError: the number of parts or what is in the folders forbids it.
+        MemobenchError: there are more parts than batches, or the folders hold another evaluation.
     """
     options, grid, out = plan.options, plan.grid, plan.output.absolute()
-    if options.shards > len(grid.cells()):
-        raise MemobenchError(
-            f"shards={options.shards} is more than the {len(grid.cells())} batches that the evaluation consists of; "
-            "ask for fewer"
-        )
+    if options.shards > (batches := len(grid.cells())):
+        raise MemobenchError(f"found shards={options.shards} and only {batches} batches of episodes; ask for fewer")
+    own = dict.fromkeys(("shards", "workers", "slurm", "output_dir", "resume"))
+    words = with_changes(plan.command[2:], **own, batch_size=plan.batch)
     jobs = [
         ShardJob(
             program=tuple(program),
-            flags=(*plan.settings.words, *_part_options(plan)),
+            words=tuple(words),
             shard=shard,
             out=out,
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
             referent=plan.environment.referent,
             directory=Path.cwd(),
-            beside=1 if options.slurm is not None else min(options.workers or options.shards, options.shards),
+            at_once=1 if options.slurm is not None else min(options.workers or options.shards, options.shards),
         )
         for shard in (Shard(k + 1, options.shards) for k in range(options.shards))
     ]
-    _check_folders(plan, out, jobs, tell)
-    return jobs
-
-
-def _part_options(plan: EvaluationPlan) -> Iterator[str]:
-    """Yield the run options that each part has, too."""
-    if plan.split == SEALED:
-        yield f"split={SEALED}"
-    if plan.options.memory_reads:
-        yield "memory_reads=true"
-
-
-def _check_folders(plan: EvaluationPlan, out: Path, jobs: Sequence[ShardJob], tell: Tell) -> None:
-    """Refuse to mix an evaluation with another one in its folder or in those of its parts."""
     check_folder(out)
-    if plan.options.resume:
+    if options.resume:
         card = card_of(plan)
         for folder in (out, *(job.folder for job in jobs)):
-            resumed_card(folder, card, tell)
+            resumed_card(folder, card, note)
     else:
         for folder in (out, *out.glob(SHARDS)):
             check_new(folder)
+    return jobs
 
 
 def slurm_of(plan: EvaluationPlan) -> Slurm | None:
@@ -193,10 +196,10 @@ def run_shards(
     progress: ProgressCallback,
     finish: Callable[[Path, Sequence[Path]], Any],
 ) -> EvaluationReport | None:
-    """Run all parts, at once or some at a time, and merge them; None where they have been handed to Slurm.
+    """Run all parts, at once or some at a time, and merge them; return None where they were submitted to Slurm.
 
     Args:
-        finish: what Slurm's last job calls with the evaluation's folder and those of its parts. It is pickled.
+        finish: called by Slurm's last job with the evaluation's folder and those of its parts. It is pickled.
     """
     options, out, folders = plan.options, plan.output.absolute(), [job.folder for job in jobs]
     with made(out):
@@ -207,4 +210,170 @@ def run_shards(
             slurm=slurm_of(plan),
             finish=partial(finish, out, folders),
         )
-        return merge_held(out, [folder for folder in folders if has_log(folder)]) if complete else None
+        return _merge_and_report(out, [folder for folder in folders if has_log(folder)]) if complete else None
+
+
+# --- merging ---
+
+
+def part_folders(out: Path) -> list[Path]:
+    """Return the folders of an evaluation's parts that hold episodes."""
+    return sorted(folder for folder in out.glob(SHARDS) if folder.is_dir() and has_log(folder))
+
+
+def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
+    """Merge parts into the folder ``out`` and report the whole; see `merge`.
+
+    Raises:
+        MemobenchError: see `merge`; or another run writes to ``out``.
+    """
+    with made(out):
+        return _merge_and_report(out, folders)
+
+
+def _merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
+    absent = merge(out, folders)
+    report = EvaluationReport(write_report(out), absent)
+    if _names_policy(read_protocol(out), read_log(out)):
+        return report
+    note = f"{out} does not name the policy of its episodes: no part did"
+    return replace(report, run=replace(report.run, notes=[*report.run.notes, note]))
+
+
+def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
+    """Merge the logs, cards and videos of evaluations of one protocol into the folder ``out``.
+
+    Episodes of ``out`` are kept. Videos and memory reads are hard links where the disk allows it, else copies;
+    LeRobot's own files are not merged. All checks are made before the first file is written.
+
+    Returns:
+        (task, episode) of those that the cards ask for and no part holds.
+
+    Raises:
+        MemobenchError: there are no parts, protocols or policies differ, a part does not name its policy where
+            another does, variants were drawn by two rules, or an episode ended differently in two parts.
+    """
+    sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
+    if not folders:
+        raise MemobenchError(f"{out} holds no parts ({SHARDS}); name the folders to merge")
+    records = {source: read_log(source) for source in sources}
+    protocols = {source: read_protocol(source) for source in sources}
+    _check_protocols(protocols)
+    _check_policies(protocols, records)
+    _check_draws(records)
+    joined = join(records)
+    card = _joined_card(sources)
+    wanted = [] if card is None else _wanted(card)
+    stored = [*map(protocol_of, sources)]
+
+    out.mkdir(parents=True, exist_ok=True)
+    for source in folders:
+        if source != out:
+            _share(source / VIDEOS, out / VIDEOS, "*.mp4")
+            _share(source / MEMORY_READS, out / MEMORY_READS, "*.json.gz")
+    write_episodes(out, joined)
+    (out / EVALUATION_FILE).unlink(missing_ok=True)
+    if card is not None:
+        asked = set(wanted)
+        write_card(out, with_episodes(card, [each for each in joined if (each["task"], each["episode"]) in asked]))
+    elif all(stored):  # the first protocol that has a setting counts
+        settings = functools.reduce(lambda first, other: {**other, **first}, [*stored, *protocols.values()])
+        write_protocol(out, {key: value for key, value in settings.items() if key not in EXTENT})
+    present = {(record["task"], record["episode"]) for record in joined}
+    return [cell for cell in wanted if cell not in present]
+
+
+def _wanted(card: Mapping[str, Any]) -> list[tuple[str, int]]:
+    """Return (task, episode) of all episodes that a card's evaluation was asked for."""
+    asked, policy = card["protocol"], card["policy"]
+    base = asked.get("seed_base")
+    first = (policy.get("seed") or 0) - base if policy and isinstance(base, int) else 0
+    return [(task, first + run) for task in asked["tasks"] for run in range(asked["episodes"])]
+
+
+def _check_protocols(protocols: Mapping[Path, Mapping[str, Any]]) -> None:
+    (first, reference), *others = protocols.items()
+    for folder, protocol in others:
+        found = differences(reference, protocol, policy=True)
+        if found:
+            raise MemobenchError(
+                f"{first} and {folder} were run under different protocols ({'; '.join(found)}); merge parts of one "
+                "evaluation"
+            )
+
+
+def _names_policy(protocol: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether a folder names the policy of its episodes, in its protocol or card, or in every line."""
+    return bool(protocol[POLICY]) or all(record.get(POLICY) for record in records)
+
+
+def _check_policies(
+    protocols: Mapping[Path, Mapping[str, Any]], records: Mapping[Path, Sequence[Mapping[str, Any]]]
+) -> None:
+    """Refuse to merge episodes of an unknown policy with those of a known policy: all would get its name."""
+    named = {record[POLICY]: folder for folder, lines in records.items() for record in lines if record.get(POLICY)}
+    if len(named) > 1:
+        (a, mine), (b, other), *_ = named.items()
+        raise MemobenchError(f"{mine} holds episodes of {a} and {other} of {b}; merge parts of one evaluation")
+    unnamed = [folder for folder in protocols if not _names_policy(protocols[folder], records[folder])]
+    if unnamed and (named or len(unnamed) < len(protocols)):
+        raise MemobenchError(
+            f"{unnamed[0]} does not name the policy of its episodes, and another part does; evaluate the policy again "
+            "there, or leave that folder out"
+        )
+
+
+def _check_draws(records: Mapping[Path, Sequence[Mapping[str, Any]]]) -> None:
+    """Refuse to merge variants drawn by an earlier version with those of this version."""
+    problems = {folder: first_variant_mismatch(lines) for folder, lines in records.items()}
+    earlier = [folder for folder, problem in problems.items() if problem is not None]
+    if 0 < len(earlier) < len(records):
+        raise MemobenchError(
+            f"an earlier version ran the episodes in {earlier[0]} and drew other variants ({problems[earlier[0]]}); "
+            "leave that folder out"
+        )
+
+
+def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Return the episodes of all parts, sorted, each once.
+
+    Raises:
+        MemobenchError: two parts disagree about an episode.
+    """
+    found: dict[tuple[str, int, str], tuple[Path, Mapping[str, Any]]] = {}
+    for folder, records in parts.items():
+        for record in records:
+            known = found.setdefault(key_of(record), (folder, record))
+            problem = disagreement(known[1], record, f"in {known[0]}", f"in {folder}")
+            if problem is not None:
+                raise MemobenchError(f"{problem}; leave the wrong folder out")
+    return [dict(found[key][1]) for key in sorted(found)]
+
+
+def _joined_card(folders: Sequence[Path]) -> dict[str, Any] | None:
+    """Return one card for all folders, None where one of them has none."""
+    if not all(POLICY in read_evaluation(folder) for folder in folders):
+        return None
+    cards = {folder: read_evaluation(folder, whole=True) for folder in folders}
+    joined = functools.reduce(partial(extended, again=False), cards.values())
+    for folder, card in cards.items():
+        for name, value in card["task_files"].items():
+            if joined["task_files"][name] != value:
+                raise MemobenchError(
+                    f"the episodes of {name} in {folder} were run with other task files than the others"
+                )
+    return joined
+
+
+def _share(source: Path, target: Path, pattern: str) -> None:
+    """Link files of episodes into another folder, or copy them; existing ones are kept."""
+    for mine in sorted(source.glob(pattern)):
+        place = target / mine.name
+        if place.exists():
+            continue
+        target.mkdir(parents=True, exist_ok=True)
+        with draft_of(place) as draft:
+            try:
+                os.link(mine, draft)
+            except OSError:  # another disk, or one without links
+                shutil.copyfile(mine, draft)

@@ -22,6 +22,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     naming_damage,
     read_info,
 )
+from lerobot_memobench.envs.observations import check_obs_type
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import check_fetched
@@ -35,8 +36,9 @@ from lerobot_memobench.run.arguments import (
     TRAINING_OPTIONS,
     Arguments,
     LerobotArguments,
-    check_task_names,
     checked_value,
+    env_config,
+    policy_config,
     read_arguments,
     read_config_file,
     resolve_recipe,
@@ -77,7 +79,6 @@ def train(given: Arguments, line: Sequence[str], notify: Callable[[str], None]) 
     """
     begun = time.time()
     prompt_frames, obs_type, given = take_training_options(resolve_recipe(resumed(given)))
-    check_task_names(given)
     arguments = read_arguments("train", given)
     if given.wants_help:
         return run_lerobot(arguments.for_parser)
@@ -170,8 +171,6 @@ def complete_training(arguments: LerobotArguments, notify: Callable[[str], None]
         MemobenchError: no policy is named, a number is too small, the dataset or the checkpoint cannot be used, or a
             resumed training has other settings.
     """
-    from lerobot_memobench.run.plan import check_observations, env_config  # imports torch
-
     from_file = arguments.has(CONFIG_FILE)
     if not from_file:
         if not any(arguments.has(key) for key in TRAINED):
@@ -194,7 +193,9 @@ def complete_training(arguments: LerobotArguments, notify: Callable[[str], None]
         if changed:
             was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
             notify(f"note: '{path}' was trained with {was}; this training continues from its weights with {now}")
-    check_observations(policy, env_config(arguments))
+    environment: Any = env_config(arguments)
+    if environment is not None and environment.type == "memobench":
+        check_obs_type(policy, environment.obs_type)
     steps = whole_number(arguments.get("steps"))
     if steps is not None and steps < SHORT_TRAINING and arguments.get("resume") != "true":
         arguments = arguments.default("log_freq", max(1, steps // 10))
@@ -211,8 +212,6 @@ def parse_policy(arguments: LerobotArguments) -> tuple[LerobotArguments, Any]:
     Settings of a checkpoint that have no effect under the settings of the command line are reset to their defaults.
     """
     from draccus.utils import ParsingError
-
-    from lerobot_memobench.run.plan import policy_config
 
     try:
         return arguments, policy_config(arguments)

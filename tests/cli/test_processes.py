@@ -1,0 +1,397 @@
+"""Commands as processes: imports, SIGTERM, a second writer, and evaluations killed at random."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import random
+import shlex
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+
+from lerobot_memobench.cli.lerobot import main as lerobot
+from lerobot_memobench.cli.memobench import main as memobench
+from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.html.write import UNFINISHED
+from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.run.card import new_card, run_facts, write_card
+from tests.support import logs, synthetic_dataset
+from tests.support.fake_loop import DRAWER, STOVE, results
+from tests.support.fork_server import Fork, ForkServer
+from tests.support.object_dataset import make_object_dataset
+
+COMMANDS = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
+
+
+# --- imports ---
+
+KNOWN = """
+import sys
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+assert "memobench" in EnvConfig.get_known_choices()
+policies = {"memobench_mem", "memobench_expert", "memobench_random", "memobench_remote"}
+assert policies <= set(PreTrainedConfig.get_known_choices())
+found = {"mujoco", "robosuite"} & set(sys.modules) | {n for n in sys.modules if "memobench" in n and "modeling" in n}
+assert not found, found
+"""
+
+
+@pytest.mark.slow  # LeRobot's import, in each process; the discovery itself is part of the tests of a second writer
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import lerobot.scripts.lerobot_eval as s; s.register_third_party_plugins()",
+        "import lerobot_policy_memobench, lerobot.policies, lerobot.envs",
+        "import lerobot.envs, lerobot.policies, lerobot_policy_memobench",
+        "import lerobot_memobench.registration",
+    ],
+)
+def test_configurations_are_registered_without_the_simulator(first: str) -> None:
+    done = subprocess.run([sys.executable, "-c", first + "\n" + KNOWN], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_command_without_lerobot_does_not_import_it() -> None:
+    code = (
+        "import sys; from lerobot_memobench.cli.memobench import main; status = main(['tasks']); "
+        "heavy = {'lerobot', 'torch', 'mujoco'} & set(sys.modules); print(sorted(heavy), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+
+
+# --- a second writer ---
+
+EVALUATION = ["policy=memobench_random", f"tasks={STOVE}", "episodes=2", "policy.device=cpu", "output_dir=out"]
+EVAL = ["eval", "env=memobench", *EVALUATION]
+GENERATE = ["generate", "--tasks", STOVE, "--episodes", "1", "--out", "ds"]
+
+#: Command -> its exit status, and the place of its lock.
+WRITERS: dict[str, tuple[Callable[[], int], int, str]] = {
+    "evaluation": (lambda: lerobot(EVAL), 2, "out"),
+    "resumed evaluation": (lambda: lerobot([*EVAL, "resume=true"]), 2, "out"),
+    "evaluation with a log elsewhere": (lambda: lerobot([*EVAL, "env.log_dir=other"]), 2, "out"),
+    "parts of an evaluation": (lambda: lerobot([*EVAL, "shards=2", "batch_size=1"]), 2, "out"),
+    "sealed test": (lambda: memobench(["test-sealed", *EVALUATION]), 2, "out"),
+    "merge": (lambda: memobench(["merge", "out", "logged"]), 2, "out"),
+    "report": (lambda: memobench(["report", "logged"]), 0, "logged"),
+    "html": (lambda: memobench(["report", "logged", "--html", "html"]), 2, "html"),
+    "generation": (lambda: memobench(GENERATE), 2, "ds/.staging"),
+    "conversion": (lambda: memobench(["convert", "files", "--out", "ds"]), 2, "ds/.staging"),
+    "training": (
+        lambda: lerobot(["train", "policy=memobench_mem", "policy.device=cpu", "dataset=data", "output_dir=run"]),
+        2,
+        ".run.lock",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return synthetic_dataset.make_dataset(tmp_path_factory.mktemp("data") / "data")
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_a_second_writer_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, dataset: Path, command: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    for name in ("out/notes.json", "out/.1-a.part.evaluation.json", "run/model", "files/a.hdf5"):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text("of the first run")
+    parts: dict[str, Any] = {"protocol": {"tasks": [STOVE], "episodes": 2}, "policy": {}, "checkpoint": None}
+    started = [run_facts(["lerobot", "eval"], 1)]
+    write_card(Path("out"), new_card(**parts, trained_on=None, task_files={}, settings={}, runs=started))
+    for name in ("ds/.staging/episodes/.tmp-000000", "html/videos/run", "data"):
+        Path(name).mkdir(parents=True)
+    Path("html/index.html").write_text(UNFINISHED)
+    Path("html/videos/run/a.mp4").write_text("of the first run")
+    Path("ds/.staging/request.json").write_text("{}")
+    for path in dataset.iterdir():
+        Path("data", path.name).symlink_to(path)
+    Path(".run.lock").touch()
+    EpisodeLog("logged").append(logs.record(STOVE))
+
+    def files() -> dict[Path, bytes | None]:
+        return {path: path.read_bytes() if path.is_file() else None for path in tmp_path.rglob("*")}
+
+    run, status, place = WRITERS[command]
+    with locked(Path(place), Path("out")):
+        before = files()
+        assert run() == status
+        after = files()
+    if command == "html":  # the report itself is written next to the log, which is not locked
+        after = {path: content for path, content in after.items() if path in before}
+    assert after == before
+    assert "another run is writing" in capsys.readouterr().err
+
+
+# --- SIGTERM ---
+
+
+class Job:
+    """A process whose descendants are known by a word in their environment, whoever their parent has become."""
+
+    def __init__(self, words: list[str], folder: Path) -> None:
+        self.mark, self.folder = uuid.uuid4().hex, folder
+        self.process = subprocess.Popen(
+            [sys.executable, *words],
+            cwd=folder,
+            env={**os.environ, "MEMOBENCH_TEST_MARK": self.mark},
+            stdout=(folder / "out.txt").open("wb"),
+            stderr=(folder / "err.txt").open("wb"),
+        )
+
+    @property
+    def alive(self) -> set[int]:
+        """Numbers of its running processes."""
+        found = set()
+        for place in Path("/proc").iterdir():
+            with contextlib.suppress(OSError):
+                if place.name.isdecimal() and self.mark.encode() in (place / "environ").read_bytes():
+                    found.add(int(place.name))
+        return found
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        """Wait for a condition; the test's own limit of time ends the waiting."""
+        while not condition():
+            assert self.process.poll() is None, (self.folder / "err.txt").read_text()
+            time.sleep(0.1)
+
+    def end(self) -> str:
+        """End it as Slurm does; return its message. No process may be left a moment later."""
+        assert len(self.alive) > 1  # else the check below would be empty
+        self.process.terminate()
+        try:
+            assert self.process.wait(30) == 128 + signal.SIGTERM
+            deadline = time.monotonic() + 10
+            while self.alive and time.monotonic() < deadline:
+                time.sleep(0.1)
+            assert not self.alive
+        finally:
+            for pid in self.alive:
+                os.kill(pid, signal.SIGKILL)
+        lines = (self.folder / "err.txt").read_text().splitlines()
+        return next(line for line in lines if "ended by SIGTERM" in line)
+
+
+TREE = """
+import subprocess, sys, time
+from pathlib import Path
+from lerobot_memobench.jobs.processes import process_pool, saying_how_to_go_on
+
+def work(number):
+    subprocess.Popen(["sleep", "600"], start_new_session=True)
+    Path(f"begun-{number}").touch()
+    time.sleep(600)
+
+if __name__ == "__main__":
+    with saying_how_to_go_on("a", lambda: "outer"), saying_how_to_go_on("b", lambda: "resume"):
+        with process_pool(2) as pool:
+            list(pool.map(work, range(2)))
+"""
+linux = pytest.mark.skipif(sys.platform != "linux", reason="processes are looked up in /proc")
+
+
+@linux
+def test_all_processes_end(tmp_path: Path) -> None:
+    (tmp_path / "tree.py").write_text(TREE)
+    job = Job(["tree.py"], tmp_path)
+    job.wait_until(lambda: len(list(tmp_path.glob("begun-*"))) == 2)
+    assert job.end() == "b: ended by SIGTERM; resume"
+
+
+def test_another_handler_of_the_signal_is_kept(tmp_path: Path) -> None:
+    code = (
+        "import os, signal\n"
+        "from lerobot_memobench.jobs.processes import saying_how_to_go_on\n"
+        "signal.signal(signal.SIGTERM, lambda *_: os._exit(7))\n"
+        "with saying_how_to_go_on('a', lambda: 'not printed'):\n    os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (7, "")
+
+
+@pytest.mark.parametrize(("words", "verb"), [(["cache", "nowhere"], "resume"), (["tasks", "--json"], "start again")])
+def test_each_command_names_the_way_to_resume(words: list[str], verb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lerobot_memobench.cli import console
+    from lerobot_memobench.cli import memobench as commands
+
+    printed: list[str] = []
+
+    @contextlib.contextmanager
+    def saying(program: str, how: Callable[[], str]) -> Iterator[None]:
+        printed.append(f"{program}: {how()}")
+        raise MemobenchError("not now")
+        yield
+
+    before = signal.getsignal(signal.SIGTERM)
+    assert memobench(["tasks", "--help"]) == 0
+    assert signal.getsignal(signal.SIGTERM) is before
+    monkeypatch.setattr(console, "saying_how_to_go_on", saying)
+    monkeypatch.setattr(commands, "use_threads", lambda role: None)
+    assert memobench(words) == 2
+    assert printed == [f"memobench: {verb} with: {shlex.join(['memobench', *words])}"]
+
+
+@linux
+@pytest.mark.slow
+def test_a_generation_is_ended(tmp_path: Path) -> None:
+    words = ["generate", "--out", "my data", "--tasks", STOVE, "--no-images", "--episodes", "200", "--workers", "2"]
+    job = Job(["-m", COMMANDS["memobench"], *words], tmp_path)
+    job.wait_until(lambda: any((tmp_path / "my data" / ".staging").glob("*/*/*")))
+    assert job.end() == f"memobench: ended by SIGTERM; resume with: {shlex.join(['memobench', *words])}"
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("parts", [False, True])
+def test_an_evaluation_is_ended(tmp_path: Path, parts: bool) -> None:
+    words = ["eval", "env=memobench", f"tasks={STOVE}", "obs_type=environment_state_agent_pos", "episodes=40"]
+    words += ["shards=2"] if parts else ["batch_size=2"]
+    job = Job(["-m", COMMANDS["lerobot"], *words], tmp_path)
+    job.wait_until(lambda: any(tmp_path.rglob("episodes/*.jsonl")))
+    again = shlex.split(job.end().partition("resume with: ")[2])
+    assert again[: len(words) + 1] == ["lerobot", *words]
+    assert again[-2] == "resume=true"
+    folder = tmp_path / again[-1].removeprefix("output_dir=")
+    assert any(folder.rglob("episodes/*.jsonl"))
+
+
+@linux
+@pytest.mark.slow
+def test_a_training_is_ended_and_resumed(tmp_path: Path) -> None:
+    make_object_dataset(tmp_path / "data")
+    words = ["train", "policy=memobench_mem", "size=tiny", "perception=objects", "dataset=data", "steps=100000"]
+    words += ["save_freq=5", "num_workers=1", "batch_size=2", "prompt_frames=false"]
+    job = Job(["-m", COMMANDS["lerobot"], *words], tmp_path)
+    job.wait_until(lambda: any(tmp_path.glob("outputs/train/*/*/checkpoints/last")))
+    again = shlex.split(job.end().partition(" with: ")[2])
+    program, train, output, resume, kept = again
+    assert (program, train, resume, kept) == ("lerobot", "train", "resume=true", "prompt_frames=false")
+    (run,) = tmp_path.glob("outputs/train/*/*")
+    assert tmp_path / output.removeprefix("output_dir=") == run
+    before = (run / "checkpoints" / "last").resolve().name
+    job = Job(["-m", COMMANDS["lerobot"], *again[1:]], tmp_path)
+    job.wait_until(lambda: (run / "checkpoints" / "last").resolve().name != before)
+    assert int((run / "checkpoints" / "last").resolve().name) > int(before)
+    job.end()
+
+
+# --- evaluations killed twenty times at random moments ---
+
+KILLS = 20
+COMMON = ["env=memobench", "env.render=fast", "env.videos=-1", "batch_size=2"]
+COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would start for longer than an episode lasts
+TWO = f"tasks={STOVE},{DRAWER}"
+EVALUATIONS = {
+    # Within the horizon the expert reaches the stove's first checkpoint in some episodes.
+    "expert": [TWO, "episodes=6", "horizon=70"],
+    # The random policy draws from a generator of its own; its actions show in the videos.
+    "random": [TWO, "policy=memobench_random", "episodes=6", "horizon=40"],
+    # Each scene with each variant, and a pause within 120 steps.
+    "evidence and pauses": [
+        *("policy=memobench_random", "evidence=true", "referent=random", "episodes=6", "horizon=130", "pause_steps=10"),
+        *("tasks=put_the_butter_into_the_bowl_from_the_prompt_video", "demonstration_prompt=false"),
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ForkServer]:
+    """Forks of a process with LeRobot: its import takes longer than an episode."""
+    modules = ("lerobot_memobench.envs.memobench_env", "lerobot_memobench.run.run", "lerobot_memobench.cli.lerobot")
+    forks = ForkServer(modules)
+    yield forks
+    forks.close()
+
+
+def start(server: ForkServer, out: Path, settings: list[str], resume: bool = True) -> Fork:
+    words = ["eval", *COMMON, *settings, f"output_dir={out}", *(["resume=true"] if resume else [])]
+    code = f"from lerobot_memobench.cli.lerobot import main; raise SystemExit(main({words!r}))"
+    return server.start(code, out.with_suffix(".txt"))
+
+
+def episodes_in(out: Path) -> int:
+    return len(read_episodes(out)) if has_log(out) else 0
+
+
+def kill_sometime(process: Fork, out: Path, rng: random.Random, run_s: float) -> bool:
+    """Kill a run at a random moment; return whether it was still running.
+
+    A third of the kills fall anywhere in the time that an undisturbed run takes, the others soon after an episode has
+    ended, where the writing is.
+    """
+    before = episodes_in(out)
+    if rng.random() < 1 / 3:
+        deadline = time.monotonic() + rng.uniform(0, run_s)
+    else:
+        while process.poll() is None and episodes_in(out) == before:
+            time.sleep(0.01)
+        deadline = time.monotonic() + rng.choice([0, rng.uniform(0, 0.1), rng.uniform(0, run_s / 4)])
+    while process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return process.poll() is None and process.kill()
+
+
+def comparable(out: Path) -> list[Any]:
+    """Results without times and names of runs, and the hash of every video's frames."""
+    log, *others = results(str(out))
+    videos = {}
+    for path in sorted((out / "videos").glob("*.mp4")):
+        digest = hashlib.sha256()
+        with av.open(str(path)) as container:
+            for frame in container.decode(video=0):
+                digest.update(frame.to_ndarray(format="rgb24").tobytes())
+        videos[path.name] = digest.hexdigest()
+    return [[{key: value for key, value in line.items() if key != "run"} for line in log], *others, videos]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3 * 3600)
+@pytest.mark.parametrize("name", EVALUATIONS)
+def test_resume_after_twenty_kills_equals_undisturbed_run(server: ForkServer, tmp_path: Path, name: str) -> None:
+    settings, undisturbed, killed = EVALUATIONS[name], tmp_path / "undisturbed", tmp_path / "killed"
+    began = time.monotonic()
+    assert start(server, undisturbed, settings, resume=False).wait() == 0
+    run_s = time.monotonic() - began
+    rng, kills, history = random.Random(f"{settings}"), 0, []
+    while kills < KILLS:
+        process = start(server, killed, settings)
+        if kill_sometime(process, killed, rng, run_s):
+            kills += 1
+            history.append(episodes_in(killed))
+        else:
+            assert process.wait() == 0
+            forget(killed, rng)
+    assert start(server, killed, settings).wait() == 0
+    print(f"{kills} kills of runs that take {run_s:.0f} s; episodes in the log after each: {history}")
+    assert comparable(killed) == comparable(undisturbed)
+    assert not [path for path in killed.rglob("*") if path.name.endswith(".part")]
+
+
+def forget(out: Path, rng: random.Random) -> None:
+    """Take half of the episodes out of a finished evaluation."""
+    records = read_episodes(out)
+    kept = rng.sample(records, len(records) // 2)
+    for file in (out / "episodes").glob("*.jsonl"):
+        file.unlink()
+    lost = [record for record in records if record not in kept]
+    from lerobot_memobench.envs.episode_log import write_episodes
+
+    write_episodes(out, kept)
+    for record in lost:
+        (out / "videos" / f"{record['task']}.{record['episode']}.mp4").unlink()

@@ -1,0 +1,129 @@
+"""The evaluation loop without a policy and a simulator: it writes the log that they would leave."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
+from lerobot_memobench.envs.evaluation_file import write_protocol
+from lerobot_memobench.run.plan import Cell, EvaluationPlan
+from lerobot_memobench.tasks.catalogue import load_task
+from lerobot_memobench.tasks.task import Task
+
+STOVE = "turn_on_the_stove_and_turn_it_off"
+DRAWER = "check_the_top_drawer_of_the_cabinet"
+
+
+class Killed(Exception):
+    """The run ends here."""
+
+
+class FakeLoop:
+    """Replacement of `run.evaluate.evaluate` that records its arguments.
+
+    Attributes:
+        plans: of each call. cells: batches of each call.
+        ran: (task, episode) simulated, in order.
+        kill_after: the run ends when this number of further episodes is logged.
+        changed: fields that records get instead of their usual ones.
+        before: called with the plan when a call begins.
+    """
+
+    def __init__(self) -> None:
+        self.plans: list[EvaluationPlan] = []
+        self.cells: list[Sequence[Cell]] = []
+        self.ran: list[tuple[str, int]] = []
+        self.kill_after: int | None = None
+        self.changed: dict[str, Any] = {}
+        self.before: Callable[[EvaluationPlan], object] = lambda plan: None
+
+    def __call__(self, plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: Any) -> None:
+        self.plans.append(plan)
+        self.cells.append(cells)
+        begin()
+        self.before(plan)
+        log = EpisodeLog(plan.log, partial(write_protocol, plan.log, plan.environment.settings.protocol_block))
+        logged = read_episodes(plan.log) if has_log(plan.log) else []
+        skipped = {(record["task"], record["episode"]) for record in logged}
+        for cell in cells:
+            for name, episode in plan.grid.episodes(cell):
+                if (name, episode) in skipped:
+                    continue
+                if self.kill_after is not None:
+                    if self.kill_after == 0:
+                        raise Killed
+                    self.kill_after -= 1
+                self.ran.append((name, episode))
+                log.append(self.record(load_task(cell[0].folder), episode, plan.environment.seed_base + episode))
+            advance(len(self.ran), len(self.ran), cell[0].name)
+
+    def record(self, task: Task, episode: int, seed: int) -> dict[str, Any]:
+        return {
+            "task": task.name,
+            "memory_type": task.memory_type,
+            "episode": episode,
+            "seed": seed,
+            "referent": "fixed",
+            "replan_steps": None,
+            "success": seed % 2 == 1,
+            "steps": 100 + seed,
+            "checkpoints": [
+                {"operation": c.operation, "first_step": seed, "ordered_step": seed} for c in task.checkpoints
+            ],
+            "failure": None if seed % 2 else "storage_failure",
+            "scene_hash": f"{task.name[:4]}{seed:012d}",
+            "wall_s": 1.0,
+            **self.changed,
+        }
+
+    def killed_after(self, count: int, *words: str) -> None:
+        """Run ``lerobot`` and end it after a number of episodes."""
+        self.kill_after = count
+        with pytest.raises(Killed):
+            main(words)
+        self.kill_after = None
+        self.ran.clear()
+
+
+@pytest.fixture
+def fake_loop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLoop:
+    """The loop is replaced, and the current folder is an empty one."""
+    import lerobot_policy_memobench  # noqa: F401 - LeRobot would find it by a search of all installed packages
+
+    monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.chdir(tmp_path)
+    fake = FakeLoop()
+    monkeypatch.setattr("lerobot_memobench.run.run.evaluate", fake)
+    return fake
+
+
+def make_checkpoint(folder: Path, kind: str = "memobench_random", **config: Any) -> Path:
+    """Write a checkpoint folder of a policy that needs no statistics."""
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"type": kind, "device": "cpu", **config}))
+    save_file({"weight": np.zeros(1, np.float32)}, folder / "model.safetensors")
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (folder / name).write_text(json.dumps({"name": name, "steps": []}))
+    return folder
+
+
+def content(folder: Path) -> dict[Path, bytes]:
+    """Return the bytes of every file below a folder."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def results(folder: str) -> list[Any]:
+    """Return log, outcomes on the card and report of an evaluation, without times."""
+    log = [{key: value for key, value in line.items() if key != "wall_s"} for line in read_episodes(Path(folder))]
+    card, report = (json.loads(Path(folder, name).read_text()) for name in ("evaluation.json", "report.json"))
+    return [log, card["episodes"], report]
