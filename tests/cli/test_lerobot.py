@@ -385,8 +385,8 @@ def test_a_training_goes_on_as_it_was_begun(training: Called, capsys: pytest.Cap
     checkpoint = training_run(Path("run"))
     words = ["train", "output_dir=run", "resume=true"]
     free = ["steps=100", "save_freq=5", "num_workers=0", "device=cpu", "log_freq=1", "policy.n_action_steps=1"]
-    same = ["align=none", "size=tiny", "policy.memory_stride=1", "policy.push_to_hub=false"]
-    assert main([*words, *free, *same, "--policy.memory_settings", "{frames: 32}"]) == 0
+    same = ["align=none", "size=tiny", "policy.push_to_hub=false"]
+    assert main([*words, *free, *same, "--policy.memory_stride", "1"]) == 0
     assert capsys.readouterr().err == ""
     training.flags = None
     for changed, said in {

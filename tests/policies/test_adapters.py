@@ -31,7 +31,7 @@ def test_memory_and_heads_are_trained_whole_and_nothing_else(dataset_root: Path,
 def test_what_is_asked_for_is_trained_whole_too(dataset_root: Path) -> None:
     policy, *_ = made_for_training(dataset_root)
     assert policy.trained_whole(["action_out_proj"]) == ["action_out_proj", *policy.trained_whole()]
-    assert policy.trained_whole(["model.modulators"]).count("model.modulators") == 1
+    assert policy.trained_whole(["model.modulators.0"]).count("model.modulators.0") == 1
 
 
 def test_adapters_are_made_beside_memory_and_heads(dataset_root: Path, tmp_path: Path) -> None:
