@@ -233,15 +233,15 @@ def test_states_longer_than_the_base_weights_are_refused() -> None:
 def test_history_without_reset_is_bounded(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Frames.capacity == 8192
     monkeypatch.setattr(Frames, "capacity", 16)
-    spec = MemorySpec(dim=2, tokens=1, width=2, expert=2, frames=4, grid=0, stride=1)
-    mechanism = Frames(spec, torch.nn.Identity(), Frames.Settings())
+    spec = MemorySpec(dim=2, tokens=1, width=2, expert=2, grid=0, stride=1)
+    mechanism = Frames(spec, torch.nn.Identity(), Frames.Settings(frames=4))
     state = mechanism.init(1)
     with caplog.at_level(logging.WARNING):
         for step in range(50):
             state = mechanism.observe(state, torch.full((1, 1, 2), float(step)), torch.tensor([step]))
             read = mechanism.read(state)
             assert read.steps is not None
-            assert read.steps[read.mask].tolist() == list(mechanism.slots(step, 4)), "as in training"
+            assert read.steps[read.mask].tolist() == list(mechanism.slots(step, mechanism.settings)), "as in training"
     assert [frame.step for frame in state[0]] == list(range(34, 50))
     assert read.steps.tolist() == [[34, 39, 44, 49]]
     assert len(caplog.messages) == 1

@@ -53,13 +53,14 @@ class Norm(nn.Module):
 
     def __init__(self, norm: nn.Module, modulator: MemoryModulator, passes: Passes) -> None:
         super().__init__()
-        self.norm, self.modulator, self.passes = norm, modulator, [passes]
+        self.norm, self.modulators, self.passes = norm, [modulator], [passes]  # lists are not registered
 
     def forward(self, x: Tensor, cond: Tensor) -> tuple[Tensor, Tensor]:
         normed, gate = self.norm(x, cond=cond)
         reading = self.passes[0].reading
         assert isinstance(reading, ModulatedReading)
-        scale, shift = self.modulator(rms_norm(x), reading.memory, self.modulator.keys(reading.memory))
+        (modulator,) = self.modulators
+        scale, shift = modulator(rms_norm(x), reading.memory, modulator.keys(reading.memory))
         return normed * (1.0 + scale) + shift, gate
 
 

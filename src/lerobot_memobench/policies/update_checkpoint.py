@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -83,7 +84,7 @@ def update_checkpoint(folder: Path) -> list[str]:
     if any(NESTED.search(name) for name in tensor_names(folder / WEIGHTS_FILE)):
         state = folder.parent / "training_state"
         if state.is_dir():
-            state.rename(state.with_name("training_state.earlier"))
+            shutil.move(state, state.with_name("training_state.earlier"))
             notes.append(
                 f"the training cannot be resumed: its parameters had another order; begin with policy={folder}"
             )

@@ -515,8 +515,9 @@ class MemobenchMemConfig(PI05Config):
     @property
     def fixed_by_training(self) -> tuple[str, ...]:
         """Fields that must keep their values when a checkpoint acts or its training is resumed, ours first."""
+        ours = [*MemobenchMemConfig.__annotations__]
         names = [one.name for one in fields(self) if one.name not in MAY_DIFFER]
-        return tuple(sorted(names, key=lambda name: name not in MemobenchMemConfig.__annotations__))
+        return tuple(sorted(names, key=lambda name: ours.index(name) if name in ours else len(ours)))
 
     kept_since_begun = fixed_by_training
 

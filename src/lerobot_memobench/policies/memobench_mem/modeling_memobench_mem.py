@@ -83,7 +83,7 @@ from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # 
 logger = logging.getLogger(__name__)
 
 OWN_MODULES = (
-    *("model.memory", "model.memory_to_expert", "model.modulators", "alignment", "model.foresight", "model.subgoal"),
+    *("model.memory", "model.memory_to_expert", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
 )
 """Suffixes of the names of modules that plain pi0.5 does not have; with adapters (``--peft…``), all their weights are
@@ -572,6 +572,7 @@ class MemobenchMemPolicy(PI05Policy):
         """Return peft's ``modules_to_save``: the modules ``asked`` for, and the model's memory and heads."""
         names = [name for name, _ in self.named_modules()]
         own = [end for end in OWN_MODULES if any(name == end or name.endswith(f".{end}") for name in names)]
+        own += [name for name in names if name.removeprefix("model.modulators.").isdecimal()]  # peft takes no list
         return [*asked, *(end for end in own if end not in set(asked))]
 
 
