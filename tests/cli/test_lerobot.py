@@ -21,10 +21,10 @@ from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
-from lerobot_memobench.policies.lerobot_config import overrides
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint, folder_with_checkpoint
+from lerobot_memobench.policies.lerobot_config import overrides
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import OPTIONS, SHORT_FORMS, split_arguments

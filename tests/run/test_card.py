@@ -11,15 +11,15 @@ from typing import Any
 import huggingface_hub
 import pytest
 
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreement, outcome
+from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.run.card import (
-    first_variant_mismatch,
     extended,
+    first_variant_mismatch,
     joined_runs,
     new_card,
     policy_facts,

@@ -15,10 +15,10 @@ from safetensors.numpy import save_file
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.weights import SHIPPED
+from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.run import rerun
 from lerobot_memobench.run.card import new_card, run_facts, with_episodes, write_card
 from lerobot_memobench.run.plan import plan_line

@@ -23,7 +23,6 @@ import yaml
 from draccus.parsers.config_parsers import JSONParser, YAMLParser
 from draccus.utils import DecodingError, is_choice_type, is_enum, is_literal, is_union
 
-from lerobot_memobench.policies.lerobot_config import overrides, quiet
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import (
     check_checkpoint,
@@ -32,6 +31,7 @@ from lerobot_memobench.policies.checkpoint import (
     looks_local,
     shipped_policies,
 )
+from lerobot_memobench.policies.lerobot_config import overrides, quiet
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig

@@ -16,7 +16,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.envs.episode_log import INPUTS, key_of
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, FORMAT
 from lerobot_memobench.envs.observations import policy_inputs
@@ -25,6 +24,7 @@ from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.io import Count, file_hash, read_json, write_file
 from lerobot_memobench.jobs.threads import cores, cpu_model
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
+from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.run.plan import EvaluationPlan
 
 PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "robosuite", "torch", "transformers", "numpy", "gymnasium")

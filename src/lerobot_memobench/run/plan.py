@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
 from lerobot_memobench.envs.settings import OBJECTS, PIXELS
@@ -23,6 +22,7 @@ from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.compatibility import check_features
+from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.protocol import (
     EVALUATION_EPISODES,
     EVALUATION_SEED,

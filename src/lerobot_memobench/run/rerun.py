@@ -21,7 +21,6 @@ from annotated_types import Ge, Le
 from draccus.utils import is_enum, is_literal, is_union
 from lerobot.configs.eval import EvalPipelineConfig
 
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.envs.episode_log import MOST_EPISODES, OMITTED, differences, read_log
 from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
 from lerobot_memobench.envs.pacing import longest
@@ -30,6 +29,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.io import Malformed, checked, count_of, parsed
 from lerobot_memobench.policies.checkpoint import local_folder
+from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.protocol import HORIZON, SEALED
 from lerobot_memobench.run.arguments import (
     PLAIN,
@@ -41,7 +41,7 @@ from lerobot_memobench.run.arguments import (
     setting_types,
     without_none,
 )
-from lerobot_memobench.run.card import PACKAGES, detector_hash, first_variant_mismatch, drawn_with, versions
+from lerobot_memobench.run.card import PACKAGES, detector_hash, drawn_with, first_variant_mismatch, versions
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
 from lerobot_memobench.tasks.task import PUBLISHED

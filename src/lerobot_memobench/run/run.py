@@ -19,9 +19,9 @@ from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import (
     card_of,
-    first_variant_mismatch,
     drawn_with,
     extended,
+    first_variant_mismatch,
     with_checkpoint,
     with_episodes,
     write_card,

@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NotRequired
 
-from lerobot_memobench.policies.lerobot_config import SEALED_LEDGER
 from lerobot_memobench.envs.evaluation_file import SealedStart
 from lerobot_memobench.io import Malformed, checked, count_of, parsed, telling_of_the_disk
 from lerobot_memobench.jobs.processes import taking_turns
+from lerobot_memobench.policies.lerobot_config import SEALED_LEDGER
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.card import PACKAGES, versions
 from lerobot_memobench.run.plan import EvaluationPlan

@@ -18,7 +18,6 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import portable_path
-from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.run.arguments import (
     CONFIG_FILE,
     Arguments,

@@ -17,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.policies.lerobot_config import parameters_of
 from lerobot_memobench.envs.episode_log import EXTENT, POLICY, differences, has_log, key_of, read_log, write_episodes
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of, read_evaluation, write_protocol
 from lerobot_memobench.errors import MemobenchError
@@ -29,8 +28,9 @@ from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import LARGE, sharing
+from lerobot_memobench.policies.lerobot_config import parameters_of
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
-from lerobot_memobench.run.card import card_of, first_variant_mismatch, extended, with_episodes, write_card
+from lerobot_memobench.run.card import card_of, extended, first_variant_mismatch, with_episodes, write_card
 from lerobot_memobench.run.plan import EvaluationPlan, Shard, with_changes
 from lerobot_memobench.run.run import (
     VIDEOS,

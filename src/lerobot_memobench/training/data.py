@@ -20,7 +20,14 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from lerobot_memobench.datasets.frames import Encoded, FrameLookup, Remember, TextEncoder, read_frame_table, read_recorded
+from lerobot_memobench.datasets.frames import (
+    Encoded,
+    FrameLookup,
+    Remember,
+    TextEncoder,
+    read_frame_table,
+    read_recorded,
+)
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, read_info, without_pattern
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
