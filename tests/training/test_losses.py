@@ -15,7 +15,14 @@ from lerobot_memobench.policies.memobench_mem.losses import counted_actions, mea
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
 from tests.support import rank_case
 from tests.support.fork_server import ForkServer
-from tests.support.small_policy import CHUNK, batch_of, draw_modulation, made_for_training, open_small_training, small_config
+from tests.support.small_policy import (
+    CHUNK,
+    batch_of,
+    draw_modulation,
+    made_for_training,
+    open_small_training,
+    small_config,
+)
 
 
 @pytest.mark.parametrize("memory", ["none", "frames"])
