@@ -37,7 +37,7 @@ OBJECT = np.dtype(
     [("kind", "u1"), ("scene", "u1"), ("near", "?"), ("lit", "?"), ("detected_lit", "?"), ("error", "<f4")]
 )
 """Outcome of an object that a camera shows. ``near``: the hand is within `NEAR`. ``error``: of its position, cm,
-infinite if it is missed. ``lit``: it stands in a highlight; ``detected_lit``: the detector agrees."""
+infinite if it is missed. ``lit``: it is in a highlight; ``detected_lit``: the detector agrees."""
 
 Outcomes = NDArray[np.void]
 """Outcomes (n,) of dtype `OBJECT`."""

@@ -326,7 +326,7 @@ def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> Dat
 
 
 def quicker_in_bfloat16() -> bool:
-    """Return whether this CPU has instructions that make products in bfloat16 faster; False if torch cannot tell.
+    """Return whether this CPU has instructions that make products in bfloat16 faster; False if torch does not know it.
 
     The answer depends on the instructions and not on a measurement, so that a machine always learns the same. With
     ``avx512_bf16`` an AMD EPYC made twice as many products per second as in float32; an Intel Xeon without AMX, which
