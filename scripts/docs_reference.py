@@ -465,7 +465,7 @@ def tasks_page(suite: str) -> str:
     if suite == "strict":
         parts.append(
             "The robot [idles](protocol.md#idling) before each execution. [Limitations of this "
-            "suite](suites.md#what-the-strict-suite-does-not-show)."
+            "suite](suites.md#limits-of-the-strict-suite)."
         )
     kind = None
     for number, name in enumerate(task_names(suite=suite), 1):

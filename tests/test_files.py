@@ -15,9 +15,9 @@ from lerobot_memobench.io import (
     as_path,
     disk_refusal,
     draft_of,
+    explaining_disk_errors,
     file_name,
     remove_drafts,
-    telling_of_the_disk,
     write_file,
 )
 from lerobot_memobench.tasks.catalogue import task_names
@@ -98,11 +98,11 @@ def test_what_a_disk_answers_is_found_however_it_is_told() -> None:
 
 def test_what_cannot_be_read_is_not_said_to_be_unwritable(tmp_path: Path) -> None:
     elsewhere = PermissionError(errno.EACCES, "Permission denied", "/source/a.hdf5")
-    with pytest.raises(PermissionError), telling_of_the_disk(tmp_path / "out"):
+    with pytest.raises(PermissionError), explaining_disk_errors(tmp_path / "out"):
         raise elsewhere
     here = PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "out" / "a"))
     told = pytest.raises(MemobenchError, match=r"out cannot be written \(Permission denied; .*; b")
-    with told, telling_of_the_disk(tmp_path / "out", "b"):
+    with told, explaining_disk_errors(tmp_path / "out", "b"):
         raise here
 
 

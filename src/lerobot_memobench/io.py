@@ -144,7 +144,7 @@ def disk_refusal(error: BaseException) -> str | None:
 
 
 @contextlib.contextmanager
-def telling_of_the_disk(out: Path, kept: str = "") -> Iterator[None]:
+def explaining_disk_errors(out: Path, kept: str = "") -> Iterator[None]:
     """Turn a disk error in writing below ``out`` into a `MemobenchError`.
 
     Args:

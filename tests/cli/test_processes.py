@@ -191,7 +191,7 @@ class Job:
 TREE = """
 import subprocess, sys, time
 from pathlib import Path
-from lerobot_memobench.jobs.processes import process_pool, saying_how_to_go_on
+from lerobot_memobench.jobs.processes import process_pool, adding_resume_hint
 
 def work(number):
     subprocess.Popen(["sleep", "600"], start_new_session=True)
@@ -199,7 +199,7 @@ def work(number):
     time.sleep(600)
 
 if __name__ == "__main__":
-    with saying_how_to_go_on("a", lambda: "outer"), saying_how_to_go_on("b", lambda: "resume"):
+    with adding_resume_hint("a", lambda: "outer"), adding_resume_hint("b", lambda: "resume"):
         with process_pool(2) as pool:
             list(pool.map(work, range(2)))
 """
@@ -217,9 +217,9 @@ def test_all_processes_end(tmp_path: Path) -> None:
 def test_another_handler_of_the_signal_is_kept(tmp_path: Path) -> None:
     code = (
         "import os, signal\n"
-        "from lerobot_memobench.jobs.processes import saying_how_to_go_on\n"
+        "from lerobot_memobench.jobs.processes import adding_resume_hint\n"
         "signal.signal(signal.SIGTERM, lambda *_: os._exit(7))\n"
-        "with saying_how_to_go_on('a', lambda: 'not printed'):\n    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "with adding_resume_hint('a', lambda: 'not printed'):\n    os.kill(os.getpid(), signal.SIGTERM)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stderr) == (7, "")
@@ -241,7 +241,7 @@ def test_each_command_names_the_way_to_resume(words: list[str], verb: str, monke
     before = signal.getsignal(signal.SIGTERM)
     assert memobench(["tasks", "--help"]) == 0
     assert signal.getsignal(signal.SIGTERM) is before
-    monkeypatch.setattr(console, "saying_how_to_go_on", saying)
+    monkeypatch.setattr(console, "adding_resume_hint", saying)
     monkeypatch.setattr(commands, "use_threads", lambda role: None)
     assert memobench(words) == 2
     assert printed == [f"memobench: {verb} with: {shlex.join(['memobench', *words])}"]

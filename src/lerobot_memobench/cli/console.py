@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lerobot_memobench.errors import MemobenchError, chain
 from lerobot_memobench.io import disk_refusal
-from lerobot_memobench.jobs.processes import saying_how_to_go_on
+from lerobot_memobench.jobs.processes import adding_resume_hint
 from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, PUBLISHED, STRICT
 
 USAGE_ERROR = 2
@@ -147,7 +147,7 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
         again: how to resume, printed when SIGTERM ends it or a worker process is killed.
     """
     try:
-        with saying_how_to_go_on(program, lambda: again):
+        with adding_resume_hint(program, lambda: again):
             result = call()
     except (typer.Abort, KeyboardInterrupt):
         return 130

@@ -214,7 +214,7 @@ def cache(
             batch_size=batch_size,
             workers=workers,
             progress=count,
-            tell=partial(screen.print, soft_wrap=True),
+            notify=partial(screen.print, soft_wrap=True),
         )
     say(f"feature cache: {folder}")
 

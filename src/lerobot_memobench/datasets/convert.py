@@ -53,11 +53,11 @@ from lerobot_memobench.io import (
     check_fetched,
     count_of,
     draft_of,
+    explaining_disk_errors,
     file_name,
     free_bytes,
     in_words,
     read_json,
-    telling_of_the_disk,
     write_file,
 )
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
@@ -131,7 +131,7 @@ def convert(
         return ConversionSummary(out, len(manifest["episodes"]), left_out, noted)
     check_destination(out)
     with (
-        telling_of_the_disk(out, "finished episodes stay, and the same command continues"),
+        explaining_disk_errors(out, "finished episodes stay, and the same command continues"),
         episodes_folder(out, request) as folder,
     ):
         _report_size(files, folder, out, notify)

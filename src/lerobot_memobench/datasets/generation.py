@@ -23,7 +23,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, ST
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
 from lerobot_memobench.datasets.staging import FINISHED_EARLY, episodes_folder, finished_manifest, staged
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import free_bytes, in_words, telling_of_the_disk
+from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm
@@ -196,7 +196,7 @@ def _run(
         return summarise(manifest["episodes"], plan.tasks, out)
     check_destination(out)
     with (
-        telling_of_the_disk(out, "finished episodes stay, and the same command continues"),
+        explaining_disk_errors(out, "finished episodes stay, and the same command continues"),
         episodes_folder(out, plan.request) as folder,
     ):
         jobs = plan.jobs(folder)
@@ -217,7 +217,7 @@ def _finish_early(plan: _Plan, out: Path) -> GenerationSummary:
     """Assemble the dataset of an unfinished run's episodes."""
     if is_dataset(out) or not (out / STAGING).is_dir():
         raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see its outcome")
-    with telling_of_the_disk(out, "finished episodes stay"), episodes_folder(out, plan.request) as folder:
+    with explaining_disk_errors(out, "finished episodes stay"), episodes_folder(out, plan.request) as folder:
         jobs = plan.jobs(folder)
         there = [job for job in jobs if job.finished()]
         made_by = f"{plan.made_by} The run was finished early: {len(there)} of {len(jobs)} seeds were run."

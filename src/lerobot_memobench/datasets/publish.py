@@ -28,7 +28,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import telling_of_the_disk, write_file
+from lerobot_memobench.io import explaining_disk_errors, write_file
 
 TABLES_FILE = "tables.md"
 UNCHECKED = (
@@ -72,7 +72,7 @@ def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[P
     if card is None:
         notify(EDITED)
         _put_card(folder, rows, notify)
-    with telling_of_the_disk(out):
+    with explaining_disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         return [
             write_file(out / TABLES_FILE, tables),

@@ -17,7 +17,7 @@ from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats
 from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, STATS_FILE, read_info
 from lerobot_memobench.datasets.video import ImageHistograms, Stats
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import read_json, short, telling_of_the_disk, write_file
+from lerobot_memobench.io import explaining_disk_errors, read_json, short, write_file
 from lerobot_memobench.protocol import CLOCK
 
 IMAGES, TEXTS = ("video", "image"), ("string", "language")
@@ -160,5 +160,5 @@ def complete(folder: Path, names: Sequence[str], notify: Callable[[str], None]) 
     there = recorded(folder)
     for name, stats in compute(folder, names).items():
         there[name] = {key: value.tolist() for key, value in stats.items()} | there.get(name, {})
-    with telling_of_the_disk(folder):
+    with explaining_disk_errors(folder):
         write_file(folder / STATS_FILE, json.dumps(there, indent=4))

@@ -143,7 +143,7 @@ def _begin_worker() -> None:
 
 
 @contextlib.contextmanager
-def saying_how_to_go_on(program: str, how: Callable[[], str]) -> Iterator[None]:
+def adding_resume_hint(program: str, how: Callable[[], str]) -> Iterator[None]:
     """Print advice on continuing if SIGTERM terminates this process in the block, or if a worker is killed.
 
     SIGTERM (a job is preempted, its time is up) ends this process and its descendants at once: all files on the disk

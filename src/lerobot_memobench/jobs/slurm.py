@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.processes import Job, check_finished, saying_how_to_go_on
+from lerobot_memobench.jobs.processes import Job, adding_resume_hint, check_finished
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 MAKE, FINISH = "make", "finish"
@@ -139,7 +139,7 @@ def run_part(part: str, logs: Path) -> None:
 if __name__ == "__main__":
     use_threads(ACTING)
     try:
-        with saying_how_to_go_on("memobench", lambda: PREEMPTED):
+        with adding_resume_hint("memobench", lambda: PREEMPTED):
             run_part(sys.argv[1], Path(sys.argv[2]))
     except MemobenchError as error:
         sys.exit(f"memobench: {error}")

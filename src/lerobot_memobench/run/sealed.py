@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NotRequired
 
 from lerobot_memobench.envs.evaluation_file import SealedStart
-from lerobot_memobench.io import Malformed, checked, count_of, parsed, telling_of_the_disk
+from lerobot_memobench.io import Malformed, checked, count_of, explaining_disk_errors, parsed
 from lerobot_memobench.jobs.processes import taking_turns
 from lerobot_memobench.policies.lerobot_config import SEALED_LEDGER
 from lerobot_memobench.protocol import SEALED
@@ -60,7 +60,7 @@ def counted(plan: EvaluationPlan, card: dict[str, Any], note: Callable[[str], No
     line, ledger = _line_of(card, str(folder)), user_ledger()
     start = card.get("sealed", {})
     if any(start.get(key) != line[key] for key in ("policy", "scenes", "release")):  # else it is resumed
-        with telling_of_the_disk(ledger.parent, "the ledger of sealed tests is there, or in $XDG_STATE_HOME/memobench"):
+        with explaining_disk_errors(ledger.parent, "sealed tests are counted there, or in $XDG_STATE_HOME/memobench"):
             ledger.parent.mkdir(parents=True, exist_ok=True)
             with taking_turns(ledger.with_suffix(".lock")):
                 start = _add(ledger, line)

@@ -26,7 +26,7 @@ from lerobot_memobench.envs.observations import check_obs_type
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import check_fetched
-from lerobot_memobench.jobs.processes import locked, saying_how_to_go_on
+from lerobot_memobench.jobs.processes import adding_resume_hint, locked
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_CONFIG
 from lerobot_memobench.policies.checkpoint import as_trained, check_weights, differing, local_folder, read_json
@@ -46,9 +46,9 @@ from lerobot_memobench.run.arguments import (
 )
 from lerobot_memobench.training.resume import (
     check_same_training,
-    how_to_go_on,
     make_room_for_link,
     note_on_resume,
+    resume_hint,
     resumed,
 )
 
@@ -91,7 +91,7 @@ def train(given: Arguments, line: Sequence[str], notify: Callable[[str], None]) 
     make_room_for_link(arguments)
     root = arguments.get("dataset.root")
     with (
-        saying_how_to_go_on("lerobot", lambda: how_to_go_on(arguments, line, begun)),
+        adding_resume_hint("lerobot", lambda: resume_hint(arguments, line, begun)),
         locked_run(arguments),
         naming_damage(Path(root) if root else None),
     ):

@@ -28,7 +28,7 @@ from torch import Tensor
 from lerobot_memobench.datasets.frames import FrameReader, frame_reader, read_frame_table, read_recorded
 from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import free_bytes, in_words, telling_of_the_disk, write_file
+from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words, write_file
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.perception.visual_encoder import GRID, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
@@ -143,7 +143,7 @@ def make_features(
     batch_size: int = 64,
     workers: int | None = None,
     progress: Progress | None = None,
-    tell: Callable[[str], None] = logger.info,
+    notify: Callable[[str], None] = logger.info,
 ) -> EpisodeFeatures:
     """Compute missing features, and open those of all episodes.
 
@@ -152,7 +152,7 @@ def make_features(
         read: source of frames; by default the camera's videos.
         batch_size: frames per pass of the encoder.
         workers: threads that decode videos ahead of the encoder; by default one per core, up to 8.
-        tell: called with the folder and its size before anything is encoded.
+        notify: called with the folder and its size before anything is encoded.
 
     Raises:
         MemobenchError: ``root`` is not a dataset, lacks the camera, or the disk is full.
@@ -166,7 +166,7 @@ def make_features(
         return EpisodeFeatures(folder, table.episodes, stride)
     read = read or frame_reader(root, camera)
     needed, free = int(counts[missing].sum()) * features.frame_bytes, free_bytes(folder)
-    tell(f"The feature cache {folder} needs {in_words(needed)}; {in_words(free)} are free.")
+    notify(f"The feature cache {folder} needs {in_words(needed)}; {in_words(free)} are free.")
     if needed > free:
         raise MemobenchError(
             f"the feature cache {folder} needs {in_words(needed)} and its disk has {in_words(free)} left; free space, "
@@ -174,7 +174,7 @@ def make_features(
             "(policy.memory_stride=)"
         )
     rank, world = rank_of_world()
-    with telling_of_the_disk(folder), ThreadPoolExecutor(workers or min(cores(), MOST_THREADS)) as pool:
+    with explaining_disk_errors(folder), ThreadPoolExecutor(workers or min(cores(), MOST_THREADS)) as pool:
         folder.mkdir(parents=True, exist_ok=True)
         _keep_from_the_hub(root)
         for number in [number for number in missing if number % world == rank]:

@@ -230,7 +230,7 @@ def step_reached(checkpoint: Path) -> int:
     return int(read_json(checkpoint.parent / TRAINING_STEP)["step"])
 
 
-def how_to_go_on(arguments: LerobotArguments, line: Sequence[str], begun: float) -> str:
+def resume_hint(arguments: LerobotArguments, line: Sequence[str], begun: float) -> str:
     """Return the advice for a training that was terminated: the command that resumes from its last checkpoint.
 
     Args:

@@ -40,7 +40,7 @@ from lerobot_memobench.datasets.statistics import recorded
 from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import cache_folder, telling_of_the_disk, write_file
+from lerobot_memobench.io import cache_folder, explaining_disk_errors, write_file
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import LerobotArguments
 from lerobot_memobench.training.configuration import check_environment, read_config
@@ -200,7 +200,7 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
     ends = np.concatenate([[0], np.cumsum(wanted)])[table.episodes]
     left_out = np.diff(table.episodes) - np.diff(ends)
     build = out.with_name(f".{out.name}.{os.getpid()}")
-    with telling_of_the_disk(out):
+    with explaining_disk_errors(out):
         shutil.rmtree(build, ignore_errors=True)
         for path in sorted((root / "data").rglob("*.parquet")):
             with undamaged(path):
