@@ -171,7 +171,7 @@ def find_reads(
         shift = int(record.get("prompt_steps") or 0) if unseen and record.get("suite", PUBLISHED) == PUBLISHED else 0
         chunks = [_later(chunk, shift) for chunk in reads["chunks"]]
         if not _is_of(reads, record) or not _fit(chunks, record):
-            misfits.append(f"{path} does not belong to the rollout in the log")
+            misfits.append(f"{path} is not of the rollout in the log")
         elif not record.get("paused_steps"):
             found[k] = chunks
     if not misfits:
