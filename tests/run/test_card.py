@@ -18,8 +18,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreement, outcome
 from lerobot_memobench.run.card import (
     checkpoint_files,
-    drawn_otherwise,
     extended,
+    first_variant_mismatch,
     joined_runs,
     new_card,
     policy_facts,
@@ -243,9 +243,9 @@ def test_episodes_that_drew_their_variants_otherwise_are_neither_gone_on_with_no
     bowl = "put_the_butter_into_the_bowl_from_the_prompt_video"
     here = {seed: referent_of(get_task(bowl), seed).variant_index for seed in (7, 8)}
     lines = [record(bowl, seed - 7, seed=seed, referent="random", variant=k) for seed, k in here.items()]
-    assert drawn_otherwise(lines) is None
-    assert drawn_otherwise([record("of_my_own", variant=5, referent="random", seed=7)]) is None
-    assert drawn_otherwise([record(bowl, variant=5, referent="random", seed=-7)]) is None, "no scene of ours"
+    assert first_variant_mismatch(lines) is None
+    assert first_variant_mismatch([record("of_my_own", variant=5, referent="random", seed=7)]) is None
+    assert first_variant_mismatch([record(bowl, variant=5, referent="random", seed=-7)]) is None, "no scene of ours"
     other = (here[8] + 1) % 3
     lines[1] = lines[1] | {"variant": other}
     told = f"{bowl}, episode 1: variant {other} there, {here[8]} by its seed here"
