@@ -287,7 +287,7 @@ def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80
     return place / "pretrained_model"
 
 
-NULL: dict[str, str | None] = dict.fromkeys(("memory_stride", "memory_fusion", "memory_frames", "memory_phase"))
+NULL: dict[str, str | None] = dict.fromkeys(("memory_stride", "memory_fusion", "memory_phase"))
 SMALL = ["policy=memobench_small", "steps=1", "device=cpu"]
 DEFAULTS: list[tuple[list[str], dict[str, str | None]]] = [
     (
@@ -307,7 +307,7 @@ DEFAULTS: list[tuple[list[str], dict[str, str | None]]] = [
     ([*SMALL, "policy.memory=frames"], {f"policy.{key}": text for key, text in NULL.items()}),
     (
         [*SMALL, "policy.memory=motion", "policy.memory_stride=2"],
-        {"policy.memory_stride": "2", "policy.memory_fusion": "null", "policy.memory_frames": "32"},
+        {"policy.memory_stride": "2", "policy.memory_fusion": "null"},
     ),
     ([*SMALL, "align=none", "policy.memory=none"], {"policy.memory_phase": "false"}),
 ]
@@ -340,11 +340,13 @@ def test_settings_that_differ_from_the_checkpoints_are_noted(
 ) -> None:
     assert main(["train", *SMALL, "align=contrastive", "policy.optimizer_lr=1e-4"]) == 0  # free in training
     assert capsys.readouterr().err == ""
-    assert main(["train", *SMALL, "policy.memory_stride=2", "policy.memory_frames=4"]) == 0
+    assert main(["train", *SMALL, "policy.memory_stride=2", "policy.memory_settings={frames: 4}"]) == 0
     note = capsys.readouterr().err
     assert note.count("\n") == 1
-    assert "memory_frames=32, memory_stride=8" in note
-    assert note.endswith("memory_frames=4, memory_stride=2\n")
+    before, _, now = note.partition(" now ")
+    assert "memory_stride=8" in before
+    assert "memory_stride=2" in now
+    assert "'frames': 4" in now
 
 
 @pytest.mark.parametrize(

@@ -272,9 +272,11 @@ def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
 def _missing(card: Mapping[str, Any]) -> list[str]:
     """Return the absent fields that resuming and repeating need."""
     missing = [key for key in WHOLE if key not in card]
-    missing += [f"protocol.{key}" for key in WHOLE_PROTOCOL if key not in card["protocol"]]
+    missing += [f"{key} in protocol" for key in WHOLE_PROTOCOL if key not in card["protocol"]]
     starts = card.get("runs", [])
-    return missing + [f"runs[{k}].{key}" for k, start in enumerate(starts) for key in WHOLE_START if key not in start]
+    return missing + [
+        f"{key} in runs[{k}]" for k, start in enumerate(starts) for key in WHOLE_START if key not in start
+    ]
 
 
 def _earlier(folder: Path) -> dict[str, Any]:
