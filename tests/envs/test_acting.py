@@ -137,7 +137,7 @@ def test_two_policies_are_not_one_evaluation(tmp_path: Path, capsys: pytest.Capt
     assert len({record["run"] for record in found}) == 2
 
     assert evaluated(second, tmp_path / "other", "episodes=1") == 0
-    with pytest.raises(MemobenchError, match=r"under other protocols \(policy\.sha256"):
+    with pytest.raises(MemobenchError, match=r"under different protocols \(policy\.sha256"):
         merge(tmp_path / "merged", [out, tmp_path / "other"])
     mixed = [*found, *({**record, "episode": 9} for record in read_episodes(tmp_path / "other"))]
     write_episodes(tmp_path / "mixed", mixed)

@@ -205,7 +205,7 @@ def test_a_task_that_cannot_be_run_is_counted_as_not_run(folder: Path, tmp_path:
     report = merge_and_report(tmp_path / "merged", [log, other])
     assert report.run.summary.rollouts == 1
     note, nobodys = report.run.notes
-    assert nobodys == f"{tmp_path / 'merged'} does not say whose episodes it holds: no part of it did"
+    assert nobodys == f"{tmp_path / 'merged'} does not name the policy of its episodes: no part did"
     assert note.startswith("a_shelf was not run, and the figures are without that: the expert places objects")
     for _ in range(2):  # and again from the merged file
         assert write_report(tmp_path / "merged").notes == [note]
