@@ -182,7 +182,7 @@ def test_a_report_is_written_in_several_formats(tmp_path: Path) -> None:
     out, paper = tmp_path / "out", tmp_path / "paper"
     words = ["--format", "csv", "--format", "json", "--format", "latex"]
     assert main(["report", a, b, *words, "--out", str(out)]) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["report.csv", "report.json", "report.tex", "tables"]
+    assert sorted(path.name for path in out.iterdir()) == ["report.json", "report.tex", "tables"]
     tables = {path.stem: list(csv.DictReader(path.open())) for path in sorted((out / "tables").iterdir())}
     assert list(tables) == ["failures", "memory-types", "overview", "prefix", "tasks"]
     found = json.loads((out / "report.json").read_text())["evaluations"]

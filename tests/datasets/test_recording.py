@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -14,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
@@ -39,18 +38,25 @@ MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_pl
 SEED = 10_000
 IDLING_SEED = SEED + 2
 """Seed with few rounds and a short rest."""
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "research"
-FULL_RUNS = {"published": DOCS / "full_run" / "manifest.json", "strict": DOCS / "strict_run" / "manifest.json"}
-"""Hashes of 1,500 demonstrations by ``memobench describe``; the strict ones are from before idling."""
+RUNS = Path(__file__).parents[2] / "results" / "demonstrations.parquet"
+FULL_RUNS = {"published": "demonstration", "strict": "strict demonstration"}
+"""Suite -> run of 1,500 demonstrations with hashes; the strict ones are from before idling."""
+
+
+def kept_hashes(suite: str) -> pd.DataFrame:
+    """Return task, seed and hash of the kept demonstrations of a suite."""
+    table: pd.DataFrame = pd.read_parquet(RUNS)
+    return table[table["run"] == FULL_RUNS[suite]]
 
 
 @pytest.mark.parametrize(("suite", "solved"), [("published", 1_500), ("strict", 1_499)])
 def test_committed_runs_are_complete(suite, solved):
-    tasks = json.loads(FULL_RUNS[suite].read_text())["tasks"]
-    assert set(tasks) == set(task_names(suite=suite))
-    assert all(list(seeds) == [str(SEED + i) for i in range(50)] for seeds in tasks.values())
-    found = [entry for seeds in tasks.values() for entry in seeds.values() if re.fullmatch("[0-9a-f]{64}", entry)]
-    assert len(set(found)) == len(found) == solved
+    table = kept_hashes(suite)
+    assert set(table["task"]) == set(task_names(suite=suite))
+    assert all(list(seeds) == list(range(SEED, SEED + 50)) for _, seeds in table.groupby("task")["seed"])
+    found = table["sha256"].dropna()
+    assert len(found) == found.nunique() == table["solved"].sum() == solved
+    assert found.str.fullmatch("[0-9a-f]{64}").all()
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +264,8 @@ def test_committed_run_is_repeated(suite, name, tmp_path):
     environment = {**os.environ, "OPENBLAS_CORETYPE": "Haswell"}
     command = [sys.executable, "-c", RECORD, name, str(SEED), str(tmp_path / "episode")]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == json.loads(FULL_RUNS[suite].read_text())["tasks"][name][str(SEED)]
+    table = kept_hashes(suite)
+    assert run.stdout.strip() == table.loc[(table["task"] == name) & (table["seed"] == SEED), "sha256"].item()
 
 
 @pytest.mark.slow
