@@ -34,7 +34,7 @@ import numpy as np
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, labels
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.datasets.hdf5.reading import PublishedFile
+from lerobot_memobench.datasets.hdf5 import PublishedFile
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import (
     EPISODE_INFO,

@@ -479,6 +479,6 @@ def test_published_figures_are_those_of_the_kept_cells(tmp_path: Path) -> None:
     assert main(["--out", str(tmp_path), "--kept", str(KEPT)]) == 0
     counted = (tmp_path / "study.md").read_text()
     found = re.findall(r"(\d+\.\d) \((\d+\.\d–\d+\.\d)\)", (KEPT.parent / "study.md").read_text())
-    assert len(found) == 15
+    assert len(found) == 14
     for solved, interval in found:
         assert f"**{solved}** | {interval}" in counted

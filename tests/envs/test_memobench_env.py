@@ -26,7 +26,6 @@ from lerobot.envs import env_to_policy_features, preprocess_observation
 import lerobot_memobench.envs
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.demonstration import labels
-from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.envs import memobench_env
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode, first_execution_step
@@ -50,6 +49,7 @@ from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import NOTHING_YET, with_memory
 from tests.support.libero import needs_assets
+from tests.support.short_demonstrations import record_demonstration
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"

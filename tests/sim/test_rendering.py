@@ -222,7 +222,8 @@ from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
 def show():
-    print(hashlib.sha256(sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest(), flush=True)
+    frames = sim.render().tobytes() + sim.render("wrist").tobytes()
+    os.write(1, f"{hashlib.sha256(frames).hexdigest()}\\n".encode())  # one write: forks share the pipe
 
 sim = Simulation(get_task(sys.argv[1]), RenderSettings(quality=sys.argv[2]))
 sim.reset(7)
