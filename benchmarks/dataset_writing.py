@@ -43,10 +43,10 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     dataset_features,
     image_key,
 )
-from lerobot_memobench.datasets.recording import record_demonstration
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.published_files import write_published
+from tests.support.short_demonstrations import record_demonstration
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 WAYS = ("write", "convert", "generate")
