@@ -366,7 +366,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
 
     Reads the workers' files and ``episodes.jsonl``, which may be compressed by ``gzip``. The newest line of an episode
     counts. Unreadable lines, such as the last line of a killed run, are skipped. They are added to ``problems`` (file,
-    line, reason) and logged as warnings, as are episodes with lines of both outcomes.
+    line, reason), or logged as warnings without it, as are episodes with lines of both outcomes.
 
     Raises:
         MemobenchError: the folder does not exist, contains no log, or contains a log of several policies.
@@ -403,10 +403,11 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
             f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
             f"{twice[0][0]}, episode {twice[0][1]}; the newest line of each counts"
         )
-    for problem in found:
-        logger.warning("%s", problem)
     if problems is not None:
         problems += found
+    else:
+        for problem in found:
+            logger.warning("%s", problem)
     return [newest[key][1] for key in sorted(newest)]
 
 

@@ -52,7 +52,7 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     card = read_evaluation(folder)
     protocol: dict[str, Any] = card.get("protocol", {})
     if not {*EXTENT, *SETTINGS} - {*OMITTED} <= set(protocol):
-        protocol = {**protocol_of_log(read_episodes(folder)), **protocol}
+        protocol = {**protocol_of_log(read_episodes(folder, [])), **protocol}  # `read_runs` names problems
     return {**protocol, POLICY: card.get(POLICY) or protocol.get(POLICY) or {}}
 
 
