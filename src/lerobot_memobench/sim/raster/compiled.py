@@ -8,6 +8,7 @@ checks changes of a function's own file only.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from numba import njit
@@ -22,7 +23,20 @@ _OPTIONS: dict[str, Any] = {
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function at its first call; cache it on disk if possible."""
     try:
-        made: Callable[..., Any] = njit(cache=True, **_OPTIONS)(function)
+        made: Any = njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # neither the source folder nor the user's cache folder is writable
-        made = njit(**_OPTIONS)(function)
-    return made
+        return njit(**_OPTIONS)(function)  # type: ignore[no-any-return]
+    _discard_unreadable_index(made._cache._cache_file)
+    return made  # type: ignore[no-any-return]
+
+
+def _discard_unreadable_index(cache_file: Any) -> None:
+    """Remove the index of a function's cache if it cannot be read.
+
+    The index contains the classes of the function's arguments. Numba imports them before it compares the time of the
+    source file, and fails if an earlier version of this package had them in another module.
+    """
+    try:
+        cache_file._load_index()
+    except Exception:
+        Path(cache_file._index_path).unlink(missing_ok=True)
