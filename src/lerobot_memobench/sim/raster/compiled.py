@@ -25,9 +25,9 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     try:
         made: Any = njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # neither the source folder nor the user's cache folder is writable
-        return njit(**_OPTIONS)(function)  # type: ignore[no-any-return]
+        return njit(**_OPTIONS)(function)
     _discard_unreadable_index(made._cache._cache_file)
-    return made  # type: ignore[no-any-return]
+    return made
 
 
 def _discard_unreadable_index(cache_file: Any) -> None:
