@@ -43,7 +43,7 @@ class WindowConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self):
-        """The history of a training sample: LeRobot loads these frames, the episode's first one for any before it."""
+        """LeRobot loads these frames for a sample and repeats the episode's first frame for earlier indices."""
         return [-age * self.stride for age in reversed(range(self.frames))]
 
     @property
@@ -137,7 +137,7 @@ class WindowPolicy(PreTrainedPolicy):
         for row, token, clock in zip(self.rows, self.tokens(batch), clocks, strict=True):
             if clock[1] == -1 or clock != row.clock:  # -1: strict, no clock; a row that is over repeats its frame
                 row.past.append(token)
-            if clock[1] == 0:  # a phase begins: earlier plans are void
+            if row.clock is None or clock[0] != row.clock[0]:  # a phase begins: earlier plans are void
                 row.queue.clear()
             row.clock = clock
         acting = [row for row in self.rows if row.clock[0] == 1]

@@ -301,7 +301,7 @@ class Episode:
         return self._expert is not None and self._expert.done
 
     def objects(self) -> NDArray[np.float32]:
-        """Return the objects visible in both cameras, (`sim.object_slots.SIZE`,)."""
+        """Return the objects that at least one camera sees, (`sim.object_layout.SIZE`,) float32."""
         if self._slots is None:
             self._slots = ObjectSlots(self.sim)
         return self._slots.observe()

@@ -177,8 +177,8 @@ class Rate:
 
     Attributes:
         value: fraction in [0, 1]; None when not applicable.
-        n: rollouts. Checkpoints of one rollout depend on one another, so rollouts, not checkpoints, are counted, which
-            makes the interval the wider one.
+        n: number of trials: rollouts, because checkpoints of one rollout are dependent; checkpoint records in pooled
+            rates.
         effective: of a mean of rates, the number of rollouts of a plain rate with the same standard error; None where
             it is n.
     """

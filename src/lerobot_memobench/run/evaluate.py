@@ -24,7 +24,7 @@ from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
 from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
 
 Advance = Callable[[int, int, str], None]
-"""Called after each batch with the number of episodes that ended, of those to be run, and the task's name."""
+"""Called after each batch with the finished episodes, all episodes of the run, and the task's name."""
 
 
 def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: Advance) -> None:

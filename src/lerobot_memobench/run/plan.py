@@ -58,13 +58,14 @@ class EvaluationPlan:
     """An evaluation that is ready to run.
 
     Attributes:
-        settings: complete, as the card holds them.
-        policy: its configuration. environment: its configuration.
-        grid: its episodes.
-        output: folder of LeRobot's own files.
+        settings: complete settings, equal to those of the card.
+        policy: configuration of the policy.
+        environment: configuration of the environment.
+        grid: episodes of each task, in batches.
+        output: folder of the evaluation; contains the shards.
         log: folder of the episode log, the report and the card.
-        options: how it is run.
-        command: the command line as it was given, for the card.
+        options: options of the run, such as shards and memory reads.
+        command: the typed command line, for the card.
     """
 
     settings: EvaluationSettings

@@ -54,7 +54,7 @@ logger = logging.getLogger(__name__)
 
 RECORDED = (OBS_STATE, OBS_ENV_STATE, ACTION, "timestamp", "frame_index", "episode_index", "task_index", "index")
 """Columns of samples if training decodes no video."""
-LEAST_DEVIATION = 0.01
+STD_OFFSET = 0.01
 """Added to the standard deviations of actions, so that nearly constant numbers are not scaled up to noise."""
 
 
@@ -93,7 +93,7 @@ def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, L
     """
     dataset, held_out = datasets
     policy_config: Any = config.policy
-    complete_policy(policy_config, dataset.meta)
+    set_subgoals(policy_config, dataset.meta)
     policy: Any = make_policy(policy_config, ds_meta=dataset.meta, rename_map=config.rename_map)
     if config.peft is not None and not policy_config.use_peft:
         policy = policy.wrap_with_peft(peft_cli_overrides=asdict(config.peft))
@@ -158,7 +158,7 @@ def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -
     complete(root, missing, logger.warning)
 
 
-def complete_policy(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:
+def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:
     """Set the subgoals of a memory that is supervised with them.
 
     Raises:
@@ -334,5 +334,5 @@ def execution_statistics(
                 "(`lerobot-edit-dataset --operation.type=recompute_stats --operation.relative_action=true "
                 f"--operation.chunk_size={config.chunk_size}`) or leave use_relative_actions out"
             )
-    found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + LEAST_DEVIATION
+    found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + STD_OFFSET
     return found

@@ -1,7 +1,7 @@
 """Train ``policy=memobench_mem``: datasets, policy, processors, updates, checkpoints.
 
-The checkpoints are LeRobot's, so that LeRobot and `lerobot eval` load them; ``training_weights.safetensors`` next to
-the model holds the trained weights; the model is their average. A resumed training continues to the bit.
+The checkpoints are LeRobot's, so that LeRobot and `lerobot eval` load them; ``training_weights.safetensors``
+holds the raw weights, the model file their moving average. A resumed training continues bit for bit.
 """
 
 from __future__ import annotations

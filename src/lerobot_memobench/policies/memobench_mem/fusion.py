@@ -38,7 +38,7 @@ class Prefix(NamedTuple):
     asked: slice | None = None
 
     def joined(self, tokens: Tensor, real: Tensor) -> Prefix:
-        """Append tokens that attend to all tokens, and to which all tokens attend."""
+        """Return a prefix with appended tokens and full attention; other attributes get their defaults."""
         more = tokens.to(self.tokens.dtype)
         return Prefix(torch.cat([self.tokens, more], dim=1), torch.cat([self.real, real], dim=1), self.instruction)
 

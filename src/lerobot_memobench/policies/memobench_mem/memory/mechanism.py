@@ -45,7 +45,8 @@ class Histories(NamedTuple):
     """Remembered frames of B samples; frames shared by several samples are stored once.
 
     Attributes:
-        frames: (U, P, D') stored frames. steps: (U,) their control steps since their episodes began, int64.
+        frames: (U, P, D') stored frames: P tokens of width D' each, before pooling.
+        steps: (U,) their control steps since their episodes began, int64.
         places: (B, F) indices of each sample's frames, oldest first, padded by -1.
         subgoals: (U,) index of each frame's subgoal text, -1: none; with `MemoryMechanism.privileged`.
         ahead: (B, n) indices of the frames that follow, -1 after the episode's end; with `MemoryMechanism.ahead`.
