@@ -313,8 +313,8 @@ def failure_of(record: Record) -> str | None:
     if record["success"]:
         if logged is not None:
             raise MemobenchError(
-                f"a rollout of {record['task']!r} is a success and has the failure class {logged!r}; expected one of "
-                "both: the log was changed or damaged, evaluate again"
+                f"a rollout of {record['task']!r} is a success and has the failure class {logged!r}; expected no "
+                "class: the log was changed or damaged, evaluate again"
             )
         return None
     if logged is None:
