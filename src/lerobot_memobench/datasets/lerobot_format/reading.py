@@ -22,6 +22,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     OBJECTS,
     PRIVILEGED,
     is_dataset,
+    read_info,
     undamaged,
 )
 from lerobot_memobench.errors import MemobenchError
@@ -165,7 +166,7 @@ def list_episodes(folder: Path) -> list[EpisodePlace]:
     Raises:
         MemobenchError: the folder is no dataset, or a record in it is damaged.
     """
-    _check(folder)
+    read_info(folder)
     rows = _rows(folder)
     first = _read(folder / "data", ("episode_index", EPISODE_INFO), [("frame_index", "==", 0)]).to_pylist()
     texts = {int(row["episode_index"]): row.get(EPISODE_INFO) for row in first}
@@ -269,7 +270,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
         MemobenchError: there is no dataset or no such episode, or another program made it.
     """
     root = Path(root)
-    _check(root)
+    read_info(root)
     rows = _rows(root, episode_index)
     if len(rows) != 1:
         raise MemobenchError(f"{root} has no episode {episode_index}; see total_episodes in its meta/info.json")
@@ -327,11 +328,6 @@ def _name_tasks(root: Path, columns: Columns) -> None:
         tasks = load_tasks(root)
     names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
     columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]
-
-
-def _check(folder: Path) -> None:
-    if not is_dataset(folder):
-        raise MemobenchError(f"{folder} is no dataset (there is no meta/info.json); name the folder of a generated one")
 
 
 def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]]:
