@@ -387,7 +387,7 @@ def forget(out: Path, rng: random.Random) -> None:
     """Take half of the episodes out of a finished evaluation."""
     records = read_episodes(out)
     kept = rng.sample(records, len(records) // 2)
-    for file in (out / "episodes").glob("*.jsonl"):
+    for file in (out / "episodes.jsonl", *(out / "episodes").glob("*.jsonl")):  # `write_episodes` keeps known lines
         file.unlink()
     lost = [record for record in records if record not in kept]
     from lerobot_memobench.envs.episode_log import write_episodes
