@@ -224,6 +224,13 @@ def test_rows_follow_their_clock(
     assert written == [k for k in range(len(clocks)) if k not in frozen]
 
 
+def test_frozen_rows_are_not_written() -> None:
+    rollout, written = Rollout(remembers=True, stride=1), list[list[int]]()
+    for clocks in ([(1, 0), (1, 0)], [(1, 1), (1, 0)], [(1, 1), (1, 0)]):
+        rollout.observe(clocks, written.append)
+    assert written == [[0, 1], [0]]
+
+
 def test_unobserved_frames_are_noticed() -> None:
     rollout, written = Rollout(remembers=True, stride=4), list[list[int]]()
     for step in (0, 3, 4, 4, 6, 8):  # frames between written ones may be left out
