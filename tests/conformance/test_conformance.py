@@ -10,22 +10,15 @@ from typing import Any
 
 import pytest
 import torch
-from lerobot.configs import PreTrainedConfig
-from torch import Tensor
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.conformance import subject as module
 from lerobot_memobench.conformance.checks import CHECKS, Behaviour, Outcome, run_check, run_checks
 from lerobot_memobench.conformance.pytest_class import MemoryConformance
-from lerobot_memobench.conformance.streams import TASK, task_of_texts
 from lerobot_memobench.conformance.subject import Subject, load_subject
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory import OURS, mechanism_names
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
-from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.tiny_paligemma import shrink_paligemma
 
 EXAMPLE = ("policy=window", "policy.width=32", "policy.frames=8", "policy.stride=2")
 MEM = (
@@ -39,10 +32,6 @@ def window(example: Path, objects: Path, tmp_path_factory: pytest.TempPathFactor
     return load_subject([*EXAMPLE, f"dataset={objects}"], tmp_path_factory.mktemp("window"))
 
 
-def failed(subject: Subject) -> set[str]:
-    return {result.check for result in run_checks(subject) if result.outcome is Outcome.FAILED}
-
-
 class TestExample(MemoryConformance):
     """A test class as in the guide, with a dataset of its own."""
 
@@ -50,11 +39,6 @@ class TestExample(MemoryConformance):
     @classmethod
     def _arguments(cls, example: Path, objects: Path) -> None:
         cls.arguments = (*EXAMPLE, f"dataset={objects}")
-
-
-def test_example_is_an_installed_package(example: Path) -> None:
-    kind = PreTrainedConfig.get_known_choices()["window"]
-    assert Path(__import__(kind.__module__).__file__).parent == example
 
 
 def test_memobench_mem_conforms(objects: Path, tmp_path: Path) -> None:
@@ -65,8 +49,8 @@ def test_memobench_mem_conforms(objects: Path, tmp_path: Path) -> None:
 # --- a policy with one flaw ---
 
 
-def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
-    """Name -> class of a policy with a flaw, and the checks that name it."""
+def flaws(base: Any) -> dict[str, type]:
+    """Check -> class of a policy that fails it."""
 
     class ForgetsNothing(base):
         def reset(self) -> None:
@@ -85,11 +69,6 @@ def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
             for row in self.rows:
                 row.past.clear()
             return super().select_action(batch)
-
-    class MixesRows(base):
-        def tokens(self, batch: Any) -> Any:
-            found = super().tokens(batch)
-            return found + found.mean(0) if found.dim() == 2 else found
 
     class SharesItsQueue(base):
         """One queue for all rows, as LeRobot's policies have: all plan when the first does."""
@@ -144,48 +123,27 @@ def flaws(base: Any) -> dict[str, tuple[type, set[str]]]:
         def needs_observation(self) -> bool:
             return False
 
-    history = "same history in training"
-    compared = {"deterministic given a seed", "reset forgets", "rows are independent", history}
     return {
-        "reset": (ForgetsNothing, {"reset forgets"}),
-        "memoryless": (ForgetsEverything, {"remembers"}),
-        "mixed rows": (
-            MixesRows,
-            {"rows are independent", "finished rows change no other", "same history in training"},
-        ),
-        "one queue": (SharesItsQueue, {"rows are independent"}),
-        "per chunk": (RemembersPlans, {"remembers every control step", history}),
-        "prompt": (DropsThePrompt, {"reads the prompt", history}),
-        "late": (ActsLate, {"plans after the prompt"}),
-        "finished": (MindsTheFinished, {"finished rows change no other"}),
-        "noise": (DrawsItsOwn, compared),
-        "needs": (NeedsNothing, {"needs_observation is true"}),
+        "reset forgets": ForgetsNothing,
+        "remembers": ForgetsEverything,
+        "rows are independent": SharesItsQueue,
+        "remembers every control step": RemembersPlans,
+        "reads the prompt": DropsThePrompt,
+        "plans after the prompt": ActsLate,
+        "finished rows change no other": MindsTheFinished,
+        "deterministic given a seed": DrawsItsOwn,
+        "needs_observation is true": NeedsNothing,
     }
 
 
-NAMES = ("reset", "memoryless", "mixed rows", "one queue", "per chunk", "prompt", "late", "finished", "noise", "needs")
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("exactly", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_flaws_fail_their_checks(name: str, exactly: bool, window: Subject) -> None:
+@pytest.mark.parametrize("check", sorted(set(CHECKS) - {"same history in training"}))
+def test_flaws_fail_their_checks(check: str, window: Subject) -> None:
     base = type(window.policy)
-    window.policy.__class__, expected = flaws(base)[name]
+    window.policy.__class__ = flaws(base)[check]
     try:
-        if exactly:
-            found = failed(window)
-        else:
-            behaviour = Behaviour(window)
-            check = min(expected)
-            found = {check} if run_check(check, behaviour).outcome is Outcome.FAILED else set()
+        assert run_check(check, Behaviour(window)).outcome is Outcome.FAILED
     finally:
         window.policy.__class__ = base
-    if not exactly:
-        assert found == {check}
-    elif name in ("reset", "memoryless", "noise"):  # other checks fail too
-        assert found >= expected
-    else:
-        assert found == expected
 
 
 def test_other_history_in_training_fails(window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,26 +152,6 @@ def test_other_history_in_training_fails(window: Subject, monkeypatch: pytest.Mo
     later = {key: [d - key.startswith("observation.") for d in found] for key, found in deltas}
     monkeypatch.setattr(reader, "delta_indices", later)
     assert run_check("same history in training", Behaviour(window)).outcome is Outcome.FAILED
-
-
-@pytest.mark.parametrize("way", ["raises", "present alone"])
-def test_checks_that_do_not_apply_are_skipped(way: str, window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
-    policy = window.policy
-    answer = policy.predict_action_chunk
-
-    def predict(batch: Any) -> Any:
-        if way == "raises":
-            raise KeyError("observation.images.image")
-        names = [key for key in batch if key.startswith("observation.") and not key.endswith("_is_pad")]
-        alone = {key: batch[key][:, -1:].expand_as(batch[key]) for key in names}
-        pad = torch.ones_like(batch["observation.state_is_pad"])
-        pad[:, -1] = False
-        return answer({**batch, **alone, "observation.state_is_pad": pad})
-
-    monkeypatch.setattr(policy, "predict_action_chunk", predict)
-    result = run_check("same history in training", Behaviour(window))
-    assert result.outcome is Outcome.NOT_CHECKED
-    assert ("KeyError" if way == "raises" else "present frames") in result.sentence
 
 
 def test_errors_of_the_policy_fail_checks(window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,15 +178,6 @@ ACT = (
     *("policy.dim_feedforward=64", "policy.n_encoder_layers=1", "policy.n_vae_encoder_layers=1"),
     *("policy.chunk_size=4", "policy.latent_dim=8"),
 )
-DIFFUSION = (
-    *("policy=diffusion", "policy.down_dims=[16,32]", "policy.num_inference_steps=2", "policy.horizon=8"),
-    *("policy.diffusion_step_embed_dim=16", "policy.n_groups=4", "policy.pretrained_backbone_weights=null"),
-    *("policy.crop_shape=[84,84]", "policy.spatial_softmax_num_keypoints=8"),
-)
-PI05 = (
-    *("policy=pi05", "policy.chunk_size=4", "policy.num_inference_steps=2", "policy.dtype=float32"),
-    "policy.tokenizer_max_length=64",
-)
 
 
 @pytest.mark.slow
@@ -256,19 +185,12 @@ PI05 = (
     ("words", "wrong"),
     [
         (ACT, ["remembers"]),
-        (DIFFUSION, ["reads the prompt"]),
-        (PI05, ["remembers"]),
-        (("policy=window", "policy.frames=8", "policy.stride=2"), []),
-        (("policy=memobench_mem", "policy.size=tiny", "policy.memory_stride=2"), []),
         (("policy=memobench_small",), []),
         (("policy=memobench_small_memoryless",), ["remembers"]),
     ],
-    ids=["act", "diffusion", "pi05", "window", "memobench_mem", "memobench_small", "memobench_small_memoryless"],
+    ids=["act", "memobench_small", "memobench_small_memoryless"],
 )
-def test_known_policies_fail_known_checks(
-    words: tuple[str, ...], wrong: list[str], example: Path, pictures: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shrink_paligemma(monkeypatch, "put the milk picked up in the prompt video on the plate")
+def test_known_policies_fail_known_checks(words: tuple[str, ...], wrong: list[str], pictures: Path) -> None:
     results = run_checks(load_subject([*words, f"dataset={pictures}"], pictures.parent))
     assert [result.check for result in results if result.outcome is Outcome.FAILED] == wrong, results
     assert not [result for result in results if result.outcome is Outcome.NOT_CHECKED]
@@ -299,15 +221,6 @@ def test_wrong_settings_are_named(
     assert named in capsys.readouterr().err
 
 
-def test_equal_noise_does_not_depend_on_rows() -> None:
-    with module.EqualNoise():
-        one, many = torch.randn(1, 4, 7), torch.randn(3, 4, 7)
-        assert torch.equal(many, one.expand_as(many))
-        assert torch.equal(torch.normal(0.0, 1.0, (2, 7))[0], one[0, 0])
-        assert torch.equal(torch.empty(5, 7).normal_()[4], one[0, 0])
-    assert not torch.equal(torch.randn(1, 4, 7), one)
-
-
 # --- every memory ---
 
 
@@ -325,45 +238,3 @@ def test_memory_of_another_package_runs_an_episode(traces: None) -> None:
     histories = Histories(frames[:1].expand(5, -1, -1), torch.arange(5), places)
     assert memory.replay(histories).rows().dtype == torch.float32
     assert memory.read(state).rows().shape == (2, 4 * memory.spec.tokens, memory.spec.width)
-
-
-@pytest.mark.parametrize("level", [0, 1, 2])
-def test_streams_use_a_task_of_the_known_texts(level: int) -> None:
-    known = {}
-    for name in ("put_the_butter_into_the_bowl_from_the_prompt_video", "check_all_three_drawers_of_the_cabinet"):
-        task = get_task(name)
-        known[task.language] = [checkpoint.language[level] for checkpoint in task.checkpoints]
-    assert task_of_texts(known) == "put_the_butter_into_the_bowl_from_the_prompt_video", "it has a prompt"
-    assert task_of_texts({"another": ["text"]}) == task_of_texts({}) == TASK
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("memory", [*OURS, "traces"])
-def test_every_memory_conforms(memory: str, traces: None, objects: Path, tmp_path: Path) -> None:
-    assert memory in mechanism_names()
-    words = ["policy=memobench_mem", f"policy.memory={memory}", "size=tiny", "policy.perception=objects"]
-    if memory == "keyframes":
-        words.append("policy.memory_stride=2")  # of 10 steps few end within the streams
-    subject = load_subject([*words, f"dataset={objects}"], tmp_path)
-    if memory == "keyframes":
-        balance(subject)
-    results = run_checks(subject)
-    assert {result.outcome for result in results} == {Outcome.PASSED}, results
-
-
-def balance(subject: Subject) -> None:
-    """Balance the texts of a high level; with random weights it always chooses the same one."""
-    high_level = subject.policy.model.memory
-    scores: list[Tensor] = []
-    ask = high_level.ask_high_level
-
-    def noted(*given: Tensor) -> tuple[Tensor, Tensor]:
-        found: tuple[Tensor, Tensor] = ask(*given)
-        scores.append(found[0][:, :-1])
-        return found
-
-    high_level.ask_high_level = noted
-    subject.roll(subject.streams)
-    del high_level.ask_high_level
-    with torch.no_grad():
-        high_level.score.bias -= torch.cat(scores).mean(dim=0)

@@ -16,3 +16,11 @@ def dataset_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tests.support.synthetic_dataset import make_dataset
 
     return make_dataset(tmp_path_factory.mktemp("data") / "synthetic")
+
+
+@pytest.fixture(scope="session")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of objects, with records; tests that change it must copy it."""
+    from tests.support.object_dataset import make_object_dataset
+
+    return make_object_dataset(tmp_path_factory.mktemp("data") / "objects", records=True)

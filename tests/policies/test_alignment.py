@@ -13,18 +13,12 @@ import torch
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import (
-    SHUFFLED_ALONE,
-    FramewiseAlignment,
     WordTextEncoder,
     make_alignment,
     retrieval_accuracy,
     shuffled_subgoals,
     text_rows,
 )
-from lerobot_memobench.policies.memobench_mem.memory import OURS
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import LEVELS
-from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, made_for_training
 
 B, F, P, D, T = 5, 3, 4, 6, 7
@@ -79,17 +73,6 @@ def test_contrastive_counts_repeated_subgoals_as_positives() -> None:
     assert module(memory, mask, text).item() == pytest.approx(0.5 * (to_text + to_memory), abs=1e-5)
 
 
-def test_contrastive_loss_of_equal_memories_has_no_gradient() -> None:
-    memory, mask = _inputs()
-    memory, mask = memory[:1].expand(B, -1, -1), mask[:1].expand(B, -1)
-    module = make_alignment("contrastive", D, T, P)
-    assert module is not None
-    loss = module(memory, mask, torch.randn(1, T).expand(B, T))
-    loss.backward()
-    assert loss.item() == pytest.approx(math.log(B), abs=1e-5)
-    assert module.project.weight.grad.abs().max() < 1e-5
-
-
 def test_framewise() -> None:
     memory, mask = _inputs()
     text, text_mask = torch.randn(B, F, T), torch.ones(B, F, dtype=torch.bool)
@@ -116,59 +99,11 @@ def test_framewise() -> None:
     assert module(memory, torch.zeros_like(mask), text, text_mask).item() == 0.0
 
 
-def test_framewise_weights() -> None:
-    valid = torch.tensor([[1, 0, 1, 1], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=torch.bool)
-    expected = [[0.5, 0, 0.75, 1.0], [0, 0.5, 0, 0], [0, 0, 0, 0]]
-    assert FramewiseAlignment.weights(valid).tolist() == expected
-
-
-def test_gradient_reaches_memory() -> None:
-    memory, mask = _inputs()
-    for name in ("semantic", "contrastive", "framewise"):
-        module = make_alignment(name, D, T, P)
-        assert module is not None
-        tokens = memory.clone().requires_grad_()
-        text = torch.randn(B, F, T) if name == "framewise" else torch.randn(B, T)
-        extra = (torch.ones(B, F, dtype=torch.bool),) if name == "framewise" else ()
-        module(tokens, mask, text, *extra).backward()
-        assert tokens.grad is not None
-        assert tokens.grad[mask].abs().sum() > 0
-        assert tokens.grad[~mask].abs().sum() == 0
-
-
 def test_retrieval_accuracy() -> None:
     text = torch.eye(3)[[0, 1, 0]]
     assert retrieval_accuracy(torch.eye(3)[[0, 1, 0]], text) == 1.0
     assert retrieval_accuracy(torch.eye(3)[[1, 1, 0]], text) == pytest.approx(2 / 3)
     assert retrieval_accuracy(torch.zeros(0, 3), torch.zeros(0, 3)) == 0.0
-
-
-@pytest.fixture(scope="module")
-def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
-
-
-@pytest.mark.parametrize(
-    ("memory", "align"),
-    [
-        *((name, align) for name in OURS for align in ("semantic", "contrastive") if name != "keyframes"),
-        *((name, "framewise") for name in ("frames", "subgoal")),
-    ],
-)
-@pytest.mark.slow
-def test_every_memory_learns_an_alignment(memory: str, align: str, objects: Path) -> None:
-    fields = {"size": "small", "perception": "objects", "frames": 32}
-    policy, before, _, dataset = made_for_training(objects, memory=memory, align=align, **fields)
-    batch = before(batch_of(dataset, [10, 30, 50, 56, 75, 90]))
-    optimizer, found = torch.optim.AdamW(policy.get_optim_params(), lr=1e-3), []
-    for _ in range(20):
-        loss, logged = policy.train().forward(batch)
-        loss.backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        found.append(logged)
-    assert found[-1]["align_loss"] < 0.9 * found[0]["align_loss"]  # of equal texts it cannot reach zero
-    assert all(logged["align_grad_norm"] > 0 for logged in found)
 
 
 # -- subgoals ------------------------------------------------------------------------------------------------------
@@ -182,19 +117,19 @@ def test_every_memory_learns_an_alignment(memory: str, align: str, objects: Path
         ("semantic", "fine", "grounded_subgoal"),
     ],
 )
-def test_subgoal_level_chooses_the_column(objects: Path, align: str, level: str, column: str) -> None:
+def test_subgoal_level_chooses_the_column(root: Path, align: str, level: str, column: str) -> None:
     fields = {"size": "small", "perception": "objects", "align": align, "subgoal_level": level}
-    _, before, _, dataset = made_for_training(objects, **fields)
+    _, before, _, dataset = made_for_training(root, **fields)
     found = before(batch_of(dataset, [30]))["memory.text"][0]
     found = found[-1] if align == "framewise" else found
     torch.testing.assert_close(found, WordTextEncoder(64)([dataset.hf_dataset[30][column]])[0])
 
 
-def test_shuffled_texts_are_those_of_the_batch(objects: Path) -> None:
+def test_shuffled_texts_are_those_of_the_batch(root: Path) -> None:
     fields = {"size": "small", "perception": "objects", "align": "contrastive"}
     found = []
     for shuffle in (False, True):
-        _, before, _, dataset = made_for_training(objects, shuffle_subgoals=shuffle, **fields)
+        _, before, _, dataset = made_for_training(root, shuffle_subgoals=shuffle, **fields)
         batches = [before(batch_of(dataset, [10, 75]))["memory.text"] for _ in range(2)]
         assert torch.equal(*batches), "equal in every epoch"
         found.append(batches[0])
@@ -223,34 +158,17 @@ def most_frequent_share(rows: np.ndarray, shuffled: np.ndarray) -> float:
     return float(max(count.max() / count.sum() for count in counts))
 
 
-@pytest.mark.parametrize("level", LEVELS)
-def test_shuffled_subgoals_are_not_renamed(level: str) -> None:
-    """In all tasks together, and in each task alone; a subgoal is one frame of each episode."""
-    repeats = 60
-    texts = [
-        [checkpoint.language[LEVELS.index(level)] for checkpoint in get_task(name).checkpoints]
-        for name in task_names(suite=None)
-    ]
-    number = {text: row for row, text in enumerate(dict.fromkeys(text for of_task in texts for text in of_task))}
-    own = [[number[text] for text in dict.fromkeys(of_task)] for of_task in texts]
-    assert any(len(rows) < SHUFFLED_ALONE for rows in own)
-
-    def shuffle(tasks: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
-        rows = np.array([row for subgoals in tasks for row in subgoals * repeats])
-        lengths = [len(subgoals) for subgoals in tasks for _ in range(repeats)]
-        return rows, shuffled_subgoals(rows, np.r_[0, np.cumsum(lengths)])[0]
-
-    rows, shuffled = shuffle(own)
-    ends = np.cumsum([repeats * len(subgoals) for subgoals in own])
-    for end, subgoals in zip(ends, own, strict=True):
-        here = slice(end - repeats * len(subgoals), end)
-        assert most_frequent_share(rows[here], shuffled[here]) < 0.7
-        assert len(subgoals) == 1 or most_frequent_share(*shuffle([subgoals])) < 0.75
-
-
 def test_one_subgoal_cannot_be_shuffled() -> None:
     cache: Any = SimpleNamespace(
         texts=["put it down"], text_rows=lambda _: np.zeros(5, int), episodes=np.array([0, 5]), root="here"
     )
     with pytest.raises(MemobenchError, match="shuffle_subgoals"):
         text_rows(cache, "coarse", "semantic", True)
+
+
+@pytest.mark.parametrize("subgoals", [2, 3, 8])
+def test_shuffled_subgoals_are_not_renamed(subgoals: int) -> None:
+    """A subgoal is one frame of each of 60 episodes."""
+    rows = np.tile(np.arange(subgoals), 60)
+    shuffled, _ = shuffled_subgoals(rows, np.arange(0, len(rows) + 1, subgoals))
+    assert most_frequent_share(rows, shuffled) < 0.75

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity, gelu, layer_norm, rms_norm, silu
 
 from lerobot_memobench.policies.memobench_mem.memory import read_settings
-from lerobot_memobench.policies.memobench_mem.memory.bank import Bank, append
+from lerobot_memobench.policies.memobench_mem.memory.bank import Bank
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories, MemorySpec, Query
 
 D, P, STRIDE, LENGTH, FRAMES = 8, 2, 24, 3, 12
@@ -100,18 +100,6 @@ def test_bank_equals_its_formula(count: int) -> None:
         assert steps["perceptual"] != steps["cognitive"], "streams merge independently"
 
 
-def test_two_most_similar_neighbours_are_merged() -> None:
-    """Rows: the middle of three; the last with the new entry; and a row that is not full."""
-    east, north, west = torch.eye(4)[:3]
-    entries = torch.stack([torch.stack([east, north, 2 * north]), torch.stack([east, north, west])])[:, :, None]
-    entries = torch.cat([entries, entries[1:] * torch.tensor([1.0, 1.0, 0.0])[None, :, None, None]])
-    steps, count, now = torch.tensor([[0.0, 8.0, 16.0]] * 2 + [[0.0, 8.0, 0.0]]), torch.tensor([3, 3, 2]), 24
-    kept, times = append(entries, steps, count, (west * 3).expand(3, 1, -1), torch.full((3,), now))
-    expected = [[east, 1.5 * north, 3 * west], [east, north, 2 * west], [east, north, 3 * west]]
-    assert torch.equal(kept[:, :, 0], torch.stack([torch.stack(row) for row in expected]))
-    assert times.tolist() == [[0, 12, 24], [0, 8, 20], [0, 8, 24]]
-
-
 def test_training_merges_with_exact_products(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounded products would choose other entries than a rollout."""
     bank, seen = made(), []
@@ -131,23 +119,3 @@ def test_training_merges_with_exact_products(monkeypatch: pytest.MonkeyPatch) ->
     finally:
         products.fp32_precision = usual
     assert seen == ["ieee"] * 5
-
-
-@pytest.mark.parametrize("count", [2, FRAMES])
-def test_shares_of_entries(count: int) -> None:
-    bank = made()
-    with torch.no_grad():
-        state = written(bank, torch.randn(count, P, D))
-        found = bank.read(state, Query(torch.randn(1, P, D)))
-    assert found.sources is not None
-    shares, steps = found.sources
-    assert shares.shape == (1, P + 1, 2 * LENGTH)
-    of_perceptual, of_cognitive = shares.split(LENGTH, dim=2)
-    torch.testing.assert_close(of_perceptual[0, :P].sum(dim=1), torch.ones(P))
-    torch.testing.assert_close(of_cognitive[0, P:].sum(dim=1), torch.ones(1))
-    assert not of_perceptual[0, P:].any()
-    assert not of_cognitive[0, :P].any()
-    kept, real = min(count, LENGTH), steps[0] >= 0
-    assert real.tolist() == [True] * kept + [False] * (LENGTH - kept) + [True] * kept + [False] * (LENGTH - kept)
-    assert not shares[0, :, ~real].any()
-    assert torch.equal(steps[0, :kept], state["perceptual_steps"][0, :kept])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from statistics import median_low
 from typing import Any
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,13 +24,6 @@ from tests.policies.test_memory import made
 
 STRIDE, TEXTS = 10, 3
 ALL = Query(choices=torch.ones(1, TEXTS, dtype=torch.bool))
-
-
-def test_example_of_the_source() -> None:
-    assert representatives([3, 1, 10, 3, 4], 5) == [3, 10]
-    assert representatives([1, 6, 12], 5) == [1, 12]
-    assert shown([3, 1, 10, 3, 4], 5, 10) == [3]
-    assert shown(range(0, 200, 10), 5, 1000) == [*range(120, 200, 10)]
 
 
 @settings(max_examples=100, deadline=None)
@@ -91,18 +83,6 @@ def test_shown_keyframes_equal_those_of_an_unbounded_list() -> None:
     assert max(map(len, mechanism.seen)) == SHOWN  # type: ignore[arg-type]
 
 
-def test_latest_nominations_are_kept() -> None:
-    mechanism = nominating(lambda frames: torch.ones_like(frames, dtype=torch.bool))
-    state = mechanism.init(1)
-    for number in range(100):
-        tokens = torch.full((1, mechanism.spec.tokens, mechanism.spec.dim), float(number))
-        state = mechanism.write(state, tokens, torch.tensor([number * STRIDE]), ALL)
-    kept = state["steps"][0, :NOMINATED]
-    assert torch.equal(kept, torch.arange(100 - NOMINATED, 100) * STRIDE)
-    assert torch.equal(state["frames"][0, :NOMINATED, 0, 0] * STRIDE, kept.float())
-    assert state["votes"][0, 0] == RECENT
-
-
 def labelled(labels: list[int], slots: list[int], ahead: bool = True) -> Histories:
     """Return histories of one episode with these labels, one per slot; frames hold their indices."""
     places = torch.full((len(slots), max(slots) + 1), -1)
@@ -149,35 +129,3 @@ def test_labels_are_those_of_the_next_frame() -> None:
     assert mechanism.losses({})["subtask"][0] == 0
     mechanism.replay(histories._replace(subgoals=None), query)
     assert not mechanism.losses({})
-
-
-@pytest.mark.slow
-def test_high_level_learns_to_nominate_and_to_choose() -> None:
-    """Trained with true keyframes, it chooses the text of each segment and nominates the segments' ends."""
-    mechanism = made("keyframes", stride=STRIDE).train()
-    labels = [0] * 12 + [1] * 10 + [2] * 12
-    slots = [*range(len(labels))]
-    query = Query(choices=torch.ones(len(slots), TEXTS, dtype=torch.bool), subgoal=torch.tensor(labels))
-    histories = labelled(labels, slots)
-    marked = torch.randn(TEXTS, 1, 6)[labels] + 0.1 * torch.randn(len(labels), 1, 6)
-    histories = histories._replace(frames=marked)
-    optimizer = torch.optim.Adam(mechanism.parameters(), 3e-3)
-    for _ in range(150):
-        mechanism.replay(histories, query)
-        loss = torch.stack([one.mean() for one in mechanism.losses({}).values()]).sum()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert loss < 0.15
-    mechanism.eval()
-    state, chosen = mechanism.init(1), []
-    with torch.no_grad():
-        for number, frame in enumerate(marked.split(1)):
-            state = mechanism.observe(state, frame, torch.tensor([number * STRIDE]), ALL)
-            chosen.append(int(state["text"]))
-    assert chosen[3:10] == [0] * 7
-    assert chosen[14:20] == [1] * 6
-    assert chosen[24:] == [2] * 10
-    kept = [step // STRIDE for step, votes in zip(state["steps"][0], state["votes"][0], strict=False) if votes > 0]
-    assert {min(abs(int(frame) - end) for end in (11, 21)) for frame in kept} <= {0, 1}
-    assert kept

@@ -6,16 +6,13 @@ LeRobot 0.6.1 has none; `scripts/lerobot_main` makes an environment that does.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from torch import Tensor
 
 from lerobot_memobench.cli.memobench import main as memobench
-from tests.policies.test_looking import CAMERAS, FEATURES, STEPS, Row, check, execution, observation
+from tests.policies.test_looking import FEATURES, STEPS, check, execution
 from tests.policies.test_other_policies import TASK, _tiny_paligemma, train_and_roll_out  # noqa: F401 - a fixture
 
 pytestmark = [
@@ -50,32 +47,3 @@ def test_visual_memory_needs_every_picture() -> None:
 
 def test_memory_of_states_needs_no_pictures() -> None:
     check(pi05(use_proprioceptive_memory=True), execution, range(0, STEPS, PLAN))
-
-
-def histories(policy: Any, rows: Sequence[Row], of: slice = slice(None)) -> list[Tensor]:
-    """Return the policy's pictures (rows, frames, C, H, W) at each step of some rows."""
-    policy.reset()
-    found = []
-    for time in range(STEPS):
-        batch = {CAMERAS[0]: observation(rows, time)[CAMERAS[0]][of]}
-        found.append(policy._stack_inference_memory(batch)[CAMERAS[0]])
-    return found
-
-
-def test_rows_have_independent_histories() -> None:
-    policy, rows = pi05(use_visual_memory=True), execution(0)
-    both = histories(policy, rows)
-    for row in range(len(rows)):
-        alone = histories(policy, rows, slice(row, row + 1))
-        assert all(torch.equal(part[row], one[0]) for part, one in zip(both, alone, strict=True))
-    times = range(STEPS - 1 - STRIDE * (FRAMES - 1), STEPS, STRIDE)
-    assert torch.equal(both[-1], torch.stack([observation(rows, time)[CAMERAS[0]] for time in times], dim=1))
-
-
-def test_a_call_is_a_step_to_it() -> None:
-    """With one call per chunk the history differs from training (docs/guides/evaluate.md)."""
-    policy = pi05(use_visual_memory=True)
-    policy.reset()
-    for time in (0, PLAN):
-        policy.predict_action_chunk(observation(execution(0), time))
-    assert policy._memory_steps_seen == 2

@@ -15,22 +15,16 @@ from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import memory
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frame, Frames, MemoryEncoder, sample_frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
-    FRAMES,
-    PLACES,
-    STEPS,
     Histories,
     MemoryMechanism,
     MemorySpec,
     MemoryTokens,
     Query,
 )
-from lerobot_memobench.policies.memobench_mem.memory.recurrent import Recurrent
 from lerobot_memobench.policies.memobench_mem.motion_fields import MotionField
-from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 
 P, D, SUBGOALS = 2, 16, ("close it", "open it", "put it there")
 
@@ -166,43 +160,19 @@ def test_gradients_reach_every_weight_and_weights_can_be_loaded(name: str) -> No
     empty.load_state_dict(mechanism.state_dict())
 
 
-class Sampled(Recurrent):
-    """A mechanism whose default replay cannot work, because it loads sampled frames."""
-
-    slots = classmethod(lambda cls, slot, settings: sample_frames(slot, 3))  # type: ignore[assignment]
-
-
-def test_replay_needs_prefixes_of_one_sequence() -> None:
-    built = Sampled(MemorySpec(4, 2, 32, 32, 0, 1), nn.Identity(), read_settings("recurrent", {"gradient_frames": 1}))
-    frames, steps = torch.randn(9, 2, 4), torch.arange(9)
-    assert built.replay(Histories(frames, steps, torch.tensor([[0, 1, 2], [0, 1, -1]]))).each.isfinite().all()
-    with pytest.raises(ValueError, match=r"Sampled\.slots"):
-        built.replay(Histories(frames, steps, torch.tensor([sample_frames(8, 3), sample_frames(3, 3)])))
-
-
-class Unset(Frames):
-    """A mechanism of a package whose Settings are no dataclass."""
-
-    Settings = dict
-
-
 def test_packages_that_add_a_broken_memory_are_named(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     added = [
         EntryPoint("gone", "no_such_package:Memory", memory.GROUP),
-        EntryPoint("other", "pathlib:Path", memory.GROUP),
         EntryPoint("twice", "one_package:Memory", memory.GROUP),
         EntryPoint("twice", "another:Memory", memory.GROUP),
-        EntryPoint("unset", f"{__name__}:Unset", memory.GROUP),
         EntryPoint("frames", "pathlib:Path", memory.GROUP),
     ]
     monkeypatch.setattr(memory, "entry_points", lambda group: added if group == memory.GROUP else [])
     for name, named in (
         ("gone", "no_such_package"),
-        ("other", "MemoryMechanism"),
         ("twice", "another:Memory.*one_package:Memory"),
-        ("unset", "Settings"),
     ):
         with pytest.raises(MemobenchError, match=f"'{name}'.*{named}"):
             find_mechanism(name)
@@ -234,51 +204,6 @@ def test_sampled_frames_are_even_and_reach_both_ends(step: int, frames: int) -> 
     assert (chosen[0], chosen[-1]) == (0, step)
     gaps = np.diff(chosen)
     assert not len(gaps) or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
-
-
-def test_sampled_frames_by_hand() -> None:
-    assert sample_frames(31, 32) == list(range(32))
-    assert sample_frames(62, 32) == list(range(0, 63, 2))
-    assert sample_frames(9, 1) == [9]
-    with pytest.raises(ValueError, match="step"):
-        sample_frames(-1, 32)
-
-
-class OneEpisode:
-    """A `FrameLookup` of one episode that counts the loaded frames."""
-
-    encoded: dict[str, Any] = {}
-    columns = encoded
-    texts = ()
-
-    def __init__(self, stored: Tensor, length: int, stride: int) -> None:
-        self.stored, self.stride, self.loaded = stored, stride, 0
-        self.episodes, self.phase = np.array([0, length]), np.ones(length)
-
-    def locate(self, index: int) -> tuple[int, int]:
-        return 0, index
-
-    def tokens(self, number: int, slots: list[int]) -> Tensor:
-        self.loaded = len(slots)
-        return self.stored[slots]
-
-
-def test_training_loads_the_frames_of_a_rollout() -> None:
-    stride, length = 2, 31
-    stored = torch.randn(-(-length // stride), 1, 6)
-    config = MemobenchMemConfig(device="cpu", memory_stride=stride, memory_settings={"frames": 5})
-    lookup, step = OneEpisode(stored, length, stride), GatherMemoryProcessorStep(config=config)
-    mechanism, state = made("frames", stride, frames=5), [[]]
-    for now in range(length):
-        if now % stride == 0:
-            state = mechanism.observe(state, stored[[now // stride]], torch.tensor([now]))
-        gathered = step.gather(lookup, [now])  # type: ignore[arg-type]
-        assert lookup.loaded <= 5
-        assert_same(
-            mechanism.replay(Histories(*(gathered[key] for key in (FRAMES, STEPS, PLACES)))), mechanism.read(state)
-        )
-    without = GatherMemoryProcessorStep(config=MemobenchMemConfig(device="cpu", memory="none"))
-    assert set(without.gather(lookup, [3])) == {"phase"}  # type: ignore[arg-type]
 
 
 def position_features(steps: Tensor) -> Tensor:

@@ -9,24 +9,15 @@ import pytest
 import torch
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem import passes
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryModulator
-from lerobot_memobench.policies.memobench_mem.layers import attend, rms_norm
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memory_reads import chunk_reads
-from tests.support.object_dataset import make_object_dataset
-from tests.support.small_policy import made_for_training, small_config
+from tests.support.small_policy import made_for_training
 
 REFUSED = ("motion",)  # has no attention weights
 LENGTH = 20
 """Frames of the dataset's second episode, which begins with a prompt of 8 frames."""
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_object_dataset(tmp_path_factory.mktemp("objects") / "data")
 
 
 def acting(root: Path, **fields: Any) -> tuple[MemobenchMemPolicy, list[dict[str, Any]]]:
@@ -54,23 +45,7 @@ def rolled(policy: MemobenchMemPolicy, batches: list[dict[str, Any]]) -> torch.T
     return torch.stack([policy.select_action(batch) for batch in batches])
 
 
-def test_modulator_reports_its_attention() -> None:
-    """With unit vectors as values, the output is the attention on each token."""
-    torch.manual_seed(0)
-    modulator, length = MemoryModulator(32, heads=4), 6
-    memory = MemoryTokens(torch.randn(3, length, 32), torch.arange(length) < torch.tensor([[6], [2], [0]]))
-    actions, (key, _) = rms_norm(torch.randn(3, 5, 32)), modulator.keys(memory)
-    units = torch.eye(length, modulator.head_dim).expand(3, -1, -1)
-    read: list[torch.Tensor] = []
-    modulator.out.register_forward_hook(lambda _, inputs, __: read.append(inputs[0]))
-    found: list[torch.Tensor] = []
-    modulator(actions, memory, (key, units), found)
-    of_heads = read[0].unflatten(-1, (4, modulator.head_dim))[..., :length]
-    torch.testing.assert_close(found[0], of_heads.mean(dim=(1, 2)))
-    torch.testing.assert_close(found[0].sum(dim=1), torch.tensor([1.0, 1.0, 0.0]))
-
-
-@pytest.mark.parametrize("fusion", ["modulation", "context"])
+@pytest.mark.parametrize("fusion", ["modulation", pytest.param("context", marks=pytest.mark.slow)])
 def test_reads_of_sampled_frames_change_no_action(root: Path, fusion: str) -> None:
     policy, batches = acting(root, memory_fusion=fusion)
     plain = rolled(policy, batches)
@@ -92,27 +67,6 @@ def test_reads_of_sampled_frames_change_no_action(root: Path, fusion: str) -> No
     assert policy.memory_reads() == [[], []]
 
 
-def test_context_reports_the_attention_of_actions(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, batches = acting(root, memory_fusion="context", num_inference_steps=1)
-    weights: list[torch.Tensor] = []
-
-    def noting(*given: Any) -> torch.Tensor:
-        read = attend(*given)
-        if given[0].shape[1] == policy.config.chunk_size:
-            query, key, scale = given[0][0], given[1][0], given[0].shape[-1] ** -0.5
-            scores = torch.einsum("nhd,md->hnm", query, key) * scale + given[3][0]
-            weights.append(scores.softmax(dim=-1))
-        return read
-
-    monkeypatch.setattr(passes, "attend", noting)
-    policy.watch_memory()
-    rolled(policy, batches[:9])
-    (read,), _ = policy.memory_reads()
-    tokens, actions = 4 * policy.config.tokens_per_frame, policy.config.chunk_size
-    columns = torch.stack(weights).mean(dim=(0, 1, 2))[:-actions][-tokens:]
-    assert read["weights"] == pytest.approx(columns.unflatten(0, (4, -1)).sum(dim=1).tolist(), abs=1e-6)
-
-
 def test_tokens_are_summed_per_entry() -> None:
     tokens, mask = torch.zeros(2, 4, 8), torch.tensor([[1, 1, 1, 1], [1, 1, 0, 0]], dtype=torch.bool)
     layers = [torch.tensor([[0.1, 0.2, 0.3, 0.4], [0.7, 0.3, 0.0, 0.0]])] * 2
@@ -132,7 +86,12 @@ def test_tokens_are_summed_per_entry() -> None:
     assert looked_up[1]["weights"] == pytest.approx([0.85, 0.15])
 
 
-@pytest.mark.parametrize("name", OURS)
+DEFAULT = ("bank", "motion")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in DEFAULT else pytest.mark.slow) for name in OURS]
+)
 def test_every_memory_reports_its_reads(root: Path, name: str) -> None:
     policy, batches = acting(root, memory=name)
     if name in REFUSED:
@@ -149,9 +108,3 @@ def test_every_memory_reports_its_reads(root: Path, name: str) -> None:
             assert min(read["weights"]) >= 0
             assert sum(read["weights"]) <= 1 + 1e-4
             assert max(read["weights"]) > 0
-
-
-def test_no_memory_has_no_reads() -> None:
-    with pytest.raises(MemobenchError, match="memory=none"):
-        small_config(memory="none").check_memory_reads()
-    small_config().check_memory_reads()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL, thumbnails
+from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     AHEAD,
     PLACES,
@@ -31,12 +32,10 @@ from lerobot_memobench.policies.memobench_mem.motion_fields import (
     ObjectMotion,
     match_blocks,
 )
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.objects import frame_row
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH
-from tests.support.object_dataset import make_object_dataset
-from tests.support.small_policy import batch_of, made_for_training, small_config
+from tests.support.small_policy import batch_of, made_for_training
 
 # -- pictures ---------------------------------------------------------------------------------------------------------
 
@@ -71,14 +70,6 @@ def test_blocks_equal_a_slow_search() -> None:
     assert not found[:, :7].any()
     assert (found[0, 9:15, 2:14] == torch.tensor([-2.0, 1.0])).all()
     assert (found[1, 9:15, 2:14] == torch.tensor([4.0, 0.0])).all()
-
-
-def test_thumbnails_hold_grey_levels_exactly() -> None:
-    levels = torch.arange(256.0).reshape(1, 1, 16, 16) / 255
-    picture = levels.repeat_interleave(16, 2).repeat_interleave(16, 3).expand(-1, 3, -1, -1)
-    found = thumbnails(picture)
-    assert (found.shape, found.dtype) == ((1, 1, THUMBNAIL**2), torch.bfloat16)
-    assert torch.equal(found.float().view(THUMBNAIL, THUMBNAIL)[::4, ::4].flatten(), torch.arange(256.0))
 
 
 # -- objects ----------------------------------------------------------------------------------------------------------
@@ -117,17 +108,6 @@ def test_things_are_matched_by_class_and_place() -> None:
     torch.testing.assert_close(moved(field[:4]), torch.tensor(expected))
     assert not field[4:-1, : MOVED + 1].any()
     torch.testing.assert_close(field[-1, :5], torch.tensor([0, 0.03 * PER_STEP, 0, 0, 1]))
-
-
-def test_things_are_followed_across_slots() -> None:
-    """Two cups pass each other, which exchanges their slots; a bowl is lost and reappears."""
-    field = field_of_objects()
-    cups = stored(*([(3, 0.0, 0.0)] * (step != 2) + [(5, 0.05 * step, 0.0), (5, 0.12, 0.0, 0.2)] for step in range(5)))
-    found, known = field.following(cups.unsqueeze(0))
-    assert (found.shape, known.shape) == ((1, 4, SLOTS + 1, MOVED), (1, 4, SLOTS + 1))
-    assert known[0, :, 0].tolist() == [True, False, False, False]
-    torch.testing.assert_close(found[0, :, 1, 0] / PER_STEP, torch.full((4,), 0.05))
-    torch.testing.assert_close(found[0, :, 2, 0], torch.zeros(4))
 
 
 # -- hindsight --------------------------------------------------------------------------------------------------------
@@ -200,9 +180,8 @@ def test_loss_counts_known_following_motions() -> None:
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, dict[str, Any]]:
+def trained(root: Path) -> tuple[Any, dict[str, Any]]:
     """A small policy of objects, and a preprocessed training batch."""
-    root = make_object_dataset(tmp_path_factory.mktemp("motion") / "objects")
     fields = {"size": "small", "perception": "objects", "memory": "motion"}
     policy, before, _, dataset = made_for_training(root, **fields)
     return policy, before(batch_of(dataset, [10, 30, 39, 50]))
@@ -236,13 +215,3 @@ def test_hindsight_has_no_effect_before_training(trained: tuple[Any, dict[str, A
     assert not [name for name in still if name.startswith(("memory.", "foresight.")) and name != unseen]
     one, other = losses()
     assert one != pytest.approx(other)
-
-
-def test_full_size_has_the_sizes_of_the_source() -> None:
-    with torch.device("meta"):
-        model = MemoryPI05(small_config(size="pi05", memory="motion", chunk_size=50))
-    assert isinstance(model.memory, Motion)
-    assert model.memory.summary.shape == (1024,)
-    assert model.memory.field.convolve[2].weight.shape == (1024, 1024, 3, 3, 3)
-    assert model.memory.out.out_features == 2048
-    assert model.foresight.queries.shape == (8, 1024)

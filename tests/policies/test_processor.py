@@ -8,21 +8,18 @@ from typing import Any
 import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
-from lerobot.processor import TokenizerProcessorStep
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem
 from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder, make_text_encoder, words
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
-    PromptTokenizerProcessorStep,
     WordTokenizerProcessorStep,
     make_vocabulary,
     make_word_tokenizer,
 )
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-from tests.support.object_dataset import make_object_dataset
 from tests.support.small_policy import batch_of, made_for_training, small_config
 
 
@@ -66,24 +63,6 @@ def test_cut_prompts_are_logged_once_per_instruction(warnings: pytest.LogCapture
     (message,) = warnings.messages
     assert "23 tokens" in message
     assert ", State: 7 12 200;" in message
-    warnings.clear()
-    exactly = "switch " * 13
-    step._tokenize_text(["switch the stove on. the stove was on. switch", exactly])
-    assert not warnings.messages
-    step._tokenize_text(exactly + "off")
-    assert "'off'" in warnings.text
-    pretrained = PromptTokenizerProcessorStep(tokenizer=step.input_tokenizer, max_length=3)
-    pretrained._tokenize_text(["switch the stove"])
-    assert "'stove'" in warnings.text
-
-
-def test_repeated_texts_are_tokenized_as_by_lerobot() -> None:
-    texts = ["put the bowl away", "wait", "put the bowl away", "wait", "put it away"]
-    step = step_of(texts, length=8)
-    found, lerobots = step._tokenize_text(texts), TokenizerProcessorStep._tokenize_text(step, texts)
-    assert found.keys() == lerobots.keys()
-    assert all(torch.equal(found[name], expected) for name, expected in lerobots.items())
-    assert torch.equal(step._tokenize_text("wait")["input_ids"], found["input_ids"][1:2])
 
 
 def test_text_encoders_distinguish_texts() -> None:
@@ -111,8 +90,7 @@ def prompt_of(before: Any, batch: dict[str, Any], row: int) -> str:
     return " ".join(step.tokenizer.convert_ids_to_tokens(ids.tolist()))
 
 
-def test_oracle_memory_is_read_in_training_and_in_rollouts(tmp_path: Path) -> None:
-    root = make_object_dataset(tmp_path / "data")
+def test_oracle_memory_is_read_in_training_and_in_rollouts(root: Path, tmp_path: Path) -> None:
     policy, before, after, dataset = made_for_training(
         root, size="small", perception="objects", memory="none", oracle_memory=True
     )

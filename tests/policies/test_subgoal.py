@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor
@@ -67,7 +65,6 @@ def remember(
     seed: int = 2,
     subgoal: list[int] | None = None,
     learns: bool = False,
-    watched: bool = False,
 ) -> NarrowReading:
     """Begin a pass over a history of three frames, with or without true texts."""
     memory, chance = model.memory, torch.Generator().manual_seed(seed)
@@ -78,7 +75,7 @@ def remember(
     query = Query(choices=choices, subgoal=None if subgoal is None else torch.tensor(subgoal))
     read = memory.replay(histories(frames, torch.arange(3).repeat(B, 1), torch.ones(B, 3, dtype=torch.bool)), query)
     each = read.each.detach().requires_grad_(learns)
-    reading = model.reading(read._replace(each=each), watched)
+    reading = model.reading(read._replace(each=each))
     assert isinstance(reading, NarrowReading)
     return reading
 
@@ -153,28 +150,6 @@ def test_gradients_flow_only_through_the_text(model: MemoryPI05) -> None:
     assert history.grad[:1].any()
 
 
-def test_unread_states_are_not_computed(model: MemoryPI05) -> None:
-    """Only one of the prefix's last states is computed; results equal those of a complete pass."""
-    model.train()
-    made = list[int]()
-    last: Any = model.paligemma_with_expert.paligemma.model.language_model.layers[-1]
-    last.mlp.register_forward_pre_hook(lambda _, inputs: made.append(inputs[0].shape[1]))
-    actions, inputs = torch.randn(B, CHUNK, model.config.max_action_dim), inputs_of(model)
-
-    def learned(watched: bool) -> list[Tensor | None]:
-        model.zero_grad()
-        reading = remember(model, subgoal=[0, 2], learns=True, watched=watched)
-        losses, scores = passed(model, inputs, actions, reading), reading.outputs[SCORES]
-        (losses.mean() + torch.nn.functional.cross_entropy(scores, torch.tensor([0, 2]))).backward()
-        return [losses, scores, reading.memory.each.grad, *(parameter.grad for parameter in model.parameters())]
-
-    narrowed, whole = learned(watched=False), learned(watched=True)
-    for ours, all_made in zip(narrowed, whole, strict=True):
-        torch.testing.assert_close(ours, all_made, rtol=1e-4, atol=1e-5)
-    assert made[0] == 1
-    assert made[1] > model.config.chunk_size
-
-
 def test_acting_equals_training(model: MemoryPI05) -> None:
     """One step of denoising ends at actions for which a training pass with the same text has no error."""
     reading = remember(model)
@@ -182,15 +157,6 @@ def test_acting_equals_training(model: MemoryPI05) -> None:
     assert reading.chosen is not None
     true = remember(model, subgoal=reading.chosen.tolist())
     assert passed(model, inputs_of(model), actions, true).max() < 1e-8
-
-
-def test_shares_are_the_texts_attention_to_memory(model: MemoryPI05) -> None:
-    reading = remember(model, watched=True)
-    planned(model, inputs_of(model), reading)
-    shares = torch.stack(reading.shares())
-    assert shares.shape == (model.config.dimensions.vlm.depth, *reading.memory.mask.shape)
-    assert (shares.sum(dim=-1) < 1).all()
-    assert torch.equal(shares > 0, reading.memory.mask.expand_as(shares))
 
 
 def test_choice_is_independent_of_the_true_text(model: MemoryPI05) -> None:

@@ -34,22 +34,21 @@ def state_at(hand: np.ndarray) -> np.ndarray:
 
 
 def record_of(name: str, seed: int, prompt: int) -> str:
-    """What `memobench generate` says of an episode."""
+    """Return the record of an episode, as `memobench generate` writes it."""
     told = {"memory_type": "object", "referent": "random", "variant": 0, "key_frames": [-1]}
     return EpisodeRecord(task_name=name, seed=seed, exec_start_index=prompt, **told).in_frames()
 
 
 def make_object_dataset(
-    root: Path, seed: int = 0, pictures: bool = False, repeats: int = 1, records: bool = False, earlier: bool = False
+    root: Path, seed: int = 0, pictures: bool = False, repeats: int = 1, records: bool = False
 ) -> Path:
     """Write episodes in which the hand moves to the one of three things that was lit in the prompt.
 
-    With ``repeats`` each of the three kinds of episodes has that many; with ``records`` each says which of two tasks it
-    is of; with ``earlier`` objects stand beside pictures under LeRobot's name of an input, as they once did.
+    With ``repeats`` each of the three kinds of episodes has that many; with ``records`` each names one of two tasks.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    objects = PRIVILEGED if pictures and not earlier else OBJECTS
+    objects = PRIVILEGED if pictures else OBJECTS
     number: dict[str, Any] = {"dtype": "float32", "names": None}
     string = {"dtype": "string", "shape": (1,), "names": None}
     camera = {"dtype": "video", "shape": (48, 48, 3), "names": ["height", "width", "channels"]}

@@ -43,11 +43,3 @@ def test_average_of_a_new_part_starts_at_its_weights() -> None:
     assert new.restore(states_of(*old.state())) == ["b"]
     assert (new.counts, new.average["b"].item()) == ({"a": 1, "b": 0}, 3.0)
     assert states_of(*new.state())["b"].updates == 0
-
-
-def test_average_is_applied_in_another_precision() -> None:
-    weight = nn.Parameter(torch.tensor([0.3]))
-    average = WeightAverage({"w": weight}, 0.9)
-    with average.applied({weight: torch.bfloat16}):
-        assert weight.dtype == torch.bfloat16
-    assert weight.dtype == torch.float32

@@ -11,7 +11,6 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.losses import counted_actions, mean_losses
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
 from tests.support import rank_case
 from tests.support.fork_server import ForkServer
@@ -66,16 +65,6 @@ def test_padded_actions_do_not_count(synthetic: Path, monkeypatch: pytest.Monkey
     assert logged["action_loss"] == pytest.approx((2 * 5.0 + CHUNK * 1.0) / (2 + CHUNK))
     per_sample, _ = policy.forward(batch, reduction="none")
     assert per_sample.mean().item() == pytest.approx(logged["action_loss"])
-
-
-def test_mean_losses_without_padding_is_the_mean() -> None:
-    losses = torch.rand(4, 5, 3)
-    found = mean_losses(losses, counted_actions({}, losses))
-    torch.testing.assert_close(found.mean, losses.mean())
-    torch.testing.assert_close(found.per_sample, losses.mean(dim=(1, 2)))
-    no_action = mean_losses(losses, torch.zeros(4, 5))
-    assert no_action.mean == 0
-    assert no_action.per_sample.tolist() == [0] * 4
 
 
 @pytest.mark.parametrize("memory", ["subgoal", "keyframes"])

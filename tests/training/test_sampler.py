@@ -11,7 +11,7 @@ from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.sampler import compute_sampler_state
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.training.sampler import execution_starts, frame_sampler, grouped_order, weighted_order
+from lerobot_memobench.training.sampler import frame_sampler, grouped_order, weighted_order
 
 EPISODES, PHASE = np.array([0, 40, 63, 94]), np.ones(94, int)
 PHASE[40:48] = 0
@@ -19,11 +19,6 @@ PHASE[40:48] = 0
 
 def sampler(**options: Any) -> Any:
     return frame_sampler(EPISODES, PHASE, options.pop("used", None), seed=5, **options)
-
-
-def test_execution_starts_after_the_prompt() -> None:
-    phase = np.array([0, 0, 1, 1, 1, 1, 0, 0])
-    assert execution_starts(np.array([0, 4, 6, 8]), phase).tolist() == [2, 4, 8]
 
 
 @pytest.mark.parametrize("used", [None, [2, 1]])

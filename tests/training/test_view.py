@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 import torch
 from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_memobench.cli.memobench import main as memobench
@@ -19,11 +17,10 @@ from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.arguments import read_arguments, split_arguments
-from lerobot_memobench.training.view import Choice, choice_for, needs_view, viewed, write_view
+from lerobot_memobench.training.view import Choice, viewed, write_view
 from tests.support.object_dataset import LENGTHS, PROMPTS
 
 STATE, SLOTS, PICTURE = "observation.state", "observation.environment_state", "observation.images.image"
-ACT = {"device": "cpu", "push_to_hub": False, "chunk_size": 4, "n_action_steps": 4}
 
 
 def opened(root: Path, **options: Any) -> LeRobotDataset:
@@ -58,14 +55,6 @@ def test_view_holds_the_frames_after_the_prompt(pictured: Path, tmp_path: Path) 
     assert next((tmp_path / "view").rglob("*.mp4")).is_symlink()
 
 
-def test_histories_do_not_reach_into_the_prompt(pictured: Path, tmp_path: Path) -> None:
-    write_view(pictured, tmp_path / "view", Choice(obs_type=PIXELS))
-    view = opened(tmp_path / "view", delta_timestamps={STATE: [-0.1, -0.05, 0.0]})
-    start = view.meta.episodes[1]["dataset_from_index"]
-    assert view[start][f"{STATE}_is_pad"].tolist() == [True, True, False]
-    assert view[start + 2][f"{STATE}_is_pad"].tolist() == [False, False, False]
-
-
 @pytest.mark.parametrize(
     ("obs_type", "seen"),
     [(PIXELS, {STATE, PICTURE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, PICTURE})],
@@ -90,23 +79,6 @@ def test_language_timestamps_move_with_their_frames(tmp_path: Path) -> None:
         assert new["content"] == old["content"]
         age = float(there["timestamp"]) - float(old["timestamp"])
         assert float(here["timestamp"]) - float(new["timestamp"]) == pytest.approx(age, abs=1e-5)
-
-
-def test_choice_depends_on_policy_and_dataset(pictured: Path, synthetic: Path) -> None:
-    features = opened(pictured).meta.features
-    plain = ACTConfig(**ACT)
-    assert choice_for(plain, features, None, None) == Choice(False, PIXELS)
-    assert choice_for(plain, features, True, OBJECTS) == Choice(True, OBJECTS)
-    reader = SimpleNamespace(reads_prompt=True, perception=None, input_features={})
-    assert choice_for(reader, features, None, None) == Choice(True, PIXELS)
-    assert choice_for(SimpleNamespace(perception="pixels", input_features={}), features, None, None) == Choice()
-    begun = ACTConfig(**ACT)
-    begun.input_features = {SLOTS: SimpleNamespace(type=FeatureType.ENV)}
-    assert choice_for(begun, features, None, None).obs_type == OBJECTS
-    features = opened(synthetic).meta.features.items()
-    foreign = {name: one for name, one in features if not name.endswith(("phase", "step"))}
-    assert not needs_view(foreign, Choice(False, PIXELS))
-    assert needs_view(foreign | {SLOTS: {"dtype": "float32", "shape": (3,)}}, Choice(False, PIXELS))
 
 
 def test_missing_observations_are_refused(synthetic: Path, objects: Path, tmp_path: Path) -> None:
@@ -138,17 +110,3 @@ def test_command_writes_a_view(pictured: Path, tmp_path: Path, capsys: pytest.Ca
     assert set(inputs(out)) == {STATE, SLOTS}
     for words in (["--out", str(out)], ["--out", str(tmp_path / "b"), "--obs-type", "some"]):
         assert memobench(["view", str(pictured), *words]) == 2
-
-
-@pytest.mark.slow
-def test_lerobots_trainer_reads_a_view(pictured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lerobot_memobench.cli.lerobot import main as lerobot
-
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    words = ["policy=act", "policy.dim_model=32", "policy.n_heads=2", "policy.dim_feedforward=64", "policy.device=cpu"]
-    words += ["policy.chunk_size=4", "policy.n_action_steps=4", "obs_type=" + OBJECTS, f"dataset={pictured}"]
-    run = tmp_path / "run"
-    assert lerobot(["train", *words, "steps=2", "batch_size=4", "num_workers=0", f"output_dir={run}"]) == 0
-    assert lerobot(["train", f"output_dir={run}", "resume=true", "steps=3", "num_workers=0"]) == 0
-    assert (run / "checkpoints/000003/pretrained_model/model.safetensors").is_file()
-    assert lerobot(["train", *words, "policy.chunk_size=-1", f"output_dir={tmp_path / 'no'}"]) != 0
