@@ -1,4 +1,4 @@
-"""Progress of an episode: steps and order of checkpoints, success. No physics."""
+"""Progress of an episode, and the choices of evidence episodes. No physics."""
 
 from __future__ import annotations
 
