@@ -33,6 +33,10 @@ def values(formula: Formula, text: str, hold_steps: int = 2) -> str:
 @pytest.mark.parametrize(
     ("formula", "states", "expected"),
     [
+        (Exactly(1, A), "- a a - - a a -", "011110*0*0*"),
+        (Exactly(2, A), "a - - a - a", "000110*"),
+        (Hold(3, A), "a a a a - a a a", "00110001"),
+        (LATCH, "- b - -", "01*1*1*"),
         (When((A, B)), "- b ab - -", "001*1*1*"),
         (Round((A, B)), "b a - b b a b ab", "00010010"),
         (Round((A, B)), "ab ab", "01"),
