@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +9,6 @@ import pytest
 
 from lerobot_memobench.datasets.demonstration import digest, labels, persistent_rows
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.memory_text import IMPERATIVES, memory_text, subtask_texts
 
 
 def bits(values) -> str:
@@ -55,20 +52,6 @@ def test_number_of_checkpoints(make_demo, make_task):
     assert found.key_frames.shape == (0,)
     with pytest.raises(MemobenchError, match="7 checkpoints"):
         labels(make_demo(["0"] * 7, task=make_task("SSSSSSS")))
-
-
-def test_columns_are_typed_and_complete(make_demo):
-    columns = labels(make_demo(["0010", "0001"])).columns()
-    kinds = {name: c.dtype.name for name, c in columns.items() if isinstance(c, np.ndarray)}
-    assert kinds == {
-        "observation.phase": "float32",
-        "observation.step": "float32",
-        "checkpoint.index": "int64",
-        "checkpoint.operation": "int64",
-        "checkpoint.completed": "bool",
-        "checkpoint.event": "bool",
-    }
-    assert set(columns) - set(kinds) == {"simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"}
 
 
 def test_labels_equal_a_plain_simulation_of_the_definition(make_demo):
@@ -139,13 +122,6 @@ def rows_of(demo, style):
     return [(row["timestamp"], row["content"]) for row in persistent_rows(labels(demo)) if row["style"] == style]
 
 
-def test_rows_follow_the_text_columns(make_demo):
-    demo = make_demo(["0" * 10 + "1" * 30, "0" * 30 + "1" * 10])
-    times = [float(np.float32(frame / 20)) for frame in (0, 11, 31)]
-    assert rows_of(demo, "subtask") == [(times[0], "did thing 0"), (times[1], "did thing 1")]
-    assert rows_of(demo, "memory") == [(times[1], "did thing 0"), (times[2], "did thing 0; did thing 1")]
-
-
 def test_short_lived_texts_get_no_row(make_demo):
     # Checkpoints 0 and 1 complete two frames apart: "did thing 1" is the subtask for 0.1 s only.
     demo = make_demo(["0" * 10 + "1" * 30, "0" * 12 + "1" * 28, "0" * 30 + "1" * 10])
@@ -174,40 +150,3 @@ def test_rows_satisfy_lerobots_writer_and_resolvers(make_demo):
                 language_render.emitted_at(t, persistent=rows, events=[], style=style)  # raises for two rows
                 active = language_render.active_at(t, persistent=rows, style=style)
                 assert style == "memory" or active is not None
-
-
-VERBS = "|".join(set(IMPERATIVES) - set(IMPERATIVES.values()))
-PAST = re.compile(rf"(?:^|; |\band |\bthen |^.*, and )({VERBS})\b")
-
-
-@pytest.mark.parametrize("suite", ["published", "strict"])
-def test_subtasks_are_instructions_and_memories_are_not(suite):
-    """Of every checkpoint of every variant: no past tense, no completed step, no repetition."""
-    for base in map(get_task, task_names(suite=suite)):
-        for task in map(base.variant, range(base.num_variants)):
-            texts = subtask_texts(task)
-            assert len(texts) == len(task.checkpoints)
-            for k, (text, checkpoint) in enumerate(zip(texts, task.checkpoints, strict=True)):
-                assert text.split()[0] in IMPERATIVES.values(), text
-                assert not PAST.search(text), text
-                assert not re.search(r"by now|in all|each once|the one time", text), text
-                assert text not in texts[:k]
-                assert checkpoint.language[1].split()[0] in IMPERATIVES, "past tense"
-            assert memory_text(task, len(texts)).startswith(task.checkpoints[0].language[1])
-
-
-@pytest.mark.parametrize(
-    ("name", "variant", "number", "text"),
-    [
-        ("turn_the_stove_on_and_off_a_given_number_of_times", 2, 1, "switch the stove on and off again for the second"),
-        ("turn_the_stove_on_and_off_a_given_number_of_times", 2, 3, "come to rest"),
-        (
-            "find_the_tomato_hidden_in_one_of_the_drawers",
-            2,
-            0,
-            "pull out the bottom drawer, where the tomato",
-        ),
-    ],
-)
-def test_text_of_a_subtask(name, variant, number, text):
-    assert subtask_texts(get_task(name).variant(variant))[number].startswith(text)

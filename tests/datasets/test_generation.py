@@ -13,13 +13,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from lerobot_memobench.datasets import generation, recording
+from lerobot_memobench.datasets import recording
 from lerobot_memobench.datasets.generation import generate, slurm_of
 from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_dataset
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.slurm import run_part
-from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task
 from tests.support.kills import hashes as tree_hash
 from tests.support.kills import killed_at
 from tests.support.sbatch import Sbatch
@@ -141,38 +140,10 @@ def tree_hash_of_run(tasks, out):
     return tree_hash(out)
 
 
-def test_unfinished_run_of_another_request_is_refused(tasks, recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr(generation, "assemble", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        run(tasks, tmp_path / "ds")
-    monkeypatch.undo()
-    with pytest.raises(MemobenchError, match="images=True, now False"):
-        run(tasks, tmp_path / "ds", images=False)
-    edited = [replace(tasks[0], bddl_text="another goal"), tasks[1]]
-    with pytest.raises(MemobenchError, match="task_files"):
-        run(edited, tmp_path / "ds")
-
-
-def test_second_run_in_one_folder_is_refused(tasks, recorded, tmp_path):
-    with pytest.raises(MemobenchError, match="another run is writing"):
-        run(tasks, tmp_path / "ds", progress=lambda _: run(tasks, tmp_path / "ds"))
-
-
-def test_number_of_prompted_episodes(tasks, recorded, tmp_path):
-    shown = replace(tasks[1], prompt=get_task(DEMO_TASK).prompt)
-    summary = run([tasks[0], shown], tmp_path / "ds", episodes=1, prompted_episodes=3, images=False)
-    assert [(task.name, task.episodes) for task in summary.tasks] == [("task_a", 1), ("task_b", 3)]
-    assert recorded == [("task_a", 10_000), *(("task_b", 10_000 + i) for i in range(3))]
-    with pytest.raises(MemobenchError, match="prompted_episodes=3, now None"):
-        run([tasks[0], shown], tmp_path / "ds", episodes=1, images=False)
-
-
 @pytest.mark.parametrize(
     ("asked", "named"),
     [
         ({"episodes": 0}, "at least 1"),
-        ({"prompted_episodes": 0}, "at least 1"),
-        ({"workers": 0}, "at least 1"),
         ({"seed_base": 7}, "split"),
         ({"tasks": []}, "0 tasks"),
         ({"tasks": "twice"}, "named twice"),
@@ -198,7 +169,6 @@ IN_C = RuntimeError("Can't write data (file write failed: errno = 28, error mess
     ("place", "error"),
     [
         ("lerobot_memobench.datasets.staging.np.savez_compressed", FULL),
-        ("lerobot_memobench.datasets.video.VideoWriter.close", IN_C),
         ("lerobot_memobench.datasets.lerobot_format.assembling.ParquetFiles.write", IN_C),
     ],
 )
@@ -209,7 +179,7 @@ def test_full_disk_keeps_finished_episodes(tasks, recorded, tmp_path, monkeypatc
 
     def full(*args, **kwargs):
         calls.append(place)
-        if len(calls) > (2 if "savez" in place else 4) or "lerobot_format" in place:
+        if len(calls) > 2 or "lerobot_format" in place:
             raise error
         return inner(*args, **kwargs)
 
@@ -229,28 +199,6 @@ def test_full_disk_keeps_finished_episodes(tasks, recorded, tmp_path, monkeypatc
     run(tasks, tmp_path / "ds")
     assert len(recorded) - made == 4 - len(staged)
     assert tree_hash(tmp_path / "ds") == reference
-
-
-def test_disk_space_is_checked_before_the_first_episode(tasks, recorded, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(MemobenchError, match="Not a directory"):
-        run(tasks, tmp_path / "file" / "ds")
-    assert recorded == []
-    reports = []
-    run(tasks, tmp_path / "ds", notify=lambda text: reports.append((len(recorded), text)))
-    ((before, text),) = reports
-    assert before == 0
-    assert text.startswith("4 demonstrations of about 1,420 frames")
-    assert "MAY NOT" not in text
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_500_000))
-    run(tasks, tmp_path / "near", notify=lambda text: reports.append((len(recorded), text)))
-    assert "MAY NOT BE ENOUGH" in reports[1][1]
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=500_000))
-    made = len(recorded)
-    with pytest.raises(MemobenchError, match="make room"):
-        run(tasks, tmp_path / "far")
-    assert len(recorded) == made
 
 
 def test_slurm_makes_an_equal_dataset(tasks, recorded, tmp_path, monkeypatch):
@@ -273,10 +221,9 @@ def test_slurm_makes_an_equal_dataset(tasks, recorded, tmp_path, monkeypatch):
     ("holder", "name", "call"),
     [
         (pathlib.Path, "rename", 2),
-        (os, "fsync", 3),
         (os, "replace", "manifest.json"),
-        (os, "replace", "meta"),
-        *(pytest.param(os, "fsync", call, marks=pytest.mark.slow) for call in range(1, 26, 4)),
+        pytest.param(os, "replace", "meta", marks=pytest.mark.slow),
+        *(pytest.param(os, "fsync", call, marks=pytest.mark.slow) for call in (1, 3, 13, 25)),
     ],
 )
 def test_killed_runs_continue(tasks, recorded, tmp_path, holder, name, call):
@@ -285,11 +232,3 @@ def test_killed_runs_continue(tasks, recorded, tmp_path, holder, name, call):
     assert not is_dataset(tmp_path / "ds")
     run(tasks, tmp_path / "ds")
     assert tree_hash(tmp_path / "ds") == reference
-
-
-def test_missing_assets_of_a_world(tmp_path, monkeypatch):
-    monkeypatch.setenv("MEMOBENCH_LIBERO_ASSETS", str(tmp_path / "none"))
-    task = get_task("check_the_top_drawer_of_the_cabinet").in_world("libero")
-    with pytest.raises(MemobenchError, match="MEMOBENCH_LIBERO_ASSETS"):
-        generate([task], 1, tmp_path / "out")
-    assert not (tmp_path / "out").exists()

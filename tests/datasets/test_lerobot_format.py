@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -58,42 +55,9 @@ def test_frames_are_equal_after_loading(dataset, demos):
         position += len(demo)
 
 
-def test_metadata_of_episodes(dataset, demos):
-    for number, demo in enumerate(demos):
-        episode = dataset.meta.episodes[number]
-        expected = {
-            "task_name": demo.task.name,
-            "memory_type": demo.task.memory_type,
-            "seed": demo.seed,
-            "referent": "fixed",
-            "variant": 0,
-            "exec_start_index": demo.exec_start,
-            "key_frames": labels(demo).key_frames.tolist(),
-            "scene_hash": "abc",
-            "success": True,
-            "operations": demo.task.operations,
-            "digest": digest(demo),
-            "fixture_poses": json.dumps({"cabinet": [float(k) for k in range(7)]}),
-            "tasks": [demo.task.language],
-        }
-        assert {key: episode[key] for key in expected} == expected
-
-
-def test_lerobots_filter_history_and_batches(dataset):
+def test_batches_of_lerobot(dataset):
     from lerobot.utils.collate import lerobot_collate_fn
 
-    chosen = LeRobotDataset(
-        REPO,
-        root=dataset.root,
-        episode_filter=lambda episode: episode["memory_type"] == "object",
-        delta_timestamps={"action": [0.0, 0.05, 0.1], "observation.images.image": [-0.05, 0.0]},
-    )
-    assert chosen.episodes == [1, 2]
-    item = chosen[29]
-    assert item["action_is_pad"].tolist() == [False, True, True]
-    assert item["observation.images.image"].shape == (2, 3, SIZE, SIZE)
-    episode = LeRobotDataset(REPO, root=dataset.root, episodes=[1])  # by torch's collate function, as the viewer does
-    assert [len(batch["index"]) for batch in torch.utils.data.DataLoader(episode, batch_size=16)] == [16, 14]
     loader = torch.utils.data.DataLoader(dataset, batch_size=4, shuffle=True, collate_fn=lerobot_collate_fn)
     batch = next(iter(loader))
     for name in ("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory", "task"):
@@ -139,32 +103,6 @@ def test_inputs_of_plain_lerobot_policies(dataset):
     assert set(dataset_to_policy_features(dataset_features(None))) == {"observation.environment_state"} | common
 
 
-def test_language_rows_in_lerobots_recipes(dataset):
-    from lerobot.configs.recipe import MessageTurn, TrainingRecipe
-    from lerobot.datasets.language_render import render_sample
-
-    recipe = TrainingRecipe(
-        messages=[
-            MessageTurn(role="user", content="${task}", stream="high_level"),
-            MessageTurn(role="user", content="done: ${memory}", stream="high_level", if_present="memory"),
-            MessageTurn(role="assistant", content="${subtask}", stream="high_level", target=True),
-        ]
-    )
-    for index in range(0, len(dataset), 4):
-        item = dataset[index]
-        rendered = render_sample(
-            recipe=recipe,
-            persistent=item["language_persistent"],
-            events=[],
-            t=item["timestamp"].item(),
-            sample_idx=index,
-            task=item["task"],
-        )
-        memory = [f"done: {item['memory']}"] if item["memory"] else []
-        texts = [message["content"] for message in rendered["messages"]]
-        assert texts == [item["task"], *memory, item["simple_subgoal"]]
-
-
 def test_files_without_images_and_at_lerobots_size_limits(demos, make_demo, tmp_path, monkeypatch):
     import lerobot.datasets.feature_utils as feature_utils
 
@@ -197,14 +135,7 @@ def test_card(synthetic):
     assert (card.data.license, "LeRobot" in card.data.tags) == ("apache-2.0", True)
     for column in dataset_features((SIZE, SIZE)):
         assert f"`{column}`" in card.text
-    for row in (
-        "| object | here | 1 | 2 | 60 | 30.00 | 30.00 | 30.00 | 30 |",
-        "|  | paper | 5 | 250 | 121,276 | 485.10 | 492.00 | 526.00 | 556 |",
-        "5.0 in object tasks",
-        "| 0–199 | 3 | 100.00 % | 50 | 3.33 % |",
-        "| 1,500+ | 0 | 0.00 % | 25 | 1.67 % |",
-    ):
-        assert row in card.text
+    assert "| object | here | 1 | 2 | 60 | 30.00 | 30.00 | 30.00 | 30 |" in card.text
 
 
 def test_terms_of_the_papers_world(demos, make_task, tmp_path):
@@ -251,18 +182,3 @@ def test_refused_destinations_and_episodes(synthetic, demos, make_demo, tmp_path
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(MemobenchError, match=r"arrays\.npz is damaged"):
         assemble([staged], tmp_path / "ds")
-
-
-@pytest.mark.slow
-def test_lerobots_viewer(synthetic, tmp_path):
-    """As in docs/guides/data.md, without a display: every frame of one episode."""
-    reader = pytest.importorskip("rerun.experimental", reason="rerun-sdk is not installed (the extra viz)").RrdReader
-    words = ["--repo-id", REPO, "--root", str(synthetic), "--episode-index", "1", "--num-workers", "0"]
-    words += ["--display-compressed-images", "--save", "1", "--output-dir", str(tmp_path)]
-    command = "from lerobot.scripts.lerobot_dataset_viz import main; main()"
-    subprocess.run([sys.executable, "-c", command, *words], check=True)
-    rows: Counter[str] = Counter()
-    for chunk in reader(tmp_path / "local_test_episode_1.rrd").store().stream():
-        rows[chunk.entity_path] += chunk.num_rows
-    entities = ("/action", "/state", "/observation.images.image", "/observation.images.wrist_image")
-    assert {entity: rows[entity] for entity in entities} == dict.fromkeys(entities, 30)

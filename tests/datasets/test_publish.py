@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE
-from lerobot_memobench.datasets.publish import TABLES_FILE, card_tables, describe, push, short_manifest
+from lerobot_memobench.datasets.publish import TABLES_FILE, describe, push
 from lerobot_memobench.errors import MemobenchError
 from tests.support import hub_server
 from tests.support.fork_server import ForkServer
@@ -152,22 +152,6 @@ def test_files_of_an_earlier_dataset_are_deleted(hub, machine, folder, tmp_path)
     assert set(hub.repos[REPO]) - {".gitattributes"} == ours | {"notes.md"}
 
 
-def test_interrupted_upload_continues(hub, machine, folder, tmp_path):
-    code = PUSH.format(folder=str(folder), repo=REPO)
-    hub.failing.append(f"/api/datasets/{REPO}/commit/main")
-    assert "repeat the command to continue" in machine(code, tmp_path / "home").stdout
-    assert (hub.repos[REPO], hub.tags[REPO]) == ({}, {})
-    assert len([request for request in hub.requests if request.startswith("PUT /lfs/")]) >= 4
-    hub.requests.clear()
-    assert machine(code, tmp_path / "home").returncode == 0
-    assert not any(request.startswith("PUT /lfs/") for request in hub.requests)
-    for lost in ("README.md", "manifest.json"):  # the card is then computed from the frames
-        (folder / lost).unlink()
-    assert machine(code, tmp_path / "home").returncode == 0
-    assert "manifest.json" not in hub.repos[REPO]
-    assert "has edited this dataset" in hub.repos[REPO]["README.md"].decode()
-
-
 KILL = """
 import os, signal
 from huggingface_hub import HfApi
@@ -183,8 +167,6 @@ HfApi.{name} = killed
     ("name", "after"),
     [
         ("preupload_lfs_files", True),
-        pytest.param("create_repo", True, marks=pytest.mark.slow),
-        pytest.param("upload_file", False, marks=pytest.mark.slow),
         pytest.param("upload_file", True, marks=pytest.mark.slow),
     ],
 )
@@ -239,17 +221,3 @@ def test_description(synthetic, tmp_path, monkeypatch):
             describe(dataset, tmp_path / "out")
     assert [file.read_bytes() for file in files] == earlier
     assert sorted((tmp_path / "out").iterdir()) == sorted(files)
-
-
-def test_description_of_failures_and_other_folders(tmp_path):
-    episodes = [
-        {"task_name": "a", "seed": 1, "digest": "ff", "failure": None},
-        {"task_name": "a", "seed": 2, "digest": None, "failure": "goal not reached"},
-    ]
-    text = short_manifest({"version": "1", "episodes": episodes})
-    assert json.loads(text) == {"version": "1", "tasks": {"a": {"1": "ff", "2": "goal not reached"}}}
-    with pytest.raises(MemobenchError, match="no dataset"):
-        describe(tmp_path, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    with pytest.raises(MemobenchError, match="How it was made"):
-        card_tables("# another card")

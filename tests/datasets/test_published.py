@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from lerobot_memobench.datasets.convert import convert
@@ -17,7 +15,6 @@ from lerobot_memobench.datasets.hdf5 import PublishedDemo, PublishedFile
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.restore import joints_of, restore, task_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.task import LIBERO
@@ -29,7 +26,6 @@ pytestmark = needs_assets
 
 DRAWER = "check_the_middle_drawer_of_the_cabinet"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
-STOCK = Path("/work/shared/reference/published_layout/drawer.hdf5")
 OPENED, SHUT = 8, 15
 """Frames of `drawer` at which the drawer is open, and shut again."""
 
@@ -117,13 +113,9 @@ def test_other_scenes_are_refused(drawer, tmp_path):
     ghost = '<body name="ghost"><freejoint name="ghost_joint0"/></body></worldbody>'
     for reason, old, new in [
         ("no joint 'plate_1_joint0'", "plate_1_joint0", "dish_1_joint0"),
-        ("no joint 'robot0_joint7'", 'name="robot0_joint7"', 'name="robot0_joint8"'),
         ("body 'ghost' by the joint 'ghost_joint0'", "</worldbody>", ghost),
         ("base 'robot0_base' at .* another scene", 'pos="-0.66 0.0 ', 'pos="0 0 '),
-        ("<composite> in its worldbody", "</worldbody>", "<composite/></worldbody>"),
-        ("'childclass'", "<body ", '<body childclass="a" '),
         ("cannot compile", "<body ", '<body pos="1 x" name="b"/><body '),
-        ("not finite or beyond", "<body ", '<body pos="1 1e9 0" name="b"/><body '),
         ("no XML", "</mujoco>", ""),
     ]:
         with pytest.raises(MemobenchError, match=reason):
@@ -134,36 +126,3 @@ def test_other_scenes_are_refused(drawer, tmp_path):
     moved = f"{found.model_file[:start]}{x} {y} 0.0{found.model_file[found.model_file.index(chr(34), start) :]}"
     with pytest.raises(MemobenchError, match=r"'wooden_cabinet_1' at .* not on the table"):
         restore(task_of(file, found), replace(found, model_file=moved))
-
-
-@pytest.mark.skipif(not STOCK.exists(), reason="needs a file of stock LIBERO, which is in no repository")
-def test_file_of_stock_libero(tmp_path):
-    """Objects, joints and checkpoints agree with LIBERO's simulator when it wrote the file."""
-    truth = json.loads(STOCK.with_suffix(".hdf5.truth.json").read_text())
-    convert(STOCK, tmp_path / "ds")
-    (table,) = (tmp_path / "ds" / "data").rglob("*.parquet")
-    rows = pq.read_table(table).to_pydict()
-    facts = [fact for each in truth.values() for fact in each["facts"]]
-    slots = np.array(rows["privileged.environment_state"]).reshape(len(facts), SLOTS, WIDTH)
-    where = slice(STARTS["position"], STARTS["position"] + FIELDS["position"])
-    for fact, things in zip(facts, slots, strict=True):
-        bowl = fact["joints"]["akita_black_bowl_1_joint0"][:3]
-        assert np.linalg.norm(things[:, where] - bowl, axis=1).min() < 2e-4
-        (middle,) = fact["joints"]["wooden_cabinet_1_middle_level"]
-        assert abs(things[1, STARTS["joint"]] - middle) < 2e-4, "in the same slot in all frames"
-    for number, each in enumerate(truth.values()):
-        assert read_episode(tmp_path / "ds", number).whole["key_frames"] == each["meta"]["key_frame"]
-
-
-def test_two_worlds_and_missing_assets(drawer, tmp_path, monkeypatch):
-    libero_layout.write(tmp_path / "a.hdf5", drawer)
-    path = libero_layout.write(tmp_path / "b.hdf5", drawer)
-    with h5py.File(path, "a") as file:
-        attributes = file["data/demo_1"].attrs
-        attributes["model_file"] = attributes["model_file"].replace('model="base"', 'model="memobench"')
-    summary = convert(tmp_path, tmp_path / "ds")
-    assert summary.episodes == 1
-    assert "world=memobench" in summary.problems[0].reason
-    monkeypatch.setenv("MEMOBENCH_LIBERO_ASSETS", str(tmp_path))
-    with pytest.raises(MemobenchError, match=r"LIBERO's asset .* is missing"):
-        convert(tmp_path / "a.hdf5", tmp_path / "other")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -15,33 +15,24 @@ from scipy import stats
 
 from lerobot_memobench.envs.episode import Episode, first_execution_step, referent_of
 from lerobot_memobench.envs.episode_log import episode_record
-from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, Pacing, longest
+from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, Pacing
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.experts.expert import Expert
-from lerobot_memobench.experts.fixtures import turn_knob
-from lerobot_memobench.experts.hand import OPEN, Hand
-from lerobot_memobench.experts.travel import come_home
 from lerobot_memobench.protocol import (
     EXECUTION,
     HORIZON,
     IDLE_STEPS,
     PAPER,
-    PROMPT,
-    PROMPT_HORIZON,
     SEALED,
     SPLITS,
     VALIDATION,
 )
-from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.failures import asks_order
-from lerobot_memobench.tasks.formula import Atom, Formula, Never, Then, atoms
-from lerobot_memobench.tasks.progress import HOLD_STEPS, Progress
-from lerobot_memobench.tasks.task import LIBERO, PUBLISHED, STRICT, Prompt, Task
+from lerobot_memobench.tasks.formula import Atom, Formula, Never, Then
+from lerobot_memobench.tasks.task import STRICT, Task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 STRICT_STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
-STRICT_ASSEMBLY = "assemble_strictly_in_the_order_demonstrated_in_the_prompt_video"
 ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 SEED = 20_000
@@ -146,75 +137,7 @@ def test_prompts_of_strict_tasks_have_one_length() -> None:
         assert {task.variant(k).prompt_steps for k in task.random_variants} == {task.prompt_steps}
         assert task.idles == (task.suite == STRICT) == (task.prompt_steps is not None)
         length = task.prompt_steps or 0
-        assert length <= PROMPT_HORIZON
         assert first_execution_step(task, SEED, True) - first_execution_step(task, SEED, False) == length
-
-
-def test_clock_of_published_episodes_restarts_with_the_execution() -> None:
-    episode = Episode(get_task(HIGHLIGHT))
-    episode.reset(SEED)
-    steps = [episode.clock]
-    while episode.phase == PROMPT:
-        assert not episode.idling
-        episode.step(REST)
-        steps.append(episode.clock)
-    assert steps == [*range(len(steps) - 1), 0]
-
-
-class ScriptedPrompt:
-    """A prompt of resting steps that moves the butter by hand."""
-
-    succeeded, steps, shift = True, 0, 0.0
-
-    def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
-        self._sim = sim
-
-    def actions(self) -> Iterator[NDArray[np.float32]]:
-        for _ in range(self.steps):
-            if self.shift:
-                self._sim.data.joint("butter_1_joint0").qpos[1] += self.shift
-            yield REST
-
-
-@pytest.fixture
-def scripted(monkeypatch: pytest.MonkeyPatch) -> type[ScriptedPrompt]:
-    monkeypatch.setattr("lerobot_memobench.envs.episode.PromptDemonstrator", ScriptedPrompt)
-    monkeypatch.setattr(ScriptedPrompt, "steps", 5)
-    monkeypatch.setattr(ScriptedPrompt, "shift", 0.0)
-    return ScriptedPrompt
-
-
-def test_rest_in_a_prompt_does_not_count_as_the_answer(scripted: type[ScriptedPrompt]) -> None:
-    scripted.steps = 60
-    task = dataclasses.replace(get_task(STRICT_STOVE).variant(0), prompt=Prompt("highlight", "moka_pot_1"))
-    episode = run(task)
-    assert (episode.exec_steps, episode.lost) == (40, True)
-    assert episode.exec_start == first_execution_step(task, SEED, True)
-
-
-@pytest.mark.parametrize("shown", [True, False])
-@pytest.mark.parametrize(
-    ("prompt", "moved"),
-    [
-        (Prompt("highlight", "butter_1"), 0.0),
-        (Prompt("hide", None, (("butter_1", "kitchen_table_plate_region"),)), 0.05),
-    ],
-)
-def test_execution_starts_from_the_hidden_scene_or_the_initial_one(
-    scripted: type[ScriptedPrompt], prompt: Prompt, moved: float, shown: bool
-) -> None:
-    scripted.shift = 0.01
-    task = dataclasses.replace(get_task(STRICT_ASSEMBLY), drawn=False, prompt=prompt)
-    sim = Simulation(task)
-    sim.reset(SEED)
-    episode = Episode(task, demonstration_prompt=shown)
-    episode.reset(SEED)
-    while episode.exec_start is None:
-        episode.step(REST)
-    assert episode.exec_start == episode.step_index == first_execution_step(task, SEED, shown)
-    distance = np.linalg.norm(episode.sim.body_pose("butter_1")[0] - sim.body_pose("butter_1")[0])
-    assert distance == pytest.approx(moved, abs=0.005)
-    assert episode.sim.holds(Atom("inplace", ("butter_1",)))
 
 
 # --- pacing ---
@@ -262,11 +185,6 @@ def test_pauses_start_and_end_between_chunks(speed: float, replan: int | None) -
     assert executed(paced(50), 400) == executed(paced(50), 400) != executed(paced(50, seed=1), 400)
 
 
-def test_longest_execution_contains_every_pause() -> None:
-    steps = longest(EnvSettings(horizon=600, pause_steps=30, speed=0.5, replan_steps=4))
-    assert sum(number is not None for number in executed(paced(30, 0.5, 4), steps)) >= 600 * 2
-
-
 def test_pauses_leave_the_expert_episode_unchanged() -> None:
     plain = run(get_task(STOVE), Episode.expert_action)
     steps, hashes = [], []
@@ -299,33 +217,6 @@ def test_horizon_counts_actions_at_full_speed_without_pauses() -> None:
 # --- the end of strict and published episodes ---
 
 
-def stove_rounds(episode: Episode, count: int) -> Iterator[NDArray[np.floating[Any]]]:
-    """Yield actions that turn the stove on and off and return home ``count`` times, then rest."""
-    hand, home = Hand(episode.sim, np.random.default_rng(0)), episode.sim.eef_pose()
-    for _ in range(count):
-        yield from turn_knob(hand, "flat_stove_1", on=True)
-        yield from turn_knob(hand, "flat_stove_1", on=False)
-        yield from come_home(hand, *home)
-    while True:
-        yield hand.rest(OPEN)
-
-
-@pytest.mark.parametrize(
-    ("asked", "done"), [(1, 1), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((1, 2), (2, 1), (2, 2)))]
-)
-def test_only_the_requested_count_succeeds(asked: int, done: int) -> None:
-    episode = Episode(get_task(STRICT_STOVE))
-    episode.reset(SEED, asked - 1)
-    while episode.exec_start is None:
-        episode.step(REST)
-    for action in stove_rounds(episode, done):
-        if episode.done:
-            break
-        episode.step(action)
-    assert (episode.success, episode.lost) == (asked == done, asked != done)
-    assert episode.exec_steps < episode.settings.horizon
-
-
 def test_unreachable_goals_end_strict_episodes_only() -> None:
     never = Never(Atom("turnoff", ("flat_stove_1",)))
     published = run(dataclasses.replace(get_task(STOVE), goal=never), horizon=45)
@@ -338,7 +229,6 @@ def test_unreachable_goals_end_strict_episodes_only() -> None:
 # --- failures ---
 
 QUICK = {
-    "check_the_top_drawer_a_given_number_of_times",
     "put_the_tomato_into_the_top_drawer_of_the_cabinet",
 }
 ALL = [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in task_names(suite=None)]
@@ -348,27 +238,10 @@ ALL = [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in ta
 def test_rest_and_random_motion_satisfy_no_checkpoint(name: str) -> None:
     rng = np.random.default_rng(SEED)
     moving = 150 if name in QUICK else 400
-    for policy, steps in ((rest, 60), (lambda _: rng.uniform(-1, 1, 7).astype(np.float32), moving)):
+    for policy, steps in ((rest, 45), (lambda _: rng.uniform(-1, 1, 7).astype(np.float32), moving)):
         episode = run(get_task(name), policy, steps=steps, demonstration_prompt=name not in QUICK)
         assert episode.progress.first_step == [None] * len(episode.task.checkpoints)
         assert not episode.success
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", task_names(suite=None))
-def test_blind_routine_solves_only_the_published_variant(name: str) -> None:
-    """It solves all published tasks. Of the strict ones it solves no counting, ordering or finding task."""
-    task = get_task(name)
-    if task.suite == PUBLISHED:
-        assert run(task, Episode.blind_action).success
-        return
-    seeds: dict[bool, int] = {}
-    for seed in range(SEED, SEED + 100):
-        seeds.setdefault(referent_of(task, seed).variant_index == 0, seed)
-    for seed in sorted(seeds.values()):
-        episode = run(task, Episode.blind_action, seed)
-        asked = task.memory_type in ("object", "procedural") and episode.task.variant_index == 0
-        assert episode.success == asked, seed
 
 
 def acted(name: str, asked: int, answered: int, horizon: int = HORIZON) -> dict[str, Any]:
@@ -429,27 +302,3 @@ def test_upstream_shows_no_prompt() -> None:
     assert episode.phase == EXECUTION
     line = episode_record(episode, 0, 0.1)
     assert (line["protocol"], "world" in line, line["prompt_steps"]) == ("upstream", False, 0)
-
-
-def test_record_names_world_and_stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
-    episode = Episode(get_task(CHECK))
-    episode.reset(7)
-    assert not {"world", "stand_ins", "protocol"} & set(episode_record(episode, 0, 0.1))
-    episode.task = episode.task.in_world(LIBERO)
-    monkeypatch.setattr(episode.sim, "stand_ins", ("cork__3",), raising=False)
-    line = episode_record(episode, 0, 0.1)
-    assert (line["world"], line["stand_ins"]) == ("libero", ["cork__3"])
-
-
-@pytest.mark.parametrize("name", [each for each in task_names() if asks_order(get_task(each).goal)])
-def test_upstream_cannot_reach_goals_in_an_order(name: str) -> None:
-    """When the last part of `Then` starts to hold, all checkpoints have held (docs/benchmark/fidelity.md)."""
-    task = get_task(name)
-    progress = Progress(task, evaluations=2)
-    for atom in (atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)):
-        for _ in range(HOLD_STEPS):
-            progress.step({atom}.__contains__)
-            if None not in progress.first_step:
-                break
-    assert None not in progress.first_step
-    assert not progress.success

@@ -44,27 +44,6 @@ def test_newest_line_counts_in_any_file(tmp_path: Path, monkeypatch: pytest.Monk
     assert [item["steps"] for item in read_episodes(tmp_path)] == [3]
 
 
-def test_lines_of_both_outcomes_are_reported(tmp_path: Path) -> None:
-    log = EpisodeLog(tmp_path)
-    for success in (True, False):
-        for episode in (1, 2):
-            log.append(record("a", episode, success=success))
-    log.append(record("a", 3))
-    log.append({**record("a", 4, success=False), "not_run": "no such place"})
-    log.append(record("a", 4, success=True))
-    problems: list[str] = []
-    assert [item["success"] for item in read_episodes(tmp_path, problems)] == [False, False, True, True]
-    assert len(problems) == 1
-    assert "2 episodes" in problems[0]
-
-
-def test_merged_file_alone_is_a_log(tmp_path: Path) -> None:
-    records = [record("a", 0), record("a", 1)]
-    write_episodes(tmp_path, records)
-    assert read_episodes(tmp_path) == records
-    assert [path.name for path in tmp_path.iterdir()] == ["episodes.jsonl"]
-
-
 @pytest.mark.parametrize("removed", [1, 2, 17, 100])
 def test_torn_file_loses_at_most_its_last_record(tmp_path: Path, removed: int) -> None:
     for k in range(3):

@@ -8,44 +8,34 @@ import json
 import logging
 import os
 import pickle
-import shutil
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from gymnasium.utils.env_checker import check_env
 from lerobot.configs import FeatureType
 from lerobot.envs import env_to_policy_features, preprocess_observation
 
 import lerobot_memobench.envs
-from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.demonstration import labels
 from lerobot_memobench.envs import memobench_env
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode, first_execution_step
-from lerobot_memobench.envs.episode_log import MOST_EPISODES, differences, read_episodes, read_log
+from lerobot_memobench.envs.episode_log import differences, read_episodes, read_log
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import CHECKPOINTS, SPARSE
-from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS, RESET, STEPS
-from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
+from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.html.write import frame_count
-from lerobot_memobench.evaluation.metrics import failure_of, seed_base
+from lerobot_memobench.evaluation.metrics import failure_of
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.protocol import ENDED, EXECUTION, IDLE_STEPS, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
 from lerobot_memobench.run.card import first_variant_mismatch
-from lerobot_memobench.run.shards import merge_and_report
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import NOTHING_YET, with_memory
 from tests.support.libero import needs_assets
@@ -55,7 +45,6 @@ STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 STRICT_HIGHLIGHT = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
-STRICT_STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
 SEEDS = [20_000, 20_001, 20_002]
 REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 NEW_ROLLOUT = {"lerobot_new_rollout": True}
@@ -114,7 +103,6 @@ def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
 
 CONTRACT = {
     "published-pixels": (STOVE, "memobench", PIXELS),
-    "published-objects": (DRAWER, "memobench", OBJECTS),
     "published-both": (STOVE, "memobench", BOTH),
     "prompted-objects": (HIGHLIGHT, "memobench", OBJECTS),
     "strict-both": (STRICT_HIGHLIGHT, "memobench", BOTH),
@@ -215,17 +203,6 @@ def test_batches_in_processes_of_all_tasks(name: str, tmp_path: Path) -> None:
     check_batches(tmp_path, (False, True), 12, tasks=name, suite=get_task(name).suite, prompt_in=RESET, obs_type=BOTH)
 
 
-def test_phase_and_step_get_the_shape_of_a_training_batch(tmp_path: Path) -> None:
-    env = vector(tmp_path, 2)
-    observation, _ = env.reset(seed=SEEDS[:2])
-    env.close()
-    before, _ = MemobenchEnvConfig().get_env_processors()
-    batch = before(preprocess_observation(observation))
-    for name, value in (("phase", EXECUTION), ("step", 0)):
-        found = batch[f"observation.{name}"]
-        assert (found.shape, found.dtype, found.tolist()) == ((2,), torch.float32, [value, value])
-
-
 # --- prompt and idling ---
 
 
@@ -256,7 +233,7 @@ def test_prompt_ignores_actions_and_restores_the_scene() -> None:
     assert len(set(runs[0])) > 20, "the prompt shows a motion"
 
 
-@pytest.mark.parametrize("name", [HIGHLIGHT, STRICT_HIGHLIGHT])
+@pytest.mark.parametrize("name", [pytest.param(HIGHLIGHT, marks=pytest.mark.slow), STRICT_HIGHLIGHT])
 def test_prompt_in_reset_gives_the_same_execution_log_and_video(tmp_path: Path, name: str) -> None:
     task = get_task(name)
     idle = {seed: first_execution_step(task, seed, True) - (task.prompt_steps or 0) for seed in range(20_000, 20_600)}
@@ -278,46 +255,6 @@ def test_prompt_in_reset_gives_the_same_execution_log_and_video(tmp_path: Path, 
         check_equal(step, expected)
     assert records[0] == records[1]
     assert videos[0] == videos[1]
-
-
-@pytest.mark.parametrize("name", [STRICT_STOVE, STRICT_HIGHLIGHT])
-def test_idling_simulates_and_renders_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = {"step": 0, "render": 0}
-
-    def counting(method: str) -> Callable[..., Any]:
-        call = getattr(Simulation, method)
-
-        def counted(sim: Simulation, *args: Any) -> Any:
-            calls[method] += 1
-            return call(sim, *args)
-
-        return counted
-
-    for method in calls:
-        monkeypatch.setattr(Simulation, method, counting(method))
-    task = get_task(name)
-    length = task.prompt_steps or 0
-    seed = next(s for s in range(20_000, 20_600) if 30 <= first_execution_step(task, s, True) - length <= 90)
-    env = make(name, obs_type=BOTH, horizon=1)
-    observation, _ = env.reset(seed=seed)
-    calls["step"] = 0
-    frames, scenes, rendered = [observation], [env.scene_hash()], [calls["render"]]
-    while observation["phase"] == [PROMPT]:
-        observation, *_ = env.step(np.full(7, 0.7, np.float32))
-        frames.append(observation)
-        scenes.append(env.scene_hash())
-        rendered.append(calls["render"])
-    begins = first_execution_step(task, seed, True)
-    assert [int(frame["step"][0]) for frame in frames] == [*range(begins), NO_CLOCK]
-    simulated = calls["step"]
-    assert (simulated == 0) == (task.prompt is None)
-    assert simulated <= begins - 30
-    assert len(set(scenes[simulated:])) == 1
-    assert rendered[simulated] == rendered[begins - 1] == rendered[begins] - 2
-    for part in ("environment_state", "agent_pos"):
-        np.testing.assert_array_equal(frames[simulated][part], observation[part])
-    assert env.step(REST)[3]
-    assert env.record()["prompt_steps"] == begins
 
 
 # --- rewards, instruction, evidence ---
@@ -401,80 +338,7 @@ def test_evidence_runs_each_scene_with_each_variant(tmp_path: Path) -> None:
     assert differences(each, once) == ["evidence: True and False"]
 
 
-def test_expert_follows_the_prompt_in_an_evidence_episode() -> None:
-    env = make(STRICT_HIGHLIGHT, prompt_in=RESET, expert_action=True, evidence=True)
-    observation, _ = env.reset(seed=20_001)
-    over = False
-    while not over:
-        observation, _, terminated, truncated, _ = env.step(observation["expert_action"])
-        over = terminated or truncated
-    assert env.record().items() >= {"success": True, "choice": 1, "variant": 1}.items()
-
-
-def test_record_and_protocol_contain_the_pace(tmp_path: Path) -> None:
-    pace = {"horizon": 60, "pause_steps": 10, "speed": 0.5, "replan_steps": 4}
-    env = make(log_dir=str(tmp_path), **pace)
-    env.reset(seed=20_000)
-    while not env.step(REST)[3]:
-        pass
-    (record,) = read_episodes(tmp_path)
-    assert (record["steps"], record["paused_steps"] % 12) == (120, 0)
-    assert 0 < record["paused_steps"] <= longest(env.settings) - 120
-    block = protocol_of(tmp_path)
-    before = {key: value for key, value in block.items() if key not in ("pause_steps", "speed")}
-    assert differences(before, block) == ["pause_steps: 0 and 10", "speed: 1.0 and 0.5"]
-
-
 # --- frames that are rendered ---
-
-
-@pytest.mark.usefixtures("no_rendering")
-def test_unneeded_observations_repeat_a_copy_of_the_last_one() -> None:
-    env = make(DRAWER, horizon=4)
-    env.reset(seed=20_007)
-    seen = env.step(actions(1, 1)[0])[0]["environment_state"]
-    env.need_observation(False)
-    articulation, _ = env.episode.sim.world.articulation("wooden_cabinet_1_top_region")
-    env.episode.sim.data.joint(articulation.joint).qpos[0] = articulation.open_q
-    one, two = (env.step(np.ones(7, np.float32))[0]["environment_state"] for _ in range(2))
-    np.testing.assert_array_equal(one, seen)
-    np.testing.assert_array_equal(two, seen)
-    assert not np.shares_memory(one, two)
-    last = env.step(np.ones(7, np.float32))[0]["environment_state"]  # the last frame is always current
-    np.testing.assert_array_equal(last, ObjectSlots(env.episode.sim).observe())
-    assert (last != seen).any()
-
-
-def test_pause_is_observed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    observed: list[int] = []
-    objects = Episode.objects
-    monkeypatch.setattr(Episode, "objects", lambda self: observed.append(self.step_index) or objects(self))  # type: ignore[func-returns-value]
-    env, rested, over = make(horizon=100, pause_steps=30), {0: False}, False
-    env.reset(seed=7)
-    while not over:
-        *_, over, _ = env.step(np.full(7, 0.1, np.float32))
-        rested[env.episode.step_index] = env.episode.rested
-    pauses = sum(rested[step] and not rested[step - 1] for step in rested if step)
-    assert pauses
-    assert len(observed) == sum(not rests for rests in rested.values()) + pauses
-    assert sum(rested[step] for step in observed) == pauses
-
-
-def test_video_contains_every_step_and_other_episodes_are_not_rendered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rendered: list[int] = []
-    images = Episode.images
-    monkeypatch.setattr(Episode, "images", lambda self: rendered.append(self.step_index) or images(self))  # type: ignore[func-returns-value]
-    env = make(DRAWER, log_dir=str(tmp_path), horizon=2, videos=1)
-    for seed in (20_000, 20_001):
-        play(env, seed, 2)
-    assert rendered == [0, 1, 2]
-    (video,) = tmp_path.rglob("*.mp4")
-    assert (video.name, frame_count(video)) == (f"{DRAWER}.0.mp4", 3 + LAST_FRAMES)
-    assert env.render().std() > 0
-    env.render()
-    assert rendered == [0, 1, 2, 2]
 
 
 def test_failed_video_leaves_the_log_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -564,7 +428,7 @@ def test_invalid_action_ends_only_its_own_episode(
     assert write_report(tmp_path).summary.failures["invalid_action"] == sum(cut)
 
 
-@pytest.mark.parametrize("bad", ["up", [[0], [0, 1]], {"arm": 0}, "up" * 500, None, np.full(7, np.inf)])
+@pytest.mark.parametrize("bad", ["up" * 500, [[0], [0, 1]], None])
 def test_invalid_action_raises_without_a_log_until_the_next_reset(tmp_path: Path, bad: Any) -> None:
     env = make()
     for _ in range(2):
@@ -623,22 +487,14 @@ SHELF = """
 """
 
 
-@pytest.fixture
-def shelf(tmp_path: Path) -> Path:
-    """Write a task that the expert cannot do."""
-    folder = tmp_path / "tasks" / "spatial" / "a_shelf"
-    folder.mkdir(parents=True)
-    (folder / "task_config.bddl").write_text(SHELF)
-    meta = {
-        "memory": [["in"] * 3],
-        "operating_type": [[0] * 3],
-        "subtask_goals": [["in", "pan_1", "shelf_1_top_region"]],
-    }
-    (folder / "task_config.meta.json").write_text(json.dumps(meta))
-    return folder
-
-
-def test_task_that_cannot_be_run_enters_no_rate(shelf: Path, tmp_path: Path) -> None:
+def test_task_that_cannot_be_run_enters_no_rate(tmp_path: Path) -> None:
+    """The expert reaches into drawers, not into shelves."""
+    shelf = tmp_path / "tasks" / "spatial" / "a_shelf"
+    shelf.mkdir(parents=True)
+    (shelf / "task_config.bddl").write_text(SHELF)
+    goal = [["in", "pan_1", "shelf_1_top_region"]]
+    meta = {"memory": [["in"] * 3], "operating_type": [[0] * 3], "subtask_goals": goal}
+    (shelf / "task_config.meta.json").write_text(json.dumps(meta))
     with pytest.raises(MemobenchError, match="drawers only"):
         make(str(shelf), expert_action=True).reset(seed=20_000)
     log = tmp_path / "log"
@@ -652,39 +508,6 @@ def test_task_that_cannot_be_run_enters_no_rate(shelf: Path, tmp_path: Path) -> 
     assert read_episodes(log) == []
     with pytest.raises(MemobenchError, match="drawers only"):
         write_report(log)
-    other = tmp_path / "other"
-    play(make(expert_action=True, log_dir=str(other), horizon=3, prompt_in=STEPS), 20_000)
-    report = merge_and_report(tmp_path / "merged", [log, other])
-    assert report.run.summary.rollouts == 1
-    assert any("a_shelf was not run" in note for note in report.run.notes)
-    assert json.loads((tmp_path / "merged" / "report.json").read_text())["not_run"] == {"a_shelf": 2}
-
-
-def test_evaluation_of_a_folder_skips_a_task_that_cannot_be_run(shelf: Path, tmp_path: Path) -> None:
-    shutil.copytree(get_task(STOVE).folder, shelf.parent / STOVE)
-    words = ["eval", "env=memobench", f"env.task_dir={shelf.parent}", "episodes=1", "videos=0", "horizon=3"]
-    for more in ((), ("resume=true",)):
-        flags = (f"obs_type={OBJECTS}", "eval.use_async_envs=false", f"output_dir={tmp_path / 'out'}", *more)
-        assert main([*words, *flags]) == 0
-        assert [record["task"] for record in read_episodes(tmp_path / "out")] == [STOVE]
-        assert json.loads((tmp_path / "out" / "report.json").read_text())["not_run"] == {"a_shelf": 1}
-    named = json.loads((tmp_path / "out" / EVALUATION_FILE).read_text())["episodes"]
-    assert [episode["task"] for episode in named] == ["a_shelf", STOVE]
-
-
-def test_evidence_episode_that_cannot_be_run_names_its_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: Any, **__: Any) -> None:
-        raise MemobenchError("no simulator")
-
-    monkeypatch.setattr(Episode, "reset", fails)
-    env = make(STRICT_HIGHLIGHT, log_dir=str(tmp_path), evidence=True, prompt_in=RESET)
-    for seed in (20_002, 20_003):
-        env.reset(seed=seed)
-        env.step(REST)
-    assert [(r["episode"], r["seed"], seed_base(r)) for r in read_log(tmp_path)] == [
-        (2, 20_001, 20_000),
-        (3, 20_001, 20_000),
-    ]
 
 
 # --- seeds ---
@@ -706,13 +529,6 @@ def test_episodes_without_a_seed_are_outside_all_splits(tmp_path: Path) -> None:
         env.close()
         runs.append(hashes)
     assert runs[0] == runs[1], "a seed determines the episodes after it"
-    assert UNSEEDED[0] > 10 * MOST_EPISODES
-    drawn = set()
-    for _ in range(2):
-        env = make()
-        env.reset()
-        drawn.add(env.episode.seed)
-    assert len(drawn) == 2
 
 
 @pytest.mark.parametrize("counted", [False, True])
@@ -740,35 +556,6 @@ def test_each_task_has_a_gymnasium_id() -> None:
     assert env.unwrapped.task == STOVE
     with pytest.raises(gym.error.NameNotFound, match=STOVE):
         gym.make("memobench/turn_on_the_stofe_and_turn_it_off-v0")
-
-
-@pytest.mark.parametrize(("name", "obs_type"), [(STOVE, PIXELS), (STRICT_HIGHLIGHT, OBJECTS)])
-def test_gymnasium_checker_gives_no_warning(name: str, obs_type: str) -> None:
-    env = gym.make(f"memobench/{name}-v0", obs_type=obs_type, render="fast")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped)
-    env.close()
-
-
-@pytest.mark.parametrize("mode", ["sync", pytest.param("async", marks=pytest.mark.slow)])
-def test_gymnasium_vector_environment_uses_the_seeds_of_the_benchmark(mode: str) -> None:
-    workers = {"context": "forkserver"} if mode == "async" else {}  # this process has threads
-    settings = {"obs_type": OBJECTS, "horizon": 2}
-    envs = gym.make_vec(f"memobench/{STOVE}-v0", num_envs=2, vectorization_mode=mode, vector_kwargs=workers, **settings)
-    observation, _ = envs.reset(seed=7)
-    scenes = envs.call("scene_hash")
-    assert observation in envs.observation_space
-    for done in (False, True):
-        *_, terminated, truncated, _ = envs.step(np.zeros((2, 7), np.float32))
-        assert (list(terminated), list(truncated)) == ([False, False], [done, done])
-    envs.step(np.zeros((2, 7), np.float32))  # both rows start an episode of another scene
-    assert not set(envs.call("scene_hash")) & set(scenes)
-    envs.close()
-    episode = Episode(get_task(STOVE))
-    for seed, scene in zip((7, 8), scenes, strict=True):
-        episode.reset(seed)
-        assert episode.scene_hash == scene
 
 
 def test_calls_without_a_running_episode_raise_gymnasium_errors() -> None:

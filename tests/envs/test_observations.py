@@ -14,7 +14,6 @@ from lerobot_memobench.envs.observations import check_obs_type, obs_type_of, pol
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.baselines.configuration_baselines import (
-    MemobenchBlindConfig,
     MemobenchExpertConfig,
     MemobenchRandomConfig,
     UntrainedConfig,
@@ -46,14 +45,11 @@ def memory(**settings: Any) -> MemobenchMemConfig:
         (config(ACTConfig), BOTH, f"pixels, {POSES}"),  # before training: everything
         (config(PI05Config, STATE, PICTURE, SLOTS), BOTH, "pixels"),  # it ignores object slots
         (memory(), PIXELS, "pixels"),
-        (memory(perception="objects"), OBJECTS, POSES),
         (memory(perception="objects", detector="package"), PIXELS, "detections"),
         (MemobenchExpertConfig(), PIXELS, "privileged simulator state"),
-        (MemobenchBlindConfig(), PIXELS, "privileged simulator state"),
         (MemobenchRandomConfig(), PIXELS, "nothing"),
         (RemoteConfig(), BOTH, "pixels"),
         (RemoteConfig(keys="a=image,b=environment_state"), BOTH, f"pixels, {POSES}"),
-        (RemoteConfig(keys="b=state"), BOTH, "nothing"),
     ],
 )
 def test_inputs_are_named(policy: Any, obs_type: str, inputs: str) -> None:
@@ -76,12 +72,10 @@ def declared(kind: str, *seen: FeatureType, **more: Any) -> Any:
         (declared("pi05"), None),
         (declared("memobench_random", FeatureType.VISUAL, perception=UntrainedConfig.perception), None),
         (declared("act", FeatureType.VISUAL), PIXELS),
-        (declared("act", FeatureType.ENV), OBJECTS),
         (declared("diffusion", FeatureType.ENV, FeatureType.VISUAL), BOTH),
         (declared("pi05", FeatureType.ENV, FeatureType.VISUAL), PIXELS),
         (declared("mine", FeatureType.ENV), OBJECTS),
         (declared("memobench_mem", FeatureType.ENV, FeatureType.VISUAL, perception="objects"), OBJECTS),
-        (declared("memobench_mem", perception="pixels"), PIXELS),
         (declared("memobench_mem", perception="objects", uses_detector=True), PIXELS),
     ],
 )

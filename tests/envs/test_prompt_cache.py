@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -30,11 +28,9 @@ from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import STRICT_PROMPT_STEPS, Task
 
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
-BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 PROCEDURE = "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video"
 HIDING = "find_the_artichoke_hidden_in_one_of_the_drawers"
 TWO_HIDDEN = "find_the_artichoke_or_the_chestnut_hidden_in_two_of_the_drawers"
-WHOLE_PROMPTS = (HIGHLIGHT, BUTTER, PROCEDURE, HIDING, TWO_HIDDEN)
 HORIZON = 3
 
 
@@ -97,10 +93,7 @@ def rollout(
     [
         (HIGHLIGHT, 40, BOTH),
         (HIDING, 60, OBJECTS),
-        *(
-            pytest.param(n, None, BOTH, marks=pytest.mark.slow)
-            for n in (HIGHLIGHT, BUTTER, PROCEDURE, HIDING, TWO_HIDDEN)
-        ),
+        *(pytest.param(n, None, BOTH, marks=pytest.mark.slow) for n in (HIGHLIGHT, PROCEDURE, TWO_HIDDEN)),
     ],
 )
 def test_rollouts_are_equal_without_cache_while_writing_and_restored(
@@ -186,8 +179,6 @@ def resave(file: Path, change: dict[str, Any]) -> None:
 DAMAGE: dict[str, Callable[[Path], object]] = {
     "cut": lambda file: file.write_bytes(file.read_bytes()[:-200]),
     "one bit": lambda file: file.write_bytes(b"".join([(b := file.read_bytes())[:900], bytes([b[900] ^ 1]), b[901:]])),
-    "text": lambda file: file.write_text("no prompt"),
-    "one array": lambda file: file.write_bytes(np.lib.format.magic(1, 0)),
     "another prompt": lambda file: resave(file, {"name": np.array("other.npz")}),
     "another scene": lambda file: resave(file, {"physics": arrays(file)["physics"][:, :-1]}),
     "single precision": lambda file: resave(file, {"physics": arrays(file)["physics"].astype(np.float32)}),
@@ -257,17 +248,7 @@ def test_file_name_depends_on_everything_that_affects_the_prompt(folder: Path, m
     assert file() is None
 
 
-PROCESS = """
-import sys
-from pathlib import Path
-from lerobot_memobench.envs import prompt_cache
-from lerobot_memobench.tasks.catalogue import get_task
-prompt_cache.cache_folder = lambda: Path(sys.argv[1])
-print(prompt_cache.prompt_file(get_task(sys.argv[2]), 7, "0"))
-"""
-
-
-def test_named_seeds_share_a_file_across_processes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_named_seeds_are_cached(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(episode_module, "PROMPT_HORIZON", 3)
     env = MemobenchEnv(HIGHLIGHT, obs_type=OBJECTS, prompt_in=RESET)
     env.reset()
@@ -275,7 +256,3 @@ def test_named_seeds_share_a_file_across_processes(folder: Path, monkeypatch: py
     env.reset(seed=7)
     env.reset(seed=7)
     assert len([*folder.iterdir()]) == 1
-    command = [sys.executable, "-c", PROCESS, str(folder.parent), HIGHLIGHT]
-    environment = {**os.environ, "PYTHONHASHSEED": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout.strip() == str(prompt_file(get_task(HIGHLIGHT), 7, "0"))

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,14 +10,10 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from PIL import ImageDraw
 
-from lerobot_memobench.envs import video
-from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.video import AHEAD, BAND, LAST_FRAMES, MARGIN, OPERATION_COLOURS, VideoRecorder, annotate
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT
-from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.catalogue import get_task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 
@@ -70,71 +62,6 @@ def test_unfinished_and_empty_videos_leave_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_adding_waits_for_the_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Memory stays bounded; discarding skips the waiting frames."""
-    begun, go_on, encoded = threading.Event(), threading.Event(), []
-
-    def encode(self: VideoRecorder, picture: av.VideoFrame) -> None:
-        encoded.append(picture)
-        begun.set()
-        go_on.wait(60)
-
-    monkeypatch.setattr(VideoRecorder, "_encode", encode)
-    recorder = VideoRecorder(tmp_path / "task.0.mp4")
-    for value in range(AHEAD):
-        recorder.add(frame(value))
-    adding = threading.Thread(target=recorder.add, args=(frame(AHEAD),))
-    adding.start()
-    begun.wait()
-    adding.join(0.05)
-    assert adding.is_alive()
-    go_on.set()
-    adding.join()
-    assert len({id(picture) for picture in encoded}) <= AHEAD
-
-    begun.clear()
-    go_on.clear()
-    other = VideoRecorder(tmp_path / "task.1.mp4")
-    for value in range(AHEAD):
-        other.add(frame(value))
-    begun.wait()
-    count = len(encoded)
-    threading.Timer(0.05, go_on.set).start()
-    other.discard()
-    assert len(encoded) == count
-    assert list(tmp_path.iterdir()) == []
-
-
-@contextmanager
-def on_a_full_disk(path: Path) -> Iterator[Path]:
-    yield Path("/dev/full")
-
-
-def add_often(recorder: VideoRecorder, picture: np.ndarray) -> None:
-    for _ in range(9):
-        recorder.add(picture)
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_unwritable_video_raises_and_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (320, 512, 3), np.uint8)  # exceeds the encoder's buffer
-    monkeypatch.setattr(video, "draft_of", on_a_full_disk)
-    recorder = VideoRecorder(tmp_path / "task.0.mp4")
-    with pytest.raises(MemobenchError, match=r"task\.0\.mp4.*No space left on device"):
-        add_often(recorder, noise)
-    with pytest.raises(MemobenchError, match="No space left"):
-        recorder.finish()
-    recorder.discard()
-    monkeypatch.undo()
-    (tmp_path / "file").touch()
-    recorder = VideoRecorder(tmp_path / "file" / "task.1.mp4")
-    recorder.add(noise)
-    with pytest.raises(MemobenchError, match=r"task\.1\.mp4"):
-        recorder.finish()
-    recorder.discard()
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
 # --- text over the pictures ---
 
 
@@ -178,37 +105,3 @@ def test_frame_shows_cameras_checkpoints_and_clock(monkeypatch: pytest.MonkeyPat
     prompt = annotate(images, moment(STOVE, PROMPT, 9, done=1))  # type: ignore[arg-type]
     assert not (prompt[52, first[4]] == OPERATION_COLOURS[operations[0]]).all(), "no checkpoint is done in a prompt"
     assert has_colour(prompt, (204, 121, 167))
-    assert [Episode.subgoal(moment(STOVE, done=k)) for k in range(3)] == [  # type: ignore[arg-type]
-        "switch the stove on",
-        *["switch the stove off again"] * 2,
-    ]
-
-
-def test_cached_text_equals_drawn_text_and_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    images = {"image": np.zeros((2, 512, 3), np.uint8)}
-    moments = [
-        moment(name, phase, step, done)
-        for name in task_names()[::12]
-        for phase in (PROMPT, EXECUTION)
-        for step in (0, 9, 444, 1200)
-        for done in (0, 1)
-    ]
-    cached = [annotate(images, each) for each in moments]  # type: ignore[arg-type]
-    for each, expected in zip(moments, cached, strict=True):
-        video._band.cache_clear()
-        video._piece.cache_clear()
-        np.testing.assert_array_equal(annotate(images, each), expected)  # type: ignore[arg-type]
-    assert len({picture.tobytes() for picture in cached}) > len(moments) / 2
-    drawn: list[str] = []
-    draw = ImageDraw.ImageDraw.text
-
-    def text(self: ImageDraw.ImageDraw, place: object, words: str, *args: object, **settings: object) -> None:
-        drawn.append(words)
-        draw(self, place, words, *args, **settings)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
-    video._piece.cache_clear()
-    for step in (123_456, 123_457, 123_456):
-        annotate(images, moment(STOVE, step=step, language="drawn in this test only"))  # type: ignore[arg-type]
-    assert max(Counter(drawn).values()) == 1
-    assert {"drawn in this test only", "step ", "7"} < {*drawn}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import sys
 import threading
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -17,9 +16,10 @@ from numba.core import caching
 
 import lerobot_memobench.sim
 from lerobot_memobench.envs.episode import PROMPT, Episode
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import controller as control
 from lerobot_memobench.sim import osc_kernel, robot
-from lerobot_memobench.sim.controller import CompiledController, OSCController, orientation_error, rotation_matrix
+from lerobot_memobench.sim.controller import CompiledController, OSCController
 from lerobot_memobench.sim.scene import SUBSTEPS
 from lerobot_memobench.sim.simulation import NO_OP, STABILISATION_STEPS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -76,86 +76,6 @@ def test_arm_follows_the_published_stack(arm_model: mujoco.MjModel) -> None:
         arm.step(action)
 
 
-class BindingShim:
-    """The parts of robosuite's simulator binding that its controller uses."""
-
-    def __init__(self, arm: Arm) -> None:
-        model, data = arm.model, arm.data
-        self.model = SimpleNamespace(
-            nv=model.nv,
-            _model=model,
-            site_name2id=lambda name: model.site(name).id,
-            opt=model.opt,
-        )
-        self._data = data
-        self.data = self
-        self.forward = lambda: None
-
-    def __getattr__(self, name: str) -> Any:
-        data = self.__dict__["_data"]
-        if name == "qM":
-            return data.qM
-        return getattr(data, name)
-
-    def get_site_jacp(self, name: str) -> np.ndarray:
-        return self._jacobian(name)[0].ravel()
-
-    def get_site_jacr(self, name: str) -> np.ndarray:
-        return self._jacobian(name)[1].ravel()
-
-    def get_site_xvelp(self, name: str) -> np.ndarray:
-        return self._jacobian(name)[0] @ self._data.qvel
-
-    def get_site_xvelr(self, name: str) -> np.ndarray:
-        return self._jacobian(name)[1] @ self._data.qvel
-
-    def _jacobian(self, name: str) -> np.ndarray:
-        jacobian = np.zeros((2, 3, self.model.nv))
-        mujoco.mj_jacSite(self.model._model, self._data, jacobian[0], jacobian[1], self.model.site_name2id(name))
-        return jacobian
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(control.MUJOCO >= (3, 10), reason="robosuite's controllers do not run on MuJoCo 3.10 or later")
-@pytest.mark.filterwarnings("ignore")
-def test_torques_equal_robosuites_controller(arm_model: mujoco.MjModel) -> None:
-    from robosuite.controllers import controller_factory, load_controller_config
-
-    arm = Arm(arm_model)
-    joints = [arm_model.joint(name) for name in robot.ARM_JOINTS]
-    actuators = [arm_model.actuator(name).id for name in robot.ARM_ACTUATORS]
-    settings = load_controller_config(default_controller="OSC_POSE")
-    settings.update(
-        robot_name="Panda",
-        sim=BindingShim(arm),
-        eef_name=robot.GRIP_SITE,
-        eef_rot_offset=np.array([0.0, 0.0, 0.0, 1.0]),
-        joint_indexes={
-            "joints": [joint.id for joint in joints],
-            "qpos": [int(joint.qposadr[0]) for joint in joints],
-            "qvel": [int(joint.dofadr[0]) for joint in joints],
-        },
-        actuator_range=(arm_model.actuator_ctrlrange[actuators, 0], arm_model.actuator_ctrlrange[actuators, 1]),
-        policy_freq=20,
-        ndim=7,
-    )
-    theirs = controller_factory("OSC_POSE", settings)
-    theirs.update_initial_joints(np.array(robot.ARM_START))
-    worst = 0.0
-
-    def compare() -> None:
-        nonlocal worst
-        theirs.new_update = True
-        # robosuite returns the torques before clipping, including gravity compensation.
-        worst = max(worst, float(np.abs(theirs.run_controller() - arm.controller.torques(arm.data)).max()))
-
-    for action in [NO_OP] * STABILISATION_STEPS + list(np.load(FIGURES)["actions"]):
-        theirs.update(force=True)
-        theirs.set_goal(action[:6])
-        arm.step(action, compare)
-    assert worst < 1e-8, f"torques differ by up to {worst:.2g} Nm"
-
-
 def test_goals_and_gripper_follow_the_published_rules(arm_model: mujoco.MjModel) -> None:
     arm = Arm(arm_model)
     arm.controller.set_goal(arm.data, np.array([9.0, -9.0, 0, 0, 0, 0, 0]))
@@ -171,21 +91,12 @@ def test_goals_and_gripper_follow_the_published_rules(arm_model: mujoco.MjModel)
     np.testing.assert_array_equal(arm.controller.goal_rotation, turned)
 
 
-def test_rotation_vectors() -> None:
-    quarter = rotation_matrix(np.array([0.0, 0.0, np.pi / 2]))
-    np.testing.assert_allclose(quarter @ [1, 0, 0], [0, 1, 0], atol=1e-6)
-    np.testing.assert_array_equal(rotation_matrix(np.zeros(3)), np.eye(3))
-    small = np.array([0.001, -0.002, 0.0015])
-    np.testing.assert_allclose(orientation_error(rotation_matrix(small), np.eye(3)), small, atol=1e-6)
-
-
 # --- compiled steps equal numpy's bit for bit ---
 
 TASKS = (
     "put_the_tomato_into_the_top_drawer_of_the_cabinet",
     "open_and_close_the_microwave",
     "put_the_butter_into_the_bowl_from_the_prompt_video",
-    "turn_on_the_stove_and_turn_it_off",
 )
 MOVES = np.random.default_rng(0).uniform(-1, 1, (20, 7))
 MOVES[::4, 3:6] = 0.0  # keeps the former orientation
@@ -222,7 +133,7 @@ def undecided(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control._Process, "agrees", None)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [TASKS[2], *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS[:2])])
 def test_episodes_are_equal_bit_for_bit(task: str) -> None:
     """The expert reaches, grasps and carries; every fourth step is random."""
     compiled, plain = Episode(get_task(task)), Episode(get_task(task))
@@ -250,18 +161,6 @@ def test_a_snapshot_continues_equally_in_both() -> None:
         sim.restore(snapshot)
         sim.step(NO_OP)
     assert bits(sims[0]) == bits(sims[1])
-
-
-def test_copied_data_moves_independently() -> None:
-    """A controller stores no address: it moves the given data."""
-    sim = simulation()
-    before = moved(sim)
-    other, controller = copy.copy(sim.data), copy.deepcopy(sim._controller)
-    controller.advance(other, 1.0, 5)
-    assert bits(sim) == before
-    sim._controller.advance(sim.data, 1.0, 5)
-    np.testing.assert_array_equal(other.qpos, sim.data.qpos)
-    np.testing.assert_array_equal(other.ctrl, sim.data.ctrl)
 
 
 def test_threads_do_not_disturb_each_other() -> None:
@@ -361,3 +260,27 @@ def test_scarce_memory_uses_numpy(times: float, ways: list[str], monkeypatch: py
     monkeypatch.setattr(OSCController, "advance", lambda *_: taken.append("numpy"))
     controller.advance(data, -1.0, 1)
     assert taken == ways
+
+
+# --- another robosuite ---
+
+
+@pytest.mark.parametrize("found", [None, "1.4.0"])
+def test_another_robosuite_names_the_install_command(monkeypatch: pytest.MonkeyPatch, found: str | None) -> None:
+    def version(name: str) -> str:
+        if found is None:
+            raise metadata.PackageNotFoundError(name)
+        return found
+
+    robot._arrays.cache_clear()
+    monkeypatch.setattr(metadata, "version", version)
+    with pytest.raises(MemobenchError, match=r"run: pip install --no-deps robosuite==1\.4\.1$"):
+        robot.robot_spec()
+
+
+def test_a_modified_arm_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    xml = robot._robosuite_xml()
+    assert robot.arm_hash(xml) == robot.ARM_SHA256
+    monkeypatch.setattr(robot, "_robosuite_xml", lambda: xml.replace('mass="', 'mass="1', 1))
+    with pytest.raises(MemobenchError, match="not those of robosuite"):
+        robot._build()

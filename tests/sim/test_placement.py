@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -60,9 +59,12 @@ def problems(sim: Simulation) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(7, 10), pytest.param(range(500), marks=pytest.mark.slow)], ids=["some seeds", "many seeds"]
+    ("name", "seeds"),
+    [
+        *((name, range(7, 10)) for name in task_names()[::5]),
+        *(pytest.param(name, range(500), marks=pytest.mark.slow) for name in task_names()),
+    ],
 )
-@pytest.mark.parametrize("name", task_names())
 def test_initial_states(name: str, seeds: range) -> None:
     sim = Simulation(get_task(name))
     wrong = {}
@@ -71,21 +73,6 @@ def test_initial_states(name: str, seeds: range) -> None:
         if found := problems(sim):
             wrong[seed] = found
     assert not wrong
-
-
-def test_whole_region_is_used() -> None:
-    """Draws are uniform over a region."""
-    sim = Simulation(get_task("put_the_tomato_into_the_top_drawer_of_the_cabinet"))
-    region = sim.task.regions["kitchen_table_beefsteak_tomato_init_region"]
-    x1, y1, x2, y2 = region.ranges[0]
-    sim.reset(0)
-    rng = np.random.default_rng(0)
-    points = np.array([sim._placer.draw(rng).poses["beefsteak_tomato__1_1"][:2] for _ in range(200)])
-    shares = (points - [x1, y1]) / [x2 - x1, y2 - y1]
-    assert shares.min() >= 0
-    assert shares.max() <= 1
-    assert np.all(np.abs(shares.mean(axis=0) - 0.5) < 0.08)
-    assert np.all(np.abs(shares.std(axis=0) - 12**-0.5) < 0.06)
 
 
 SPOT = ((0.0, 0.0, 0.001, 0.001),)
@@ -115,8 +102,8 @@ def test_impossible_placements_are_errors(change: Callable[[Task], Task], fragme
         Simulation(change(get_task("put_the_butter_into_the_bowl_from_the_prompt_video"))).reset(0)
 
 
-def test_object_on_object_in_region_and_open_drawer() -> None:
-    """Forms of `:init` rarely used by the catalogue: on an object, in a drawer, opened."""
+def test_object_in_an_open_drawer() -> None:
+    """Forms of `:init` that the catalogue rarely uses."""
     task = get_task("put_the_tomato_into_the_top_drawer_of_the_cabinet")
     init = (
         *(atom for atom in task.init if atom.args[0] != "beefsteak_tomato__1_1"),
@@ -128,12 +115,3 @@ def test_object_on_object_in_region_and_open_drawer() -> None:
         sim.reset(seed)
         assert sim.holds(Atom("open", ("wooden_cabinet_1_top_region",)))
         assert sim.holds(Atom("in", ("beefsteak_tomato__1_1", "wooden_cabinet_1_top_region")))
-    task = get_task("put_the_butter_into_the_bowl_from_the_prompt_video")
-    init = (
-        *(atom for atom in task.init if atom.args[0] != "butter_1"),
-        Atom("on", ("butter_1", "bowl_mid")),
-    )
-    sim = Simulation(dataclasses.replace(task, name="butter in a bowl", init=init))
-    sim.reset(0)
-    mujoco.mj_forward(sim.model, sim.data)
-    assert sim.holds(Atom("on", ("butter_1", "bowl_mid")))

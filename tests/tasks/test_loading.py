@@ -14,11 +14,11 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.bddl import Region, parse_bddl
-from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task, load_task, task_names
+from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
 from lerobot_memobench.tasks.formula import And, Atom, Not, format_formula
-from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Prompt
+from tests.support import mutations
 from tests.support.scripts import load_script
 
 format_bddl = load_script("strict_suite/bddl_text").format_bddl
@@ -49,14 +49,6 @@ def test_bddl_is_parsed_in_any_case_and_written_again(bddl: str) -> None:
         assert parse_bddl(format_bddl(parse_bddl(text))) == parse_bddl(text)
 
 
-def test_language_is_free_text_and_some_sections_are_optional(bddl: str) -> None:
-    text = "put  the\n  Cup (red) - not: the other one, please"
-    problem = parse_bddl(bddl.replace(LANGUAGE, text).replace("(:obj_of_interest cup_1 box_1)", ""))
-    assert problem.language == "put the Cup (red) - not: the other one, please"
-    assert parse_bddl(bddl.replace("(:domain robosuite)", "")).domain == ""
-    assert problem.objects_of_interest == ()
-
-
 def test_unused_region_on_an_undeclared_target_is_accepted(bddl: str) -> None:
     """LIBERO's ten goal tasks declare such a region of a drainer."""
     libero = bddl.replace("(top_region", "(right_region (:target Drainer_1))\n    (top_region")
@@ -71,32 +63,18 @@ def test_unused_region_on_an_undeclared_target_is_accepted(bddl: str) -> None:
 
 MALFORMED_BDDL = [
     # (text, replacement, line of the error, word in the message)
-    ("(define", "(definition", 1, "problem"),
     ("(problem KITCHEN)", "(problem)", 1, "problem"),
-    ("(problem KITCHEN)", "problem KITCHEN", 1, "problem"),
-    ("(:domain robosuite)", "(:domain)", 2, ":domain"),
     ("(:domain robosuite)", "(:domian robosuite)", 2, ":domian"),
     ("(:domain robosuite)", "(:domain robosuite) (:domain robosuite)", 2, "second :domain"),
-    ("(:domain robosuite)", "()", 2, "empty list"),
     (LANGUAGE, "", 3, ":language"),
-    ("(cup_place (:target table_1)", "(cup_place", 5, ":target"),
     ("(cup_place (:target table_1)", "(cup_place (:target tabel_1)", 5, "'table_1'"),
-    ("(cup_place (:target table_1)", "(cup_place (:target table_1 box_1)", 5, ":target"),
     ("(cup_place (:target table_1)", "(cup_place (:target table_1) (:target table_1)", 5, "second :target"),
-    ("(:yaw_rotation ((0.0 1.5)))", "(:yaw ((0.0 1.5)))", 5, ":yaw"),
     ("(:yaw_rotation ((0.0 1.5)))", "(:yaw_rotation ((1.5 0.0)))", 5, "low <= high"),
-    ("(:yaw_rotation ((0.0 1.5)))", "(:yaw_rotation ((0.0 1.5) (0.0 1.0)))", 5, "yaw"),
-    ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 0.0))", 6, "value"),
     ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 -0.2 0.0))", 6, "x1 <= x2"),
     ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 nan 0.0))", 6, "finite"),
-    ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 1e999 0.0))", 6, "finite"),
-    ("((-0.1 -0.1 0.0 0.0))", "()", 6, ":ranges"),
     (" (:ranges ((-0.1 -0.1 0.0 0.0)))", "", 19, ":ranges"),
     ("(box_place", "(cup_place", 6, "again"),
     ("table_1 - kitchen_table", "table_1 - kitchen_table Table_1 - shelf", 10, "'Table_1'"),
-    ("lid,v1.2 - lid", "lid,v1.2 -", 15, "class"),
-    ("cup_1 cup_2 - cup", "- cup", 14, "name"),
-    ("lid,v1.2 - lid", "lid,v1.2", 15, "class"),
     ("lid,v1.2 - lid", "lid,v1.2 (- lid)", 15, "list"),
     ("(:obj_of_interest cup_1", "(:obj_of_interest cup_3", 17, "'cup_3'"),
     ("    (On cup_1 table_1_cup_place)\n", "", 18, "'cup_1'"),
@@ -104,21 +82,12 @@ MALFORMED_BDDL = [
     ("(On cup_2 table_1_cup_place)", "(On cup_2 lid,v1.2)", 18, "itself"),
     ("(On cup_2 table_1_cup_place)", "(Not (On cup_2 table_1_cup_place))", 21, ":init"),
     ("(Close box_1_top_region)", "(WasOpen box_1_top_region)", 23, ":init"),
-    ("(Close box_1_top_region)", "Close", 23, "'Close'"),
-    ("(Close box_1_top_region)", "(Close cup_1)", 23, "'cup_1'"),
-    ("(On cup_1 table_1_cup_place)", "(On table_1_cup_place cup_1)", 20, "region"),
-    ("(In cup_1 box_1_top_region)", "(In cup_1 box_1)", 25, "region"),
     ("(In cup_1 box_1_top_region)", "(In cup_1 top_region)", 25, "'top_region'"),
-    ("(In cup_1 box_1_top_region)", "(In cup_1)", 25, "argument"),
     ("(In cup_1 box_1_top_region)", "(Into cup_1 box_1_top_region)", 25, "'Into'"),
-    ("(In cup_1 box_1_top_region)", "(In cup_1 (top box_1))", 25, "name"),
     ("(In cup_1 box_1_top_region)", "(In cup_1 box_1_top_region", 1, "never closed"),
     ("(Not (Open box_1_top_region))", "(Not)", 25, "Not"),
-    ("(:goal (And", "(:goal (On cup_1 box_1) (And", 25, ":goal"),
     ("(Not (Open box_1_top_region))", "(Not " * 5_000 + "(Open box_1)" + ")" * 5_000, 25, "nested"),
-    ("(:goal", "(:gaol", 25, ":gaol"),
     ("(define", "(" * 50_000 + "define", 1, "never closed"),
-    ("(define", ") (define", 1, "')'"),
 ]
 
 
@@ -133,13 +102,6 @@ def test_malformed_bddl_names_file_line_and_item(bddl: str, old: str, new: str, 
     assert message.startswith(f"some/file.bddl, line {line}: found ")
     assert word in message
     assert "\n" not in message
-
-
-@pytest.mark.parametrize("section", [":language", ":fixtures", ":init", ":goal"])
-def test_missing_section_is_named(bddl: str, section: str) -> None:
-    broken = re.sub(rf"  \({section}\b.*?\n(?=  \(:|\)$)", "", bddl, flags=re.DOTALL | re.MULTILINE)
-    with pytest.raises(MemobenchError, match=section):
-        parse_bddl(broken)
 
 
 # --- metadata ---
@@ -159,20 +121,6 @@ def test_folder_in_the_published_format(write_task: Write) -> None:
     again = load_task(str(folder))
     assert task == again == pickle.loads(pickle.dumps(task))  # noqa: S301
     assert hash(task) == hash(again)
-
-
-def test_keys_of_this_project(write_task: Write, metadata: dict[str, Any]) -> None:
-    metadata |= {"memory_type": "object", "family": "mine", "demo_summary": "Stow the cup.", "note": {"kept": True}}
-    metadata |= {"prompt": {"kind": "pick", "target": "cup_1"}, "timestep_exec_start_idx": [-1]}
-    task = load_task(write_task(metadata=metadata, parent="spatial"))
-    assert (task.memory_type, task.family, task.demo_summary) == ("object", "mine", "Stow the cup.")
-    assert task.prompt == Prompt("pick", "cup_1")
-    assert task.metadata["note"] == {"kept": True}
-    metadata["prompt"] = None
-    assert load_task(write_task(metadata=metadata)).prompt is None
-    strict = {"suite": "strict", "derived_from": "a_task", "drawn": True, "spoilt_as": "miscount"}
-    task = load_task(write_task(metadata=metadata | strict))
-    assert (task.suite, task.derived_from, task.drawn, task.spoilt_as) == tuple(strict.values())
 
 
 def test_variants_replace_goals_texts_and_prompt(write_task: Write, metadata: dict[str, Any]) -> None:
@@ -209,44 +157,22 @@ def test_variants_replace_goals_texts_and_prompt(write_task: Write, metadata: di
 
 MALFORMED_METADATA: list[tuple[dict[str, Any], str]] = [
     *(({key: None}, key) for key in ("memory", "operating_type", "subtask_goals")),
-    ({"subtask_goals": []}, "subtask_goals"),
     ({"subtask_goals": {"and": []}}, "subtask_goals"),
     ({"subtask_goals": [["open", "box_1"]]}, "1 entries"),
     ({"subtask_goals": [["open", "box_1"], ["open", "box_2"]]}, "subtask_goals[1]"),
-    ({"subtask_goals": [["open", "box_1"], 5]}, "subtask_goals[1]"),
-    ({"operating_type": [[0, 0, 0]]}, "operating_type"),
-    ({"operating_type": [[0, 0, 0], [0, 0]]}, "operating_type[1]"),
     ({"operating_type": [[0, 0, 0], [0, 0, 3]]}, "operating_type[1][2]"),
-    ({"operating_type": [[0, 0, 0], [0, 0, True]]}, "operating_type[1][2]"),
-    ({"memory": [["a", "b", "c"]]}, "memory"),
     ({"memory": [["a", "b", "c"], ["a", "b"]]}, "memory[1]"),
-    ({"memory": [["a", "b", "c"], ["a", "b", " "]]}, "memory[1]"),
-    ({"memory": [["a", "b", "c"], ["a", "b", 3]]}, "memory[1][2]"),
-    ({"key_frame": [-1]}, "key_frame"),
     ({"key_frame": [-1, 0.5]}, "key_frame[1]"),
-    ({"timestep_exec_start_idx": "0"}, "timestep_exec_start_idx"),
-    ({"demo_summary": ["a"]}, "demo_summary"),
     ({"memory_type": "episodic"}, "memory_type"),
-    ({"family": 1}, "family"),
     ({"suite": "strikt"}, "suite"),
-    ({"drawn": 1}, "drawn"),
     ({"spoilt_as": "lost"}, "spoilt_as"),
-    ({"prompt": "pick"}, "prompt"),
     ({"prompt": {"kind": "pick", "target": "cup_1", "x": 1}}, "prompt"),
     ({"prompt": {"kind": "grab", "target": "cup_1"}}, "prompt.kind"),
-    ({"prompt": {"kind": "pick"}}, "prompt.target"),
     ({"prompt": {"kind": "pick", "target": "cup_9"}}, "prompt.target"),
-    ({"prompt": {"kind": "hide"}}, "prompt.places"),
     ({"prompt": {"kind": "hide", "places": [["cup_1", "box_1"]]}}, "prompt.places"),
-    ({"variants": {}}, "variants"),
-    ({"variants": [{}]}, "memory"),
-    ({"variants": [{"memory": []}]}, "variants[0].memory"),
-    ({"variants": [{"memory": "M", "swap": 1}]}, "variants[0]"),
     ({"variants": [{"memory": "M", "substitute": {"cup_1": "cup_7"}}]}, "variants[0].substitute['cup_1']"),
-    ({"variants": [{"memory": "M", "substitute": {"cup_1": DRAWER}}]}, "variants[0].substitute"),
     ({"variants": [{"memory": "M", "order": [0, 0]}]}, "variants[0].order"),
     ({"variants": [{"memory": "M", "goal": ["open", "nowhere"]}]}, "variants[0].goal"),
-    ({"variants": [{"memory": "M", "subtask_goals": []}]}, "variants[0].subtask_goals"),
     ({"variants": [{"memory": "M", "replaces_published": 1}]}, "variants[0].replaces_published"),
 ]
 
@@ -316,54 +242,7 @@ def test_memory_type_and_prompt_are_inferred(
     assert load_task(write_task(bddl.replace(LANGUAGE, language), parent="spatial")).memory_type == "spatial"
 
 
-def test_inferred_referent_is_the_object_with_siblings(write_task: Write, metadata: dict[str, Any]) -> None:
-    metadata["subtask_goals"][0] = ["on", "lid,v1.2", "cup_2"]
-    assert load_task(write_task(metadata=metadata, parent="object")).prompt == Prompt("routine", "cup_2")
-
-
-def test_published_folders_load_wherever_they_are(published: Path, tmp_path: Path) -> None:
-    folders = sorted(path for path in published.glob("*/*") if path.is_dir())
-    assert len(folders) == 30
-    for folder in folders:
-        complete = (folder / "task_config.meta.json").exists()
-        assert complete == (folder.name != "turn_on_the_stove_and_turn_it_off_near_the_shelf")
-        task = load_task(folder, require_metadata=complete)
-        assert (task.memory_type, task.num_variants) == (folder.parent.name, 1)
-        if task.prompt is None:
-            assert task.memory_type in ("temporal", "spatial")
-        else:
-            assert task.prompt == get_task(folder.name).prompt
-        if complete:
-            elsewhere = tmp_path / "x" / folder.name
-            elsewhere.mkdir(parents=True)
-            for file in folder.iterdir():
-                (elsewhere / file.name).write_bytes(file.read_bytes())
-            assert load_task(elsewhere).memory_type == folder.parent.name
-
-
 # --- damaged files ---
-
-PIECES = [
-    *'()[]{}",:;- \n\t\x00é😀',
-    *("0", "-1", "nan", "1e999", "(And)", "(Not", ":goal", "- -", "null", "true", "[]", "{}"),
-]
-
-
-def mutate(text: str, rng: random.Random) -> str:
-    """Return a text with one to four random edits."""
-    for _ in range(rng.randint(1, 4)):
-        start = rng.randrange(len(text) + 1)
-        end = min(len(text), start + rng.choice([0, 1, 1, 2, 5, 20, 200]))
-        before, part, after = text[:start], text[start:end], text[end:]
-        edits = (before + after, before + rng.choice(PIECES) + part + after, before + 2 * part + after,
-                 before + part.swapcase() + after, before if rng.random() < 0.2 else text)  # fmt: skip
-        text = rng.choice(edits)
-        words = text.split(" ")
-        i, j = rng.randrange(len(words)), rng.randrange(len(words))
-        if rng.random() < 0.2:
-            words[i], words[j] = words[j], words[i]
-        text = " ".join(words)
-    return text
 
 
 @pytest.mark.parametrize(("count", "seed"), [(200, 0), pytest.param(2000, 1, marks=pytest.mark.slow)])
@@ -371,14 +250,13 @@ def test_damaged_files_load_or_raise_one_sentence(count: int, seed: int, write_t
     rng, refused = random.Random(seed), 0
     for _ in range(count):
         task = get_task(rng.choice(task_names()))
-        texts = [task.bddl_text, (task.folder / "task_config.meta.json").read_text()]
-        which = rng.randrange(2)
-        texts[which] = mutate(texts[which], rng)
-        folder = write_task(*texts)
+        folder = write_task(task.bddl_text, (task.folder / "task_config.meta.json").read_text())
+        file = folder / rng.choice(["task_config.bddl", "task_config.meta.json"])
+        file.write_bytes(mutations.mutated_bytes(file.read_bytes(), rng))
         message = refusal(folder)
         refused += bool(message)
         assert not message or (str(folder) in message and "\n" not in message)
-    assert count / 4 < refused < 0.95 * count
+    assert refused > count / 4
 
 
 def refusal(folder: Path) -> str:
@@ -393,18 +271,3 @@ def refusal(folder: Path) -> str:
 
 
 # --- worlds and memory texts ---
-
-
-def test_world_is_kept_by_variants() -> None:
-    published = get_task(DEMO_TASK)
-    there = published.variant(1).in_world("libero")
-    assert there.world == there.variant(0).world == there.variant(2).world == "libero"
-    assert there.variant(0) == published.in_world("libero") != published
-
-
-def test_memory_text_contains_the_completed_checkpoints() -> None:
-    task = get_task("turn_on_the_stove_and_turn_it_off")
-    texts = [checkpoint.language[1] for checkpoint in task.checkpoints]
-    assert [memory_text(task, k) for k in range(3)] == ["", texts[0], "; ".join(texts)]
-    assert with_memory("Put it back", "") == "Put it back Memory: nothing yet"
-    assert with_memory("Put it back", "took it") == "Put it back Memory: took it"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections import Counter
 
@@ -34,35 +33,22 @@ def values(formula: Formula, text: str, hold_steps: int = 2) -> str:
 @pytest.mark.parametrize(
     ("formula", "states", "expected"),
     [
-        (Never(A), "- b a - -", "110*0*0*"),
-        (Hold(3, A), "a a a a - a a a", "00110001"),
-        (Hold(1, A), "a - a", "101"),
         (Exactly(1, A), "- a a - - a a -", "011110*0*0*"),
         (Exactly(2, A), "a - - a - a", "000110*"),
-        (When((A, B)), "- b a b", "000*0*"),
+        (Hold(3, A), "a a a a - a a a", "00110001"),
+        (LATCH, "- b - -", "01*1*1*"),
         (When((A, B)), "- b ab - -", "001*1*1*"),
         (Round((A, B)), "b a - b b a b ab", "00010010"),
         (Round((A, B)), "ab ab", "01"),
-        (Round((A,)), "a a - a", "1101"),
         (Round((Hold(2, A), B)), "a a b a b a a b", "00100001"),
         (Exactly(2, Round((C, B, Not(B)))), "c b - b - c b -", "00000001"),
-        (Not(Never(A)), "- a -", "01*1*"),
-        (And((Never(B), A)), "a b a", "10*0*"),
-        (Or((Never(B), A)), "- b a -", "1010"),
         (Or((Never(A), Never(B))), "- a b a", "110*0*"),
-        (And((A, Not(Or((B, Not(A)))))), "- a b ab", "0100"),
-        (LATCH, "- b - -", "01*1*1*"),
         (Never(And((LATCH, A))), "- b - a a", "1110*0*"),
-        (Hold(2, LATCH), "- b - -", "001*1*"),
-        (Exactly(1, LATCH), "- b - -", "01*1*1*"),
-        (When((LATCH, Never(A))), "a b", "0*0*"),
         # Then: each child holds for two consecutive steps, in order; done children stay done.
-        (Then((A,)), "a a - a", "01*1*1*"),
         (Then((A,)), "a - a a", "0001*"),
         (Then((A, B)), "ab ab ab ab - -", "0001*1*1*"),
         (Then((A, B)), "b b b a a a", "000000"),
         (Then((A, B)), "b b a a b b", "000001*"),
-        (Then((Never(A), B)), "- - b b a", "0001*1*"),
         (Then((Never(A), B)), "- a b b", "00*0*0*"),
         # A nested Then holds for two steps itself, and starts after the child before it.
         (Then((A, Then((B, C)))), "abc abc abc abc abc abc abc", "0000001*"),
@@ -78,20 +64,6 @@ def test_tables_of_states(formula: Formula, states: str, expected: str) -> None:
 
 def test_default_hold_is_ten_steps() -> None:
     assert values(Then((A,)), "a " * 11, HOLD_STEPS) == "0" * 9 + "1*1*"
-
-
-def test_counting_goal() -> None:
-    """Two rounds from home, then the first rest decides; a rest before the event is a rest, too."""
-    shut = Not(B)
-    goal = When((Hold(3, And((C, shut))), And((Exactly(2, Round((C, B, shut))), Exactly(2, Round((B, shut)))))))
-    once, twice = "c b - c ", "c b - c b - c "
-    assert values(goal, twice + "c c").endswith("1*"), "two from home, then rest"
-    assert values(goal, once + "c c").endswith("0*"), "stopped after one"
-    assert values(goal, "c b - c b - c b - c c c").endswith("0*"), "went on to three"
-    assert values(goal, "c c c").endswith("0*"), "did not begin"
-    assert values(goal, "c b - b - c c c").endswith("0*"), "the hand was not home in between"
-    assert values(goal, "c b - b - c b - c c c").endswith("0*"), "one of three was not from home"
-    assert "1" not in values(goal, twice + "- - - c c"), "no rest, no success"
 
 
 def test_atoms_are_evaluated_once_per_step_and_latches_never() -> None:
@@ -147,20 +119,6 @@ def test_operators_equal_their_definitions(
     assert follow(When((condition, formula)), states)[0] == [k >= first and found[first] for k in steps]
     latched = list(itertools.accumulate((B in state for state in states), max))
     assert follow(LATCH, states)[0] == latched
-
-
-@given(FORMULAS, STATES, STATES)
-def test_equal_memory_means_equal_future(formula: Formula, past: list[set[Atom]], future: list[set[Atom]]) -> None:
-    evaluator, other = Evaluator([formula]), Evaluator([formula])
-    for state in past:
-        evaluator.step(state.__contains__)
-    for state in [*past, *past]:
-        other.step(state.__contains__)
-    again = copy.deepcopy(evaluator)
-    assert hash(again.memory) == hash(evaluator.memory)
-    if other.memory == evaluator.memory:
-        again = other
-    assert [evaluator.step(s.__contains__) for s in future] == [again.step(s.__contains__) for s in future]
 
 
 @given(FORMULAS, STATES)
