@@ -154,6 +154,7 @@ def test_earlier_format_is_named_with_its_converter(synthetic, copy, tmp_path, c
     root = copy(synthetic)
     info = json.loads((root / "meta" / "info.json").read_text())
     (root / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
+    shutil.rmtree(root / "meta" / "episodes")  # v2.1 has meta/episodes.jsonl
     train = ["train", "policy=act", f"dataset={root}", f"output_dir={tmp_path / 'run'}"]
     assert (lerobot(train) if command == "train" else memobench([command, str(root)])) == 2
     assert f"convert_dataset_v21_to_v30 --repo-id=local/converted --root={root}" in capsys.readouterr().err

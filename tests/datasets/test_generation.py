@@ -232,3 +232,30 @@ def test_killed_runs_continue(tasks, recorded, tmp_path, holder, name, call):
     assert not is_dataset(tmp_path / "ds")
     run(tasks, tmp_path / "ds")
     assert tree_hash(tmp_path / "ds") == reference
+
+
+def test_second_run_in_one_folder_is_refused(tasks, recorded, tmp_path):
+    with pytest.raises(MemobenchError, match="another run is writing"):
+        run(tasks, tmp_path / "ds", progress=lambda _: run(tasks, tmp_path / "ds"))
+
+
+def test_disk_space_is_checked_before_the_first_episode(tasks, recorded, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MemobenchError, match="Not a directory"):
+        run(tasks, tmp_path / "file" / "ds")
+    assert recorded == []
+    reports = []
+    run(tasks, tmp_path / "ds", notify=lambda text: reports.append((len(recorded), text)))
+    ((before, text),) = reports
+    assert before == 0
+    assert text.startswith("4 demonstrations of about 1,420 frames")
+    assert "MAY NOT" not in text
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_500_000))
+    run(tasks, tmp_path / "near", notify=lambda text: reports.append((len(recorded), text)))
+    assert "MAY NOT BE ENOUGH" in reports[1][1]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=500_000))
+    made = len(recorded)
+    with pytest.raises(MemobenchError, match="make room"):
+        run(tasks, tmp_path / "far")
+    assert len(recorded) == made

@@ -13,20 +13,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.protocol import EXECUTION
+from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.arguments import call_lerobot
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.lerobots_trainer import trainer_in_this_process
-from tests.support.tiny_paligemma import shrink_paligemma
+from tests.support.tiny_paligemma import shrink_paligemma, word_tokenizer
 
 TASK = "turn_on_the_stove_and_turn_it_off"
-STATE, OBJECTS = "observation.state", "observation.environment_state"
+STATE, OBJECTS, PRIVILEGED = "observation.state", "observation.environment_state", "privileged.environment_state"
 PICTURES = {"observation.images.image", "observation.images.wrist_image"}
 INPUTS = {*PICTURES, STATE}
 
@@ -48,11 +49,35 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
     # Phase, checkpoints, subgoals and language are inputs of memory policies alone.
     assert set(config["input_features"]) == inputs
     assert set(config["output_features"]) == {"action"}
+    assert normalised(checkpoint, inputs) <= {*inputs, "action"} | KEPT
     words = (f"tasks={TASK}", "episodes=1", "horizon=3", "env.render=fast", f"output_dir={out / 'eval'}")
     assert main(["eval", "env=memobench", f"policy={run}", *words]) == 0
     (record,) = read_episodes(out / "eval")
     assert record["steps"] == 3
     return protocol_of(out / "eval")
+
+
+#: LeRobot saves the statistics of every column; the features of its step list the ones in use.
+KEPT = {
+    *PICTURES,
+    OBJECTS,
+    PRIVILEGED,
+    "executed_action",
+    "checkpoint.index",
+    "checkpoint.operation",
+    "checkpoint.completed",
+    "checkpoint.event",
+    *("timestamp", "frame_index", "episode_index", "index", "task_index"),
+}
+
+
+def normalised(checkpoint: Path, inputs: set[str]) -> set[str]:
+    """Return the columns whose statistics a checkpoint's preprocessor holds; check the ones in use."""
+    steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
+    (step,) = [step for step in steps if step.get("registry_name") == "normalizer_processor"]
+    assert set(step["config"]["features"]) == {*inputs, "action"}
+    with safe_open(checkpoint / step["state_file"], framework="numpy") as file:
+        return {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118
 
 
 ACT = (
@@ -67,6 +92,11 @@ DIFFUSION = (
 )
 
 
+@pytest.mark.parametrize("policy", [pytest.param(ACT, marks=pytest.mark.slow), DIFFUSION], ids=["act", "diffusion"])
+def test_policies_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> None:
+    assert train_and_roll_out(dataset, tmp_path, *policy)["obs_type"] == "pixels_agent_pos"
+
+
 @pytest.mark.parametrize("policy", [ACT, pytest.param(DIFFUSION, marks=pytest.mark.slow)], ids=["act", "diffusion"])
 @pytest.mark.parametrize(
     ("pictures", "obs_type", "seen"),
@@ -74,6 +104,7 @@ DIFFUSION = (
         (True, "both", "both"),
         pytest.param(False, None, "environment_state_agent_pos", marks=pytest.mark.slow),
         pytest.param(True, None, "pixels_agent_pos", marks=pytest.mark.slow),
+        pytest.param(True, "environment_state_agent_pos", "environment_state_agent_pos", marks=pytest.mark.slow),
     ],
 )
 def test_evaluation_has_the_inputs_of_training(
@@ -106,6 +137,55 @@ def test_pi(dataset: Path, tmp_path: Path, name: str) -> None:
     )
 
 
+@pytest.fixture
+def tiny_smolvlm(tmp_path: Path) -> Path:
+    """A folder with the configuration and processor of a small SmolVLM."""
+    from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
+
+    folder = tmp_path / "smolvlm"
+    tokenizer = word_tokenizer(
+        get_task(TASK).language,
+        fake_image_token="<fake_token_around_image>",
+        image_token="<image>",
+        end_of_utterance_token="<end_of_utterance>",
+        global_image_token="<global-img>",
+        video_token="<video>",
+    )
+    text = {
+        "hidden_size": 48,
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 4,
+        "num_key_value_heads": 2,
+        "head_dim": 12,
+        "vocab_size": len(tokenizer),
+        "pad_token_id": tokenizer.pad_token_id,
+        "max_position_embeddings": 512,
+    }
+    vision = {
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+        "image_size": 512,
+        "patch_size": 16,
+    }
+    image = tokenizer.convert_tokens_to_ids("<image>")
+    SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=4, image_token_id=image).save_pretrained(folder)
+    SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor()).save_pretrained(folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_smolvla(dataset: Path, tmp_path: Path, tiny_smolvlm: Path) -> None:
+    train_and_roll_out(
+        dataset,
+        tmp_path,
+        *("policy=smolvla", f"policy.vlm_model_name={tiny_smolvlm}", "policy.num_vlm_layers=2", "policy.num_steps=2"),
+        *("policy.chunk_size=4", "policy.n_action_steps=4"),
+    )
+
+
 # --- demonstration prompts ---
 
 MILK = "find_the_specific_milk_pointed_out_in_the_prompt_video_and_put_it_on_the_plate"
@@ -114,11 +194,36 @@ PROMPTS = [147, 165]
 HORIZON, INTERVAL = 20, 8
 
 
-def test_first_plan_reads_the_first_execution_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def observed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run two episodes in one batch by LeRobot's command; return each step's phases and steps of both rows."""
+    import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
+
+    def run(policy: type, *flags: str) -> list[tuple[list[int], list[int]]]:
+        clocks, select = [], policy.select_action  # type: ignore[attr-defined]
+
+        def selected(this: Any, batch: Any, **options: Any) -> Any:
+            phases, steps = (batch[f"observation.{name}"].flatten().int().tolist() for name in ("phase", "step"))
+            clocks.append((phases, steps))
+            return select(this, batch, **options)
+
+        monkeypatch.setattr(policy, "select_action", selected)
+        line = [
+            *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}", "--env.render=fast"),
+            *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
+            *("--policy.device=cpu", f"--output_dir={tmp_path}", f"--env.log_dir={tmp_path}"),
+        ]
+        assert call_lerobot("eval", [*line, *flags]) == 0
+        return clocks
+
+    return run
+
+
+def test_first_plan_reads_the_first_execution_frame(
+    observed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The environments receive the planned actions and no earlier ones, whatever the lengths of the prompts."""
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
-
-    import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
 
     plans: list[np.ndarray] = []
     applied: dict[int, list[np.ndarray]] = defaultdict(list)
@@ -137,20 +242,21 @@ def test_first_plan_reads_the_first_execution_frame(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(MemobenchEnv, "step", stepped)
     words = dict(word.split("=", 1) for word in DIFFUSION) | {"policy.horizon": "16", "policy.n_action_steps": "8"}
     flags = [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in words.items()]
-    flags += [
-        f"--env.tasks={MILK}",
-        f"--env.horizon={HORIZON}",
-        f"--env.log_dir={tmp_path}",
-        f"--output_dir={tmp_path}",
-    ]
-    flags += ["--env.type=memobench", "--env.render=fast", "--env.prompt_in=reset", "--policy.device=cpu", "--seed=7"]
-    assert (
-        call_lerobot("eval", [*flags, *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false")])
-        == 0
-    )
+    clocks = observed(DiffusionPolicy, *flags, "--env.prompt_in=reset")
     records = read_episodes(tmp_path)
     assert [(record["prompt_steps"], record["steps"]) for record in records] == [(steps, HORIZON) for steps in PROMPTS]
+    assert [record["prompt_shown"] for record in records] == [True, True]
+    assert clocks[0] == ([EXECUTION] * 2, [0, 0])
     for row, seed in enumerate((7, 8)):
         expected = np.concatenate([actions[row, :INTERVAL].numpy() for actions in plans])[:HORIZON]
         np.testing.assert_array_equal(np.stack(applied[seed]), expected)
     assert protocol_of(tmp_path)["prompt_in"] == "reset"
+
+
+def test_prompts_are_observed_by_policies_that_read_them(observed: Any, tmp_path: Path) -> None:
+    from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy
+
+    settings = ("--env.expert_action=true", "--env.horizon=2", "--env.obs_type=environment_state_agent_pos")
+    clocks = observed(MemobenchExpertPolicy, "--policy.type=memobench_expert", *settings)
+    assert [sum(phases[row] == PROMPT for phases, _ in clocks) for row in range(2)] == PROMPTS
+    assert protocol_of(tmp_path)["prompt_in"] == "steps"
