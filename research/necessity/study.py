@@ -132,24 +132,6 @@ class KeptSearch(TypedDict):
     policy: list[Rule]
 
 
-class Found(TypedDict):
-    """Result of the searches of a task."""
-
-    deterministic: Number
-    confirmed: Count
-    of: Count
-    cut_off: Count
-
-
-class KeptResult(TypedDict):
-    """Result of a task, as `necessity.json` holds it."""
-
-    task: str
-    referent: str
-    in_order: InOrder | None
-    any_order: Found | None
-
-
 # --- the study of one task ---
 
 Piece = Literal["scene", "search"]

@@ -178,22 +178,9 @@ class Browser:
     def click(self, selector: str, across: float = 0.5, down: float = 0.5) -> None:
         """Press and release the mouse within an element, at a fraction of its width and height."""
         box = self.box(selector)
-        self.mouse("mousePressed", box["x"] + across * box["width"], box["y"] + down * box["height"])
-        self.mouse("mouseReleased", box["x"] + across * box["width"], box["y"] + down * box["height"])
-
-    def mouse(self, kind: str, x: float, y: float) -> None:
-        """Send a mouse event with the left button."""
-        pressed = {} if kind == "mouseMoved" else {"button": "left", "clickCount": 1}
-        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **pressed)
-
-    def drag(self, selector: str, start: float, end: float) -> None:
-        """Press within an element and pull to another fraction of its width."""
-        box = self.box(selector)
-        y = box["y"] + box["height"] / 2
-        points = [box["x"] + at * box["width"] for at in (start, end)]
-        self.mouse("mousePressed", points[0], y)
-        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=points[1], y=y, button="left", buttons=1)
-        self.mouse("mouseReleased", points[1], y)
+        place = {"x": box["x"] + across * box["width"], "y": box["y"] + down * box["height"]}
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call("Input.dispatchMouseEvent", type=kind, button="left", clickCount=1, **place)
 
     def key(self, key: str, modifiers: int = 0) -> None:
         """Press a key on whatever has the focus; modifiers: 1 Alt, 2 Ctrl, 4 Meta, 8 Shift."""
