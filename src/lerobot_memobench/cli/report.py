@@ -80,7 +80,7 @@ def report(
 
     runs = read_runs(folders)
     for run in runs:
-        _write_beside_log(run)
+        _write_next_to_log(run)
     show_report(build(runs, with_ is Published.PAPER), "report", format_, out)
     if figures is not None:
         from lerobot_memobench.evaluation.plots import draw_figures
@@ -97,7 +97,7 @@ def report(
         say(f"open {written.page}")
 
 
-def _write_beside_log(run: Run) -> None:
+def _write_next_to_log(run: Run) -> None:
     """Write report.json and report.md of an evaluation where its folder can be written."""
     from lerobot_memobench.envs.episode_log import is_archive
     from lerobot_memobench.evaluation.report import write_report

@@ -32,14 +32,14 @@ from lerobot_memobench.evaluation.metrics import (
 )
 from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
-    beside_paper,
     best_interval,
-    check_beside,
+    check_paper_rows,
     departures,
     failures_table,
     inputs_sentence,
     memory_types_table,
     overview,
+    paper_section,
     pooled_sentence,
     prefix_table,
     rates_table,
@@ -114,7 +114,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     Raises:
         MemobenchError: the published figures are of other tasks.
     """
-    check_beside(runs, paper)
+    check_paper_rows(runs, paper)
     found, controls = [], list(controls_among(runs))
     if len(runs) > 1:
         found.append(Section("Evaluations", (overview(runs),), notes=tuple(unlike(runs))))
@@ -128,7 +128,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
             section = replace(section, title=run.name, sentences=(where, *section.sentences))
         found += [section, *_evidence(run)]
     if paper:
-        found.append(beside_paper(runs))
+        found.append(paper_section(runs))
     return Report(headline(runs), tuple(found), report_data(runs, controls, paper))
 
 

@@ -300,7 +300,7 @@ TABLES = (
 """Key, title, and which of the paper's tables it holds."""
 
 
-def check_beside(runs: Sequence[Run], paper: bool) -> None:
+def check_paper_rows(runs: Sequence[Run], paper: bool) -> None:
     """Refuse to report the paper's figures (``paper``) with those of tasks that it did not publish.
 
     Raises:
@@ -314,9 +314,9 @@ def check_beside(runs: Sequence[Run], paper: bool) -> None:
         )
 
 
-def beside_paper(runs: Sequence[Run]) -> Section:
+def paper_section(runs: Sequence[Run]) -> Section:
     """Return the paper's tables of rates with these evaluations in the first rows, and departures from its protocol."""
-    tables = [_beside(runs, *each) for each in TABLES]
+    tables = [_paper_table(runs, *each) for each in TABLES]
     notes = [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
     return Section("With the paper's figures", (*tables, paper_failures()), notes=tuple(notes))
 
@@ -329,7 +329,7 @@ def extent(run: Run) -> str:
     return f"{len(summary.tasks)} of {PAPER_TASKS} tasks, {count_of(summary.rollouts, 'rollout')}"
 
 
-def _beside(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -> Table:
+def _paper_table(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -> Table:
     """Return a table of the paper's, ours on top, named with their extent: the paper ran 1,500 rollouts."""
     published = published_rows(*sources)
     names = [f"{run.name} ({size})" if (size := extent(run)) else run.name for run in runs]
