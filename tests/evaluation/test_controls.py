@@ -20,7 +20,7 @@ CONTROLS: dict[str, dict[str, Any]] = {
     "pause_steps": {"pause_steps": 100},
     "speed": {"speed": 0.5},
     "oracle_memory": {"oracle_memory": True},
-    "shuffle_subgoals": {"policy_settings": {"shuffle_subgoals": True}},
+    "align_targets": {"policy_settings": {"align_targets": "shuffled"}},
 }
 
 
@@ -130,7 +130,7 @@ def test_shuffled_memory_is_compared_checkpoint_by_checkpoint(tmp_path: Path) ->
         return [3] * third + [2] * (second - third) + [1] * (first - second) + [0] * (50 - first)
 
     normal = evaluation(tmp_path / "normal", reach(38, 26, 4))
-    shuffled = evaluation(tmp_path / "shuffled", reach(45, 12, 1), "b", policy_settings={"shuffle_subgoals": True})
+    shuffled = evaluation(tmp_path / "shuffled", reach(45, 12, 1), "b", policy_settings={"align_targets": "shuffled"})
     words = ["--with", "paper", "--format", "json", "--format", "markdown", "--out", str(tmp_path)]
     assert main(["compare", normal, shuffled, *words]) == 0
     found = [rows_of(tmp_path)[STOVE, f"c{k}"] for k in (1, 2, 3)]
@@ -143,7 +143,7 @@ def test_shuffled_memory_is_compared_checkpoint_by_checkpoint(tmp_path: Path) ->
 
 def test_a_checkpoint_after_a_missed_one_does_not_count(tmp_path: Path) -> None:
     normal = evaluation(tmp_path / "normal", [0])
-    shuffled = evaluation(tmp_path / "shuffled", [3], "b", policy_settings={"shuffle_subgoals": True})
+    shuffled = evaluation(tmp_path / "shuffled", [3], "b", policy_settings={"align_targets": "shuffled"})
     write_episodes(tmp_path / "normal", [rollout(STOVE, "temporal", "SUU", [False, True, True], False, 0)])
     assert main(["compare", normal, shuffled, "--format", "json", "--out", str(tmp_path)]) == 0
     assert [rows_of(tmp_path)[STOVE, f"c{k}"]["a"] for k in (1, 2, 3)] == [0, 0, 0]

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from lerobot_memobench.datasets.frames import FrameTable
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.alignment import (
     WordTextEncoder,
     make_alignment,
     retrieval_accuracy,
-    shuffled_subgoals,
-    text_rows,
 )
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.targets import answers, progress, shuffled_subgoals, with_targets
 from tests.support.small_policy import batch_of, made_for_training
 
 B, F, P, D, T = 5, 3, 4, 6, 7
@@ -128,8 +127,8 @@ def test_subgoal_level_chooses_the_column(root: Path, align: str, level: str, co
 def test_shuffled_texts_are_those_of_the_batch(root: Path) -> None:
     fields = {"size": "small", "perception": "objects", "align": "contrastive"}
     found = []
-    for shuffle in (False, True):
-        _, before, _, dataset = made_for_training(root, shuffle_subgoals=shuffle, **fields)
+    for targets in ("subgoals", "shuffled"):
+        _, before, _, dataset = made_for_training(root, align_targets=targets, **fields)
         batches = [before(batch_of(dataset, [10, 75]))["memory.text"] for _ in range(2)]
         assert torch.equal(*batches), "equal in every epoch"
         found.append(batches[0])
@@ -159,11 +158,10 @@ def most_frequent_share(rows: np.ndarray, shuffled: np.ndarray) -> float:
 
 
 def test_one_subgoal_cannot_be_shuffled() -> None:
-    cache: Any = SimpleNamespace(
-        texts=["put it down"], text_rows=lambda _: np.zeros(5, int), episodes=np.array([0, 5]), root="here"
-    )
-    with pytest.raises(MemobenchError, match="shuffle_subgoals"):
-        text_rows(cache, "coarse", "semantic", True)
+    table = FrameTable(np.array([0, 5]), np.ones(5, np.uint8), {"coarse": ["put it down"] * 5}, None)
+    config = MemobenchMemConfig(align="semantic", subgoal_level="coarse", align_targets="shuffled")
+    with pytest.raises(MemobenchError, match="needs at least two"):
+        with_targets(table, config, Path("here"))
 
 
 @pytest.mark.parametrize("subgoals", [2, 3, 8])
@@ -172,3 +170,20 @@ def test_shuffled_subgoals_are_not_renamed(subgoals: int) -> None:
     rows = np.tile(np.arange(subgoals), 60)
     shuffled, _ = shuffled_subgoals(rows, np.arange(0, len(rows) + 1, subgoals))
     assert most_frequent_share(rows, shuffled) < 0.75
+
+
+TWO_DRAWERS = ["open the top drawer", "put the pea on the table", "open the low drawer", "", "put the pea on the table"]
+"""Subgoals of the five frames of two episodes of one task."""
+
+
+def test_answers_are_constant_in_an_episode() -> None:
+    made = answers(TWO_DRAWERS, np.array([0, 2, 5]))
+    assert made[:2] == ["open the top drawer; put the pea on the table"] * 2
+    assert made[2:] == ["open the low drawer; put the pea on the table"] * 3
+
+
+def test_progress_lacks_the_words_that_differ() -> None:
+    made = progress(TWO_DRAWERS, np.array([0, 2, 5]), ["find", "find"])
+    assert made == ["open the drawer", "put the pea on the table", "open the drawer", "", "put the pea on the table"]
+    assert progress(["left", "right"], np.array([0, 1, 2]), ["turn", "turn"]) == ["-", "-"]
+    assert progress(["left", "right"], np.array([0, 1, 2]), ["turn", "look"]) == ["left", "right"]

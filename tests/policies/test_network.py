@@ -223,6 +223,11 @@ def test_instruction_conditions_norms_without_its_padding() -> None:
     assert torch.equal(found, condition(torch.where(short, tokens, 3)))
     other = condition(torch.where(torch.arange(12) == 4, tokens + 1, tokens))
     assert (other != found).any(dim=1).all()
+    exchanged = condition(tokens[:, [0, 2, 1, *range(3, 12)]])
+    assert ((exchanged - found).abs().amax(dim=1) > 1e-3).all(), "the order of words counts"
+    with torch.no_grad():
+        model.instruction.positions.zero_()  # as in checkpoints of earlier versions
+    torch.testing.assert_close(condition(tokens[:, [0, 2, 1, *range(3, 12)]]), condition(tokens))
 
 
 def test_gradient_checkpointing_keeps_gradients() -> None:

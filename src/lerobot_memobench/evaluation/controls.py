@@ -38,6 +38,7 @@ class Control:
         one_policy: whether both evaluations have to be of one policy.
         gap_closed: whether the share of the gap to 100 % is reported.
         by_checkpoint: whether prefix completion is compared checkpoint by checkpoint.
+        value: the setting's only value that is the control; None: every value but the default.
     """
 
     title: str
@@ -48,11 +49,13 @@ class Control:
     one_policy: bool = False
     gap_closed: bool = False
     by_checkpoint: bool = False
+    value: Any = None
 
     def value_in(self, run: Run) -> Any:
         """Return the setting's value in an evaluation, the default where its log does not record it."""
         known = run.protocol[POLICY].get("settings", {}) if self.of_policy else run.protocol
-        return known.get(self.setting, self.default)
+        found = known.get(self.setting, self.default)
+        return found if self.value in (None, found) else self.default
 
 
 CONTROLS = (
@@ -82,13 +85,14 @@ CONTROLS = (
     ),
     Control(
         "Shuffled memory",
-        "shuffle_subgoals",
-        False,
+        "align_targets",
+        "subgoals",
         "The second policy was trained on subgoals in another order; tasks with fewer than three such subgoals on "
         "subgoals of other episodes. c1, c2, … count rollouts in which that checkpoint and all before it were "
         "satisfied.",
         of_policy=True,
         by_checkpoint=True,
+        value="shuffled",
     ),
 )
 

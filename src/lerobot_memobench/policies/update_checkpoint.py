@@ -35,6 +35,7 @@ from lerobot_memobench.policies.checkpoint import (
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     ALIGN_WEIGHTS,
     SHUFFLE_SEED,
+    SHUFFLED,
     SIZES,
     TOKENS_PER_FRAME,
 )
@@ -102,6 +103,8 @@ def updated(saved: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         MemobenchError: this version cannot act as the checkpoint was trained.
     """
     policy = {name: value for name, value in saved.items() if name not in REMOVED_FIELDS}
+    if saved.get("shuffle_subgoals"):
+        policy["align_targets"] = SHUFFLED
     memory = saved.get("memory") or ("none" if saved.get("memory_fusion") == "none" else "frames")
     settings = dict(saved.get("memory_settings") or {})
     tokens = TOKENS_PER_FRAME[saved.get("perception", "pixels")]

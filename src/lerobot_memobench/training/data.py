@@ -47,6 +47,7 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     make_memobench_mem_pre_post_processors,
 )
 from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
+from lerobot_memobench.policies.memobench_mem.targets import with_targets
 from lerobot_memobench.protocol import OBS_PHASE, PROMPT
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
 
@@ -188,7 +189,7 @@ def open_lookup(
     in_data = {known: given for given, known in (renamed or {}).items()}
     remember: Remember | None = None
     if isinstance(encoder, ImageTowerEncoder):
-        table = read_frame_table(root)
+        table = with_targets(read_frame_table(root), config, root)
         if config.memory != "none":
             remembered = encoder.memory_input
             camera = in_data.get(remembered, remembered) or next(iter(cameras_of(read_info(root)["features"])), "")
@@ -196,6 +197,7 @@ def open_lookup(
         return FrameLookup(root, table, stride=config.memory_stride, texts=text_encoder(config), remember=remember)
     names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
     columns, table = read_recorded(root, names)
+    table = with_targets(table, config, root)
     logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     encoded: dict[str, Encoded] = {}
     if isinstance(encoder, VisualTokenEncoder):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import logging
 import math
 import re
 from abc import ABC, abstractmethod
@@ -25,11 +24,9 @@ from torch.nn.utils import parameters_to_vector
 
 from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, MEMORY_COLUMN, FrameLookup, holds_texts
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SHUFFLE_SEED, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.losses import joint, mean_over_ranks, world_size
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
-
-logger = logging.getLogger(__name__)
 
 POSITIVE_SIMILARITY = 0.99  # texts more similar than this are the same subgoal
 INITIAL_TEMPERATURE = 0.07
@@ -220,10 +217,6 @@ def alignment_loss(
 # -- subgoal texts of samples -----------------------------------------------------------------------------------------
 
 
-SHUFFLED_ALONE = 3
-"""Smallest number of subgoals of an episode that are permuted among themselves."""
-
-
 def require_texts(root: Path, config: MemobenchMemConfig) -> None:
     """Check that a dataset has the texts that a policy learns from.
 
@@ -249,15 +242,14 @@ def require_texts(root: Path, config: MemobenchMemConfig) -> None:
         )
 
 
-def text_rows(lookup: FrameLookup, level: str, align: str, shuffle: bool) -> np.ndarray:
+def text_rows(lookup: FrameLookup, level: str, align: str) -> np.ndarray:
     """Return the row of the cached embeddings for each frame of the dataset (N,), -1 for frames without subgoal.
 
     Args:
         level: subgoal level. align: the objective, for the message.
-        shuffle: whether subgoals are shuffled (`shuffled_subgoals`).
 
     Raises:
-        MemobenchError: the dataset has no texts, or a single text to shuffle.
+        MemobenchError: the dataset has no texts.
     """
     rows = lookup.text_rows(level)
     if len(lookup.texts) == 0:
@@ -265,24 +257,7 @@ def text_rows(lookup: FrameLookup, level: str, align: str, shuffle: bool) -> np.
             f"The dataset of {lookup.root} has no subgoal text, which --policy.align={align} needs; use "
             "--policy.align=none, or a dataset with subgoals."
         )
-    if not shuffle:
-        return rows
-    if len(np.unique(rows[rows >= 0])) < 2:
-        raise MemobenchError(
-            f"The dataset of {lookup.root} has one {level} subgoal, and --policy.shuffle_subgoals=true needs at least "
-            "two; use a dataset of several tasks, or another --policy.subgoal_level."
-        )
-    shuffled, elsewhere = shuffled_subgoals(rows, lookup.episodes)
-    logger.info(
-        "%s subgoals are shuffled: %d of %d episodes permute their own; %d have fewer than %d and take texts of other "
-        "episodes",
-        level,
-        len(lookup.episodes) - 1 - elsewhere,
-        len(lookup.episodes) - 1,
-        elsewhere,
-        SHUFFLED_ALONE,
-    )
-    return shuffled
+    return rows
 
 
 def texts_of_frames(lookup: FrameLookup, rows: np.ndarray, frames: Sequence[int]) -> dict[str, Tensor]:
@@ -301,39 +276,6 @@ def texts_of_histories(lookup: FrameLookup, rows: np.ndarray, histories: Sequenc
 def _embed(lookup: FrameLookup, rows: np.ndarray) -> dict[str, Tensor]:
     numbers = torch.from_numpy(rows)
     return {TEXT_MASK: numbers >= 0, TEXT: lookup.text_embeddings[numbers.clamp(min=0)]}
-
-
-def shuffled_subgoals(rows: np.ndarray, episodes: np.ndarray, seed: int = SHUFFLE_SEED) -> tuple[np.ndarray, int]:
-    """Permute the subgoals within each episode: a control of the paper.
-
-    Two subgoals of a task would be exchanged in every episode alike, which renames the texts and keeps their
-    information. Episodes with fewer than `SHUFFLED_ALONE` subgoals therefore draw texts of other episodes: of other
-    tasks if there are enough, else of the whole dataset.
-
-    Args:
-        rows: (N,) text index per frame, -1 for none. episodes: (E + 1,) first frame of each episode.
-        seed: of the permutation.
-
-    Returns:
-        (N,) text indices, and the number of episodes that drew texts of others.
-    """
-    shuffled, every, elsewhere = rows.copy(), np.unique(rows[rows >= 0]), 0
-    for episode, (start, end) in enumerate(itertools.pairwise(episodes)):
-        present = np.unique(rows[start:end])
-        present = present[present >= 0]
-        chance = np.random.default_rng([seed, episode])
-        if len(present) >= SHUFFLED_ALONE:
-            # A rotation of a random order moves every subgoal.
-            order = chance.permutation(present)
-            replaced, by = order, np.roll(order, 1)
-        else:
-            others = np.setdiff1d(every, present)
-            pool = others if len(others) >= SHUFFLED_ALONE * len(present) else every
-            replaced, by = present, chance.choice(pool, len(present), replace=False)
-            elsewhere += 1
-        replace = dict(zip(replaced.tolist(), by.tolist(), strict=True))
-        shuffled[start:end] = [replace.get(row, -1) for row in rows[start:end].tolist()]
-    return shuffled, elsewhere
 
 
 # -- frozen text encoders of subgoals ---------------------------------------------------------------------------------

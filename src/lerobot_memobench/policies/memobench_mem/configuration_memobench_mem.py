@@ -44,7 +44,8 @@ FLOW_MATCHING, REGRESSION = "flow_matching", "regression"
 OBJECTIVES = (FLOW_MATCHING, REGRESSION)
 ALIGN_WEIGHTS: Mapping[str, float] = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
 SHUFFLE_SEED = 7
-"""Seed of ``shuffle_subgoals``."""
+"""Seed of ``align_targets=shuffled``."""
+SUBGOALS, SHUFFLED, PROGRESS, ANSWERS = ALIGN_TARGETS = ("subgoals", "shuffled", "progress", "answers")
 MODULATION, CONTEXT, OWN = "modulation", "context", "own"
 MEMORY_FUSIONS = (MODULATION, CONTEXT, OWN)
 PERCEPTIONS = ("pixels", "objects")
@@ -198,7 +199,7 @@ READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
         "memory_phase",
     ),
     "a memory that learns from texts": (lambda it: it.privileged_memory, "subgoals"),
-    "an alignment": (lambda it: it.align != NONE, "shuffle_subgoals text_encoder"),
+    "an alignment": (lambda it: it.align != NONE, "align_targets text_encoder"),
     "an alignment or a memory that learns from texts": (
         lambda it: it.align != NONE or it.privileged_memory,
         "subgoal_level",
@@ -278,9 +279,11 @@ class MemobenchMemConfig(PI05Config):
     """How memory is aligned with checkpoint language: ``none``, ``semantic``, ``contrastive`` or ``framewise``."""
     subgoal_level: str = "intermediate"
     """Level of the checkpoint language: ``coarse``, ``intermediate`` or ``fine``."""
-    shuffle_subgoals: bool = False
-    """Control of the paper: permute the subgoal texts within each episode; an episode with fewer than three takes
-    texts of other episodes. The permutation is the same in every epoch and on every machine."""
+    align_targets: str = SUBGOALS
+    """Texts that memory is aligned with: ``subgoals``, or a control. ``shuffled`` (the paper's) permutes them within
+    each episode; an episode with fewer than three takes texts of other episodes; the permutation is the same in every
+    epoch and on every machine. ``progress`` cuts the words that differ between the episodes of a task, and with them
+    the hidden answer. ``answers`` is one text per episode, all its subgoals, which does not name its progress."""
     text_encoder: str | None = None
     """Encoder of subgoal texts: ``words`` (hashed words), ``labels`` (a random vector per text), or the folder or
     repository of a SigLIP model; None: the default of the size."""
@@ -364,6 +367,7 @@ class MemobenchMemConfig(PI05Config):
             ("align", ALIGN_WEIGHTS),
             ("perception", PERCEPTIONS),
             ("subgoal_level", SUBGOAL_LEVELS),
+            ("align_targets", ALIGN_TARGETS),
         ):
             self._choose(name, tuple(known))
         if self.visual_encoder is None and self.uses_visual_encoder:

@@ -28,6 +28,10 @@ OWN = ("state_token.", "instruction.", "paligemma_with_expert.perception.")
 """Prefixes of the names of further parameters that plain pi0.5 does not have, except for the memory's."""
 
 
+ORDERED_WORDS = 48
+"""Leading words of a prompt whose order the condition of the instruction depends on."""
+
+
 @functools.cache
 def compiled(part: Callable[..., Any], mode: str) -> Callable[..., Any]:
     """Compile a part of a pass without graph breaks, once for all models."""
@@ -263,7 +267,9 @@ class StateToken(nn.Module):
 
 
 class InstructionCondition(nn.Module):
-    """Map the mean word of the instruction to a condition of the action expert's norms, added to the denoising time.
+    """Map the instruction to a condition of the action expert's norms, which is added to the denoising time.
+
+    Each word is scaled by a vector of its position before the mean, so that the condition depends on the words' order.
 
     With attention only, the model has to find the single word in which two instructions differ. On six tasks of one
     cabinet, one microwave and one stove, after 2,000 updates, the loss was 2 % lower with this condition, and 28 of 30
@@ -273,10 +279,14 @@ class InstructionCondition(nn.Module):
     def __init__(self, words_dim: int, width: int) -> None:
         super().__init__()
         self.mlp = nn.Sequential(nn.Linear(words_dim, width), nn.SiLU(), nn.Linear(width, width))
+        # Random vectors distinguish two orders of the same words from the first update on.
+        self.positions = nn.Parameter(torch.randn(ORDERED_WORDS, words_dim))
 
     def forward(self, words: Tensor, real: Tensor) -> Tensor:
         """Return the condition (B, width) of embedded words (B, n, D); ``real`` (B, n) is False for padding."""
         weights = real.unsqueeze(-1).to(words.dtype)
-        mean = (words * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
+        ordered = min(words.shape[1], ORDERED_WORDS)
+        scale = F.pad(1 + self.positions[:ordered].to(words.dtype), (0, 0, 0, words.shape[1] - ordered), value=1.0)
+        mean = (words * scale * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
         condition: Tensor = self.mlp(mean.to(next(self.mlp.parameters()).dtype))
         return condition

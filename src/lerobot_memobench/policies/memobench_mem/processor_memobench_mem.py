@@ -248,7 +248,7 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         if config.align == "none":
             return memory | found
         if self._texts is None:
-            self._texts = text_rows(lookup, config.subgoal_level, config.align, config.shuffle_subgoals)
+            self._texts = text_rows(lookup, config.subgoal_level, config.align)
         if config.align != "framewise":
             return memory | found | texts_of_frames(lookup, self._texts, indices)
         histories = [int(lookup.episodes[episode]) + read * stride for episode, read in recalled]
