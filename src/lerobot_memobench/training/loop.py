@@ -347,14 +347,15 @@ def quick_products() -> Iterator[None]:
     if not quicker_in_bfloat16():
         yield
         return
-    products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # torch sets it late
-    before = products.fp32_precision, torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
-    products.fp32_precision = "bf16"
+    before = torch.get_float32_matmul_precision(), torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
+    # Not the setting of mkldnn alone, which this setting would contradict: the compiler refuses that.
+    torch.set_float32_matmul_precision("medium")
     torch.backends.cuda.enable_flash_sdp(False)
     try:
         yield
     finally:
-        products.fp32_precision, fused = before
+        precision, fused = before
+        torch.set_float32_matmul_precision(precision)
         torch.backends.cuda.enable_flash_sdp(fused)
 
 
