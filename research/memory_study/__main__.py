@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from statistics import mean
@@ -73,7 +74,9 @@ def study(
         say(planned(data, cells, workers))
         return
     cluster = None if slurm is None else Slurm(read_options(slurm), NEEDS, out / "logs", jobs_per_member=1)
-    for title, jobs, at_once in (("demonstrations", data, 1), ("cells", cells, workers)):
+    uncontrolled = [replace(cell, controlled=False, sealed=False) for cell in cells]  # all rows before any control
+    stages = (("demonstrations", data, 1), ("cells", uncontrolled, workers), ("controls", cells, workers))
+    for title, jobs, at_once in stages:
         with counting(console(), title, len(jobs)) as count:
 
             def advance(news: Advance, count=count) -> None:  # type: ignore[no-untyped-def]

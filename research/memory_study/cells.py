@@ -5,14 +5,12 @@ The same call resumes a killed cell: a training from its last checkpoint, an eva
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE
-from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.arguments import split_arguments
 from research.memory_study.commands import Cost, check_training, has_ended, kept_of, run_once, train_once
@@ -77,6 +75,7 @@ class Cell:
         out: the study's folder.
         sealed: whether the sealed test is run too.
         at_once: cells that run at the same time, this one included.
+        controlled: whether the controls of a row's first training seed are run too.
     """
 
     grid: Grid
@@ -86,6 +85,7 @@ class Cell:
     seed: int
     sealed: bool = False
     at_once: int = 1
+    controlled: bool = True
 
     @property
     def task_name(self) -> str:
@@ -110,7 +110,7 @@ class Cell:
     @property
     def parts(self) -> list[str]:
         """The evaluation, the controls of a row's first training seed, and the sealed test where it is wanted."""
-        controls = self.grid.rows[self.row].controls if self.seed == 0 else ()
+        controls = self.grid.rows[self.row].controls if self.seed == 0 and self.controlled else ()
         return [ROLLOUTS, *controls, *([SEALED] if self.sealed or has_ended(self.log(SEALED)) else [])]
 
     def evaluation(self, part: str) -> Path:
@@ -181,11 +181,9 @@ class Cell:
 
     def training_words(self) -> list[str]:
         """Return the command that trains its policy."""
-        row, suite = self.grid.rows[self.row], self.grid.suites[self.suite]
+        row = self.grid.rows[self.row]
         data = Demonstrations(self.grid, self.suite, self.out).folder
-        policy = row.policy or [*self.grid.policy, *suite.weight_words]
-        if row.policy and suite.tasks and suite.whole:
-            policy = [*policy, *episode_words(data, suite.tasks)]
+        policy = row.policy or self.grid.policy
         rest = [f"dataset={data}", f"seed={self.seed}", f"output_dir={self.policy}"]
         return ["lerobot", "train", *_last_of_each([*policy, *self.grid.training, *row.training]), *rest]
 
@@ -215,8 +213,7 @@ def ended_as(log: Path, words: Sequence[str]) -> bool:
     """Return whether the command of a log has ended well.
 
     Raises:
-        MemobenchError: it had other words. The study's folder, and the episodes of a dataset that the tasks have, may
-            differ.
+        MemobenchError: it had other words. The study's folder may differ.
     """
     kept = kept_of(log)
     if kept is None:
@@ -239,22 +236,7 @@ def difference(first: Iterable[str], second: Iterable[str]) -> str | None:
 
 
 def _in_any_folder(words: Iterable[str]) -> list[str]:
-    kept = [word for word in words if not word.startswith("dataset.episodes=")]
-    return [re.sub(r"(?s)^([\w.]+=)?.*/(?=(cells|demonstrations)/)", r"\1", word) for word in kept]
-
-
-def episode_words(data: Path, tasks: Sequence[str]) -> list[str]:
-    """Return the word that restricts LeRobot's own policies, which have no task weights, to episodes of some tasks.
-
-    Args:
-        data: the dataset; [] is returned before it exists.
-        tasks: their names, or memory types.
-    """
-    if not data.is_dir():
-        return []
-    records = [(place.index, place.record) for place in list_episodes(data) if place.record is not None]
-    chosen = [index for index, record in records if {record.task_name, record.memory_type} & {*tasks}]
-    return [f"dataset.episodes={json.dumps(chosen, separators=(',', ':'))}"]
+    return [re.sub(r"(?s)^([\w.]+=)?.*/(?=(cells|demonstrations)/)", r"\1", word) for word in words]
 
 
 def _last_of_each(words: Sequence[str]) -> list[str]:

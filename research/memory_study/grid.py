@@ -12,7 +12,7 @@ import yaml
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.catalogue import resolve_tasks
-from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
+from lerobot_memobench.tasks.task import PUBLISHED
 
 ROLLOUTS = "rollouts"
 """The evaluation of a cell; its controls have names of their own."""
@@ -35,14 +35,12 @@ class Suite:
     Attributes:
         demonstrations: words of ``memobench generate``. evaluation: of ``lerobot eval env=memobench``.
         tasks: tasks or memory types to learn and roll out; none: all.
-        whole: demonstrations are of all tasks; frames of the others only count in normalisation.
         ceilings: task -> best success without a memory, per cent: found (``research.necessity``), or exact.
     """
 
     demonstrations: list[str]
     evaluation: list[str] = field(default_factory=list)
     tasks: list[str] = field(default_factory=list)
-    whole: bool = False
     ceilings: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -52,21 +50,13 @@ class Suite:
 
     @property
     def demonstration_words(self) -> list[str]:
-        """Words of ``memobench generate``, with the tasks unless the whole suite is demonstrated."""
-        return [*self.demonstrations, *(["--tasks", ",".join(self.tasks)] if self.tasks and not self.whole else [])]
+        """Words of ``memobench generate``, with the tasks."""
+        return [*self.demonstrations, *(["--tasks", ",".join(self.tasks)] if self.tasks else [])]
 
     @property
     def task_words(self) -> list[str]:
         """Words of an evaluation of these tasks."""
         return [f"tasks={','.join(self.tasks)}"] if self.tasks else []
-
-    @property
-    def weight_words(self) -> list[str]:
-        """Words of a training of ``memobench_mem`` that draws only these tasks from a whole suite's."""
-        others = (kind for kind in MEMORY_TYPES if kind not in self.tasks)
-        weights = dict.fromkeys(self.tasks, 1) | dict.fromkeys(others, 0)
-        listed = ", ".join(f"{name}: {weight}" for name, weight in weights.items())
-        return [f"policy.task_weights={{{listed}}}"] if self.tasks and self.whole else []
 
 
 @dataclass(frozen=True)
@@ -146,9 +136,9 @@ class Grid:
             raise MemobenchError(f"row {name!r} has seeds: {row.seeds}; expected at least 1")
 
     def places(self) -> Iterator[tuple[str, str, int]]:
-        """Yield suite, row and training seed of every cell: the first seeds of all rows before the second ones."""
-        for seed in range(max(row.seeds for row in self.rows.values())):
-            for suite in self.suites:
+        """Yield suite, row and training seed of every cell: a suite's first seeds before its second ones."""
+        for suite in self.suites:
+            for seed in range(max(row.seeds for row in self.rows.values())):
                 yield from ((suite, name, seed) for name, row in self.rows.items() if seed < row.seeds)
 
 

@@ -21,7 +21,7 @@ from research.memory_study.cells import Cell, difference
 from research.memory_study.contrasts import Contrast, adjusted, average_success, contrast, episodes_of
 from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid
 
-REFERENCES = ("no memory", "clock only", "frames")
+REFERENCES = ("no memory", "clock of the execution", "frames", "contrastive")
 """Rows from which the differences of the others are computed."""
 EVIDENCE = "evidence"
 """The control with columns in the first table; the others have a table of their own."""

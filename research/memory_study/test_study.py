@@ -13,7 +13,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import IO, Any
 
 import pytest
@@ -133,40 +132,12 @@ def test_ceilings_cover_the_tasks_and_are_exact_on_strict() -> None:
 # --- commands of a cell ---
 
 
-def test_tasks_of_a_whole_suite_are_weighted(tmp_path: Path) -> None:
-    grid = grid_of(
-        tmp_path, ("evaluation: [suite=strict]", f"evaluation: [suite=strict], tasks: [object, {FIND}], whole: true")
-    )
-    cell = Cell(grid, tmp_path, "strict", "no memory", 0)
-    weights = f"policy.task_weights={{object: 1, {FIND}: 1, temporal: 0, spatial: 0, procedural: 0}}"
-    assert weights in cell.training_words()
-    assert f"tasks=object,{FIND}" in cell.evaluation_words(ROLLOUTS)
-
-
 def test_tasks_alone_are_demonstrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     grid = grid_of(tmp_path, ("[suite=strict]}", f"[suite=strict], tasks: [object, {FIND}]}}"))
     ran = list[list[str]]()
     monkeypatch.setattr(cells, "run_once", lambda words, *_, **__: ran.append(words))
     Demonstrations(grid, "strict", tmp_path).run()
     assert ran[0][:6] == ["memobench", "generate", "--suite", "strict", "--tasks", f"object,{FIND}"]
-    words = Cell(grid, tmp_path, "strict", "no memory", 0).training_words()
-    assert not any(word.startswith("policy.task_weights=") for word in words)
-
-
-def test_other_policies_learn_the_episodes_of_the_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    grid = grid_of(
-        tmp_path,
-        ("evaluation: [suite=strict]", f"evaluation: [suite=strict], tasks: [object, {FIND}], whole: true"),
-        ("no memory: {", "act: {policy: [policy=act], "),
-    )
-    cell = Cell(grid, tmp_path, "strict", "act", 0)
-    Demonstrations(grid, "strict", tmp_path).folder.mkdir(parents=True)
-    records = [(FIND, "spatial"), ("count_it", "temporal"), ("bowl", "object")]
-    places = [
-        SimpleNamespace(index=k, record=SimpleNamespace(task_name=n, memory_type=t)) for k, (n, t) in enumerate(records)
-    ]
-    monkeypatch.setattr(cells, "list_episodes", lambda folder: [*places, SimpleNamespace(index=3, record=None)])
-    assert "dataset.episodes=[0,2]" in cell.training_words()
 
 
 def test_sealed_test_is_run_once_where_wanted(no_memory: Cell) -> None:
