@@ -43,6 +43,7 @@ def study(
         Path | None, typer.Option(help="Make tables and figure of the cells kept in this folder, then stop.")
     ] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder of the figure; --out by default.")] = None,
+    controls: Annotated[bool, typer.Option(help="Run the controls, after all cells.")] = True,
     sealed: Annotated[bool, typer.Option("--sealed", help="Run the sealed test too: once, last.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
     slurm: Annotated[str | None, typer.Option(help="Run on Slurm, with these options of sbatch.")] = None,
@@ -76,7 +77,7 @@ def study(
     cluster = None if slurm is None else Slurm(read_options(slurm), NEEDS, out / "logs", jobs_per_member=1)
     uncontrolled = [replace(cell, controlled=False, sealed=False) for cell in cells]  # all rows before any control
     stages = (("demonstrations", data, 1), ("cells", uncontrolled, workers), ("controls", cells, workers))
-    for title, jobs, at_once in stages:
+    for title, jobs, at_once in stages if controls or sealed else stages[:2]:
         with counting(console(), title, len(jobs)) as count:
 
             def advance(news: Advance, count=count) -> None:  # type: ignore[no-untyped-def]
