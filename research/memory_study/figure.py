@@ -1,4 +1,4 @@
-"""The figure of the study: success of each row, and how often it follows the evidence."""
+"""The figure of the study: success of each row, and how often it follows the evidence, one panel per suite."""
 
 from __future__ import annotations
 
@@ -8,49 +8,53 @@ from typing import Any
 
 from research.drawing import pyplot, save
 from research.memory_study.grid import Grid
-from research.memory_study.tables import figures_of_rows, titles
+from research.memory_study.tables import figures_of_rows
 
-CHANCE_COLOUR = "#d55e00"
-MEASURES = {"solved": ("solved, %", "#0072b2"), "follows": ("follows the evidence, %", "#e69f00")}
-"""Figure of a row -> label and colour."""
+SOLVED, FOLLOWS, WITHOUT = "#0072b2", "#e69f00", "#d55e00"
+"""Colours of success, of choices that follow the evidence, and of the best success found without a memory."""
+ROW_HEIGHT, PANEL_WIDTH = 0.32, 5.6
+"""Inches."""
 
 
 def draw(grid: Grid, out: Path, path: Path) -> Path | None:
-    """Draw the evaluated rows to ``path``; return it, or None without any.
-
-    A bar is the mean of training seeds, a dot one of them. An orange line is the best without the past: the success
-    that a search found, and the chance of following.
-    """
+    """Draw the evaluated rows to ``path``, each suite's by descending success; return it, or None without any."""
     plt = pyplot()
     suites = {suite: found for suite in grid.suites if (found := figures_of_rows(grid, out, suite))}
     if not suites:
         return None
-    rows = [row for row in titles(grid) if any(row in found for found in suites.values())]
-    size = (2.0 + 2.6 * len(suites) * len(MEASURES), 1.2 + 0.3 * len(rows))
-    figure, axes = plt.subplots(
-        1, len(suites) * len(MEASURES), figsize=size, sharey=True, squeeze=False, constrained_layout=True
-    )
-    panels = [(suite, measure) for suite in suites for measure in MEASURES]
-    for axis, (suite, measure) in zip(axes[0], panels, strict=True):
-        for place, row in enumerate(rows):
-            _draw_row(axis, place, suites[suite].get(row), measure)
-        axis.set_xlim(0, 100)
-        axis.set_title(suite, fontsize=10)
-        axis.set_xlabel(MEASURES[measure][0])
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[0][0].set_yticks(range(len(rows)), rows)
-    axes[0][0].invert_yaxis()
+    longest = max(map(len, suites.values()))
+    size = (PANEL_WIDTH * len(suites), 1.6 + ROW_HEIGHT * longest)
+    figure, axes = plt.subplots(1, len(suites), figsize=size, squeeze=False, constrained_layout=True)
+    for axis, (suite, found) in zip(axes[0], suites.items(), strict=True):
+        _draw_suite(axis, suite, found)
+    handles = {
+        label: handle
+        for axis in axes[0]
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)  # a suite may lack evidence
+    }
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return save(figure, path)
 
 
-def _draw_row(axis: Any, place: int, row: dict[str, Any] | None, measure: str) -> None:
-    if row is None or not row[measure]:
-        axis.text(1, place, "not run", va="center", fontsize=7, color="grey")
-        return
-    of_seeds, without = row[measure], row["without"][measure]
-    average = mean(of_seeds)
-    axis.barh(place, average, 0.7, color=MEASURES[measure][1], alpha=0.75)
-    axis.plot(of_seeds, [place] * len(of_seeds), "o", color="black", markersize=3)
-    axis.text(1, place, f"{average:.0f}", va="center", fontsize=8)
+def _draw_suite(axis: Any, suite: str, found: dict[str, dict[str, Any]]) -> None:
+    rows = sorted(found, key=lambda row: mean(found[row]["solved"]), reverse=True)
+    places = range(len(rows))
+    axis.barh(places, [mean(found[row]["solved"]) for row in rows], 0.7, color=SOLVED, alpha=0.75, label="solved")
+    seeds = [(value, place) for place, row in enumerate(rows) for value in found[row]["solved"]]
+    axis.plot(*zip(*seeds, strict=True), "o", color="black", markersize=3.5, label="solved, each training seed")
+    follows = [(value, place) for place, row in enumerate(rows) for value in found[row]["follows"]]
+    if follows:
+        axis.plot(
+            *zip(*follows, strict=True), "D", color=FOLLOWS, markersize=6, label="choices that follow the evidence"
+        )
+    for place, row in enumerate(rows):
+        axis.text(1, place, f"{mean(found[row]['solved']):.0f}", va="center", fontsize=8, color="white")
+    without = found[rows[0]]["without"]
     if without is not None:
-        axis.plot([without, without], [place - 0.42, place + 0.42], color=CHANCE_COLOUR, linewidth=2)
+        axis.axvline(without, color=WITHOUT, linewidth=2, label="best found without a memory")
+    axis.set_yticks(places, rows)
+    axis.invert_yaxis()
+    axis.set_xlim(0, 100)
+    axis.set_title(suite, fontsize=11)
+    axis.set_xlabel("%")
+    axis.spines[["top", "right"]].set_visible(False)

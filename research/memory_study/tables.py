@@ -51,6 +51,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         ("How rollouts ended, all training seeds together", _endings(rows)),
         ("Other conditions of the rollouts, first training seed", _conditions(rows)),
         *((f"Minus *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
+        (f"Minus *{FOUND_WITHOUT}*", _above_ceiling(rows, grid.suites[suite].ceilings)),
         ("The sealed test", _sealed(rows)),
         *((f"The sealed test, minus *{name}*", _differences(rows, name, SEALED)) for name in REFERENCES),
         ("Cost of a cell, on a shared machine", _costs(rows)),
@@ -59,7 +60,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
 
 
 def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, Any]]:
-    """Return title of a row -> "solved" (SR) and "follows" per training seed, and the best of both "without" the past.
+    """Return title of a row -> "solved" (SR) and "follows" per training seed, and the best success "without" a memory.
 
     Per cent.
     """
@@ -69,7 +70,7 @@ def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, An
         found[row] = {
             "solved": [report(cell, ROLLOUTS)["average"]["SR"] for cell in cells],
             "follows": [each["follows"]["percent"] for each in evidence],
-            "without": {"solved": ceiling, "follows": evidence[0]["chance"] if evidence else None},
+            "without": ceiling,
         }
     return found
 
@@ -292,6 +293,21 @@ def _sealed(rows: Rows) -> str:
             averages = [_average(reports, metric) for metric in METRICS[1:]]
             lines.append([row, str(len(tested)), *_with_interval(success), *averages])
     return markdown(("", "training seeds", "SR", "95 %", *METRICS[1:]), lines) if lines else ""
+
+
+def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:
+    """Return success minus the ceiling, which is a number without an interval of its own."""
+    ceiling = _ceiling(ceilings)
+    if ceiling is None:
+        return ""
+    lines = []
+    for row, cells in rows.items():
+        success = average_success(_runs(cells))
+        value, low, high = (
+            f"{100 * (one or 0.0) - ceiling:+.1f}" for one in (success.value, success.low, success.high)
+        )
+        lines.append([row, str(len(cells)), value, f"{low} to {high}"])
+    return markdown(("", "training seeds", "difference, points", "95 %"), lines)
 
 
 def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
