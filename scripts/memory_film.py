@@ -1,214 +1,138 @@
-"""Make README's animation: the expert and two policies in the same scene, side by side.
+"""Make README's animation: one scene with two prompts, equal pictures after both, and two right answers.
 
-    python scripts/memory_film.py            # docs/figures/memory.webp; minutes on one core
+    python scripts/memory_film.py            # docs/figures/memory.webp; two minutes on one core
 
-Evaluates all three on the first evaluation seeds, with a demonstration prompt whose referent depends on the seed, and
-selects the first seed with different outcomes. Its actions are replayed in a scene rendered at quality high.
+The expert acts in two variants of a strict task at one seed. Both episodes rest after their prompts; their pictures are
+equal at the first step of the execution.
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from unittest import mock
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.observations import OBJECTS
-from lerobot_memobench.envs.video import OPERATION_COLOURS
-from lerobot_memobench.evaluation.tables import OPERATION_NAMES
 from lerobot_memobench.io import draft_of
-from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION
+from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task
+from lerobot_memobench.tasks.catalogue import get_task
 
-TASK = DEMO_TASK
-POLICIES = {
-    "expert": (),
-    "with memory": ("policy=memobench_small",),
-    "without memory": ("policy=memobench_small_memoryless",),
-}
-"""Column title -> arguments of `lerobot eval` that select the policy."""
-EPISODES, HORIZON = 6, 400
-"""Evaluated seeds, and steps per episode."""
-STRIDE, SPEED = 4, 2.0
+TASK, SEED = "find_the_artichoke_hidden_in_one_of_the_drawers", VALIDATION_SEED
+VARIANTS = (0, 1)
+STRIDE, SPEED = 6, 3.0
 """Control steps per frame, and playback speed relative to real time."""
-LAST_SECONDS = 2.0
-"""Duration of the last frame."""
-SIDE, MARGIN = 272, 6
-"""Size of a scene and margin between scenes, pixels; three scenes are as wide as a README on GitHub."""
-HEADER, TITLE, FOOTER = 48, 40, 42
+EQUAL_SECONDS, LAST_SECONDS = 2.5, 2.0
+"""Duration of the frame with equal pictures, and of the last frame."""
+SIDE, MARGIN = 408, 6
+"""Size of a scene and margin between scenes, pixels; two scenes are as wide as a README on GitHub."""
+HEADER, FOOTER = 44, 44
 """Heights of the text rows, pixels."""
-LARGE, MEDIUM = 25, 21
-"""Font sizes; readable at half the width, on a phone."""
-BACKGROUND, INK, FAINT = (24, 26, 30), (240, 240, 240), (165, 170, 180)
-DEMONSTRATION, SOLVED, FAILED = (204, 121, 167), (0, 158, 115), (213, 94, 0)
-QUALITY = 78
+FONT, SMALL = 22, 19
+"""Sizes of the captions and of the instruction, which fills the width."""
+BACKGROUND, INK = (24, 26, 30), (240, 240, 240)
+PROMPT, EQUAL, SOLVED = (204, 121, 167), (230, 159, 0), (0, 158, 115)
+QUALITY = 76
 """WebP quality; keeps the file below 2 MB without artefacts around text."""
 
-Rollout = tuple[dict[str, Any], list[NDArray[np.float32]]]
-"""Log record and actions of an episode."""
+Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Image and state of one episode at a step; ``reached`` has a value per memory checkpoint."""
+    """Picture of one episode at a step, and its caption."""
 
-    image: NDArray[np.uint8]
-    phase: int
-    clock: int
-    reached: tuple[bool, ...]
-    drifted: bool
-    solved: bool
+    picture: Picture
+    prompt: bool
+    caption: str = ""
 
 
-@contextmanager
-def recorded_actions() -> Iterator[dict[int, list[NDArray[np.float32]]]]:
-    """Record the executed actions of all episodes in this process, by seed."""
-    actions: dict[int, list[NDArray[np.float32]]] = defaultdict(list)
-    step = Episode.step
-
-    def recording_step(episode: Episode, action: ArrayLike) -> None:
-        executing = episode.phase == EXECUTION
-        step(episode, action)
-        if executing:
-            actions[episode.seed].append(episode.applied_action)
-
-    with mock.patch.object(Episode, "step", recording_step):
-        yield actions
-
-
-def evaluate(name: str, folder: Path) -> dict[int, Rollout]:
-    """Evaluate one of `POLICIES` in this process; return log record and actions by seed."""
-    from lerobot_memobench.run.plan import plan_line
-    from lerobot_memobench.run.run import run_evaluation
-
-    words = ["env=memobench", *POLICIES[name], f"tasks={TASK}", "referent=random", f"horizon={HORIZON}"]
-    words += [f"obs_type={OBJECTS}", f"episodes={EPISODES}", "videos=0", f"output_dir={folder}"]
-    plan = plan_line([*words, "batch_size=1", "eval.use_async_envs=false"])
-    with recorded_actions() as actions:
-        run_evaluation(plan, print, print)
-    return {record["seed"]: (record, actions[record["seed"]]) for record in read_episodes(folder)}
-
-
-def first_difference(rollouts: dict[str, dict[int, Rollout]]) -> int:
-    """Return the first seed with different outcomes.
+def frames_of(variant: int) -> tuple[list[Frame], list[Frame]]:
+    """Return the frames of the prompt without the rest after it, and of the execution.
 
     Raises:
-        SystemExit: the outcomes are equal on all seeds.
+        SystemExit: the expert did not succeed.
     """
-    seeds = sorted(next(iter(rollouts.values())))
-    for seed in seeds:
-        if len({episodes[seed][0]["success"] for episodes in rollouts.values()}) > 1:
-            return seed
-    raise SystemExit(f"all outcomes are equal on seeds {seeds[0]} to {seeds[-1]}; increase EPISODES")
-
-
-def replay(seed: int, record: dict[str, Any], actions: Sequence[NDArray[np.float32]]) -> list[Frame]:
-    """Replay an evaluated episode until success, reference drift or its end.
-
-    Raises:
-        SystemExit: scene or outcome differ from the evaluation's.
-    """
-    render = RenderSettings(2 * SIDE, 2 * SIDE, "high")
-    episode = Episode(get_task(TASK), referent="random", horizon=HORIZON, render=render)
-    episode.reset(seed)
-    frames, remaining = [frame_of(episode)], iter(actions)
-    while not (episode.done or frames[-1].solved or frames[-1].drifted):
-        start = episode.exec_start
-        episode.step(next(remaining) if start is not None else np.zeros(7, np.float32))
-        if episode.step_index % STRIDE == 0 or episode.done or start != episode.exec_start:
-            frames.append(frame_of(episode))
-    if episode.scene_hash != record["scene_hash"] or (episode.done and episode.success != record["success"]):
-        raise SystemExit(f"the replay of seed {seed} differs from its evaluation")
-    return frames
+    episode = Episode(get_task(TASK), referent="random", render=RenderSettings(2 * SIDE, 2 * SIDE, "high"))
+    episode.reset(SEED, variant)
+    prompt, execution = [frame_of(episode)], list[Frame]()
+    while not episode.done:
+        idle = episode.idling
+        episode.step(episode.expert_action())
+        if episode.phase == EXECUTION:
+            if not execution or episode.exec_steps % STRIDE == 0 or episode.done:
+                execution.append(frame_of(episode))
+        elif not idle and episode.step_index % STRIDE == 0:
+            prompt.append(frame_of(episode))
+    if not episode.success:
+        raise SystemExit(f"the expert did not solve variant {variant} at seed {SEED}; choose another seed")
+    return prompt, execution
 
 
 def frame_of(episode: Episode) -> Frame:
     """Render the current step."""
-    reached = tuple(k < episode.progress.index for k in range(len(episode.task.checkpoints)))
-    image = Image.fromarray(episode.sim.render()).resize((SIDE, SIDE), Image.Resampling.BOX)
-    return Frame(np.asarray(image), episode.phase, episode.clock, reached, episode.drifted, episode.success)
+    picture = Image.fromarray(episode.sim.render()).resize((SIDE, SIDE), Image.Resampling.BOX)
+    caption = "solved" if episode.success else ""
+    return Frame(np.asarray(picture), episode.phase != EXECUTION, caption)
 
 
-def animation(columns: dict[str, list[Frame]]) -> Iterator[Image.Image]:
-    """Yield the frames of the animation; a finished column repeats its last frame."""
-    for k in range(max(map(len, columns.values()))):
-        yield compose({name: frames[min(k, len(frames) - 1)] for name, frames in columns.items()})
+def composed(columns: Sequence[Frame], headline: str, colour: tuple[int, int, int]) -> Image.Image:
+    """Return a frame of the animation: instruction, headline, and the scenes with their captions."""
+    width = len(columns) * (SIDE + MARGIN) - MARGIN
+    made = Image.new("RGB", (width, HEADER + SIDE + FOOTER), BACKGROUND)
+    draw, font = ImageDraw.Draw(made), ImageFont.load_default(size=FONT)
+    small = ImageFont.load_default(size=SMALL)
+    draw.text((8, HEADER // 2), f"“{get_task(TASK).language}”", fill=INK, font=small, anchor="lm")
+    for column, frame in enumerate(columns):
+        x = column * (SIDE + MARGIN)
+        made.paste(Image.fromarray(frame.picture), (x, HEADER))
+        if frame.prompt:
+            draw.rectangle((x, HEADER, x + SIDE - 1, HEADER + SIDE - 1), outline=PROMPT, width=4)
+        draw.text((x + SIDE - 10, HEADER + SIDE + FOOTER // 2), frame.caption, fill=SOLVED, font=font, anchor="rm")
+    draw.text((8, HEADER + SIDE + FOOTER // 2), headline, fill=colour, font=font, anchor="lm")
+    return made
 
 
-def compose(columns: dict[str, Frame]) -> Image.Image:
-    """Return a frame of the animation: instruction and time, then title, scene and checkpoints of each column."""
-    task = get_task(TASK)
-    picture = Image.new("RGB", (len(columns) * (SIDE + MARGIN) - MARGIN, HEADER + TITLE + SIDE + FOOTER), BACKGROUND)
-    draw = ImageDraw.Draw(picture)
-    large, medium = (ImageFont.load_default(size=size) for size in (LARGE, MEDIUM))
-    phase = max(frame.phase for frame in columns.values())
-    clock = max(frame.clock for frame in columns.values() if frame.phase == phase)
-    label, colour = ("execution", FAINT) if phase == EXECUTION else ("demonstration", DEMONSTRATION)
-    draw.text((8, HEADER // 2), f"“{task.language}”", fill=INK, font=medium, anchor="lm")
-    draw.text((picture.width - 8, HEADER // 2), f"{label}  {clock / CONTROL_HZ:4.1f} s", colour, medium, "rm")
-    for column, (name, frame) in enumerate(columns.items()):
-        x, top = column * (SIDE + MARGIN), HEADER + TITLE
-        ink = INK
-        if frame.phase != EXECUTION:
-            draw.rectangle((x, HEADER, x + SIDE - 1, top - 1), fill=DEMONSTRATION)
-            ink = BACKGROUND
-        draw.text((x + SIDE // 2, HEADER + TITLE // 2), name, fill=ink, font=large, anchor="mm")
-        picture.paste(Image.fromarray(frame.image), (x, top))
-        draw_checkpoints(draw, (x + 8, top + SIDE + 7), frame.reached)
-        end, colour = ("solved", SOLVED) if frame.solved else ("wrong bowl", FAILED) if frame.drifted else ("", INK)
-        draw.text((x + SIDE - 8, top + SIDE + FOOTER // 2), end, fill=colour, font=large, anchor="rm")
-    return picture
+def animation() -> Iterator[tuple[Image.Image, float]]:
+    """Yield the frames of the animation and their durations in seconds; a finished episode repeats its last frame.
+
+    Raises:
+        SystemExit: the pictures at the first step of the execution differ.
+    """
+    prompts, executions = zip(*map(frames_of, VARIANTS), strict=True)
+    step = STRIDE / CONTROL_HZ / SPEED
+    for columns in _together(prompts):
+        yield composed(columns, "1. Two prompts in one scene", PROMPT), step
+    first = [frames[0] for frames in executions]
+    if not all(np.array_equal(first[0].picture, frame.picture) for frame in first):
+        raise SystemExit(f"the pictures of seed {SEED} differ after the prompts; choose another seed")
+    yield composed(first, "2. Equal pictures: which drawer?", EQUAL), EQUAL_SECONDS
+    *pictures, last = [composed(columns, "3. Two right answers", INK) for columns in _together(executions)]
+    yield from ((picture, step) for picture in pictures)
+    yield last, LAST_SECONDS
 
 
-def draw_checkpoints(draw: ImageDraw.ImageDraw, corner: tuple[int, int], reached: tuple[bool, ...]) -> None:
-    """Draw a box with the operation of each memory checkpoint, ticked if it is reached."""
-    x, y = corner
-    for checkpoint, done in zip(get_task(TASK).checkpoints, reached, strict=True):
-        colour = OPERATION_COLOURS[checkpoint.operation]
-        draw.rounded_rectangle((x, y, x + 28, y + 28), 5, fill=colour if done else None, outline=colour, width=3)
-        if done:
-            draw.line([(x + 7, y + 14), (x + 13, y + 21), (x + 22, y + 8)], fill=BACKGROUND, width=4)
-        else:
-            draw.text((x + 14, y + 14), checkpoint.operation, colour, ImageFont.load_default(size=18), "mm")
-        name = OPERATION_NAMES[checkpoint.operation].lower()
-        draw.text((x + 36, y + 14), name, colour, ImageFont.load_default(size=19), "lm")
-        x += 120
-
-
-def write(pictures: Sequence[Image.Image], path: Path) -> None:
-    """Write an animated WebP that repeats forever."""
-    milliseconds = [round(1000 * STRIDE / CONTROL_HZ / SPEED)] * (len(pictures) - 1) + [round(1000 * LAST_SECONDS)]
-    options = {"append_images": pictures[1:], "duration": milliseconds, "loop": 0, "quality": QUALITY, "method": 6}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with draft_of(path) as draft:
-        pictures[0].save(draft, "WEBP", save_all=True, **options)
+def _together(columns: Sequence[Sequence[Frame]]) -> Iterator[list[Frame]]:
+    for place in range(max(map(len, columns))):
+        yield [frames[min(place, len(frames) - 1)] for frames in columns]
 
 
 def main() -> None:
-    """Evaluate, select a seed, replay and write."""
+    """Make the animation and write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/figures/memory.webp"))
     out = parser.parse_args().out
-    with tempfile.TemporaryDirectory() as work:
-        rollouts = {name: evaluate(name, Path(work) / name.replace(" ", "_")) for name in POLICIES}
-    for name, episodes in rollouts.items():
-        print(name, {seed: (record["success"], record["failure"]) for seed, (record, _) in episodes.items()})
-    seed = first_difference(rollouts)
-    pictures = list(animation({name: replay(seed, *episodes[seed]) for name, episodes in rollouts.items()}))
-    write(pictures, out)
-    print(f"{out}: seed {seed}, {len(pictures)} frames, {out.stat().st_size / 1e6:.2f} MB")
+    pictures, seconds = zip(*animation(), strict=True)
+    options = {"append_images": pictures[1:], "loop": 0, "quality": QUALITY, "method": 6}
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with draft_of(out) as draft:
+        pictures[0].save(draft, "WEBP", save_all=True, duration=[round(1000 * one) for one in seconds], **options)
+    print(f"{out}: seed {SEED}, {len(pictures)} frames, {out.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":
