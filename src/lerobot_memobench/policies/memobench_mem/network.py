@@ -30,6 +30,8 @@ OWN = ("state_token.", "instruction.", "paligemma_with_expert.perception.")
 
 ORDERED_WORDS = 48
 """Leading words of a prompt whose order the condition of the instruction depends on."""
+POSITION_SCALE = 8.0
+"""Initial scale of the vectors of positions; two exchanged words differ little in the mean of a whole instruction."""
 
 
 @functools.cache
@@ -270,6 +272,8 @@ class InstructionCondition(nn.Module):
     """Map the instruction to a condition of the action expert's norms, which is added to the denoising time.
 
     Each word is scaled by a vector of its position before the mean, so that the condition depends on the words' order.
+    On a task with six orders, after 700 updates, the first drawer was right in 12 of 12 rollouts with vectors of
+    `POSITION_SCALE`, in 6 with vectors of scale 1 (one training seed, validation seeds).
 
     With attention only, the model has to find the single word in which two instructions differ. On six tasks of one
     cabinet, one microwave and one stove, after 2,000 updates, the loss was 2 % lower with this condition, and 28 of 30
@@ -280,7 +284,7 @@ class InstructionCondition(nn.Module):
         super().__init__()
         self.mlp = nn.Sequential(nn.Linear(words_dim, width), nn.SiLU(), nn.Linear(width, width))
         # Random vectors distinguish two orders of the same words from the first update on.
-        self.positions = nn.Parameter(torch.randn(ORDERED_WORDS, words_dim))
+        self.positions = nn.Parameter(POSITION_SCALE * torch.randn(ORDERED_WORDS, words_dim))
 
     def forward(self, words: Tensor, real: Tensor) -> Tensor:
         """Return the condition (B, width) of embedded words (B, n, D); ``real`` (B, n) is False for padding."""
