@@ -6,7 +6,6 @@ import fcntl
 import json
 import os
 import random
-import re
 import shutil
 import signal
 import subprocess
@@ -34,7 +33,6 @@ from tests.support.logs import rollout
 
 FIND = "find_the_artichoke_hidden_in_one_of_the_drawers"
 BUTTER = "put_only_the_butter_picked_up_in_the_prompt_video_on_the_plate"
-KEPT = Path(__file__).parents[2] / "results" / "study"
 SMALL = """
 policy: [policy=memobench_mem, size=small, perception=objects]
 training: [steps=4, save_freq=2]
@@ -445,12 +443,3 @@ def test_cells_are_kept_and_restored(no_memory: Cell, frames: Cell, tmp_path: Pa
     text = (tmp_path / "again" / "study.md").read_text()
     assert text == tables(frames.grid, tmp_path, "strict") + "\n"
     assert (tmp_path / "again" / "study.png").stat().st_size > 5_000
-
-
-def test_published_figures_are_those_of_the_kept_cells(tmp_path: Path) -> None:
-    assert main(["--out", str(tmp_path), "--kept", str(KEPT)]) == 0
-    counted = (tmp_path / "study.md").read_text()
-    found = re.findall(r"(\d+\.\d) \((\d+\.\d–\d+\.\d)\)", (KEPT.parent / "study.md").read_text())
-    assert len(found) == 14
-    for solved, interval in found:
-        assert f"**{solved}** | {interval}" in counted
