@@ -16,7 +16,7 @@ import typer
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import SUITES, Task
 from research.command import run
-from research.judge.mutants import Battery, is_equivalent, killer, mutants
+from research.judge.mutants import Battery, is_not_shown, killer, mutants
 
 
 class Row(NamedTuple):
@@ -84,7 +84,7 @@ def judged(
     print(table([row for row in rows if row.task in names]))
     if with_mutants:
         batteries.sort(key=lambda one: one.task.suite, reverse=True)  # strict tasks kill most
-        tried = [mutant for mutant in mutants() if not is_equivalent(mutant)]
+        tried = [mutant for mutant in mutants() if not is_not_shown(mutant)]
         survivors = [mutant.name for mutant in tried if killer(mutant, batteries) is None]
         print(f"\nmutants killed: {len(tried) - len(survivors)} of {len(tried)}", *survivors, sep="\n")
 

@@ -39,21 +39,32 @@ NEGATED: dict[type[ast.cmpop], type[ast.cmpop]] = {
 SHIFTED: dict[type[ast.cmpop], type[ast.cmpop]] = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
 """Bounds that are one off; for whole numbers only."""
 JUDGED = {
-    nodes: ("build", "value", "settled", "reset"),
+    nodes: ("build", "value", "reset"),
     progress: ("step", "settle", "lost"),
     world: (
         *("holds", "touching", "_articulated", "_in", "_on_object", "_on_site"),
         *("_is_or_was_equal", "_is_ajar", "_shift", "_joint_shift"),
     ),
 }
-"""Module -> functions that give verdicts; the detent of strict scenes moves the arm and is tested with the physics."""
+"""Module -> functions that give verdicts. ``settled`` ends a lost episode early and does not change its verdict;
+``tests/tasks/test_nodes.py`` tests it. The detent of strict scenes moves the arm and is tested with the physics."""
 THRESHOLDS = ("ON_DISTANCE", "IN_SLACK", "ON_SITE_BELOW", "ON_SITE_ABOVE", "PLACE_DISTANCE", "LIFTED_HEIGHT")
 BOUNDS = ("open_below", "on_at_least")
 """Bounds of joints other than zero."""
-EQUIVALENT = {
+NOT_SHOWN = {
     "_ExactlyNode.value: 1 -> 2 in self.count = min(": "the count saturates one later and is compared with the number",
+    "nodes: build: 0 -> 1": "the number of an operator without one is not used",
+    "_AtomNode.reset": "every evaluation sets the latch",
+    "_ThenNode.value: 0 -> 1 in self.done, self.held": "only if the next part holds already; no case of the slow test",
+    "Progress.step: self.first_step[k] is None": "verdicts do not hold the first step",
+    "Progress.step: now and self.first_step[k] is None": "verdicts do not hold the first step",
+    "World.touching: False -> True": "a scene without any contact does not occur",
+    "World._on_site: any((x1": "no case puts an object into the second rectangle of a region only",
+    "IN_SLACK × 0.5": "no case puts an object 5 to 10 mm below a drawer's floor; tests/sim/test_world.py does",
+    "ON_SITE_BELOW ×": "contact with the target decides first",
+    "ON_SITE_ABOVE × 2.0": "contact with the target decides first",
 }
-"""Part of a mutant's name -> why no verdict can show it."""
+"""Part of a mutant's name -> why the cases do not kill it."""
 
 
 @dataclass(frozen=True)
@@ -237,9 +248,9 @@ class Battery:
         return None
 
 
-def is_equivalent(mutant: Mutant) -> bool:
-    """Return whether no verdict can show a mutant."""
-    return any(part in mutant.name for part in EQUIVALENT)
+def is_not_shown(mutant: Mutant) -> bool:
+    """Return whether a mutant is a known survivor."""
+    return any(part in mutant.name for part in NOT_SHOWN)
 
 
 def killer(mutant: Mutant, batteries: Sequence[Battery]) -> str | None:
