@@ -481,6 +481,7 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
     """Yield one task's card."""
     from lerobot_memobench.evaluation.tables import OPERATION_NAMES
     from lerobot_memobench.tasks.catalogue import task_number
+    from lerobot_memobench.tasks.gap import gaps
 
     drawn = task.suite == "strict"  # the seed draws the instruction
     title = task.name.replace("_", " ") if drawn else task.language
@@ -496,6 +497,8 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
         ["fixtures", ", ".join(sorted(set(task.fixtures.values()) - {"kitchen_table"})) or "table only"],
         ["admissible goals", str(len(task.random_variants))],
     ]
+    measured = " · ".join("–" if gap is None else str(gap) for gap in gaps(task))
+    rows.append(["[gap](gap.md) of each checkpoint, control steps", measured])
     if task.derived_from:
         rows.append(["scene of", f"[`{task.derived_from}`](tasks_published.md#{slug(task.derived_from)})"])
     for referent, (rate, verdict) in known.items():

@@ -94,7 +94,8 @@ def test_tasks_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         assert main(["tasks", "--dir", str(folder), "--json"]) == 0
         (task,) = json.loads(capsys.readouterr().out)
         assert set(task) == {
-            "name", "memory_type", "family", "language", "objects", "fixtures", "goal", "checkpoints", "state_dim",
+            "name", "memory_type", "family", "language", "objects", "fixtures", "goal", "checkpoints", "gaps",
+            "state_dim",
         }  # fmt: skip
         assert task["name"] == TASK
         assert task["state_dim"] > 30  # of the compiled model

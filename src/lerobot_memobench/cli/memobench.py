@@ -37,6 +37,7 @@ from lerobot_memobench.tasks.catalogue import (
     task_number,
     task_record,
 )
+from lerobot_memobench.tasks.gap import longest_gap
 from lerobot_memobench.tasks.task import PUBLISHED, Task
 
 if TYPE_CHECKING:
@@ -94,18 +95,22 @@ def load_tasks(folder: Path | None, suite: str = PUBLISHED) -> tuple[list[Task],
 
 
 def task_table(found: Sequence[Task]) -> Table:
-    """Return one row per task; ``tasks=`` and ``--tasks`` take the numbers, a user's own tasks have none."""
+    """Return one row per task; ``tasks=`` and ``--tasks`` take the numbers, a user's own tasks have none.
+
+    ``gap``: the longest of the task's checkpoints, control steps.
+    """
     suites = {task.suite for task in found}
     title = count_of(len(found), "task") + (f" of the {suites.pop()} suite" if len(suites) == 1 else "")
     table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
-    for name in ("no.", "task", "memory type", "checkpoints", "demonstration prompt", "instruction"):
-        table.add_column(name, justify="right" if name == "no." else "left")
+    for name in ("no.", "task", "memory type", "checkpoints", "gap", "demonstration prompt", "instruction"):
+        table.add_column(name, justify="right" if name in ("no.", "gap") else "left")
     for k, task in enumerate(found):
         if k and task.memory_type != found[k - 1].memory_type:
             table.add_section()
         prompt = task.prompt.kind if task.prompt else ""
+        gap = str(longest_gap(task) or "")
         number = str(task_number(task.name)) if CATALOGUE_DIR in task.folder.parents else ""
-        table.add_row(number, task.name, task.memory_type, task.operations, prompt, task.title)
+        table.add_row(number, task.name, task.memory_type, task.operations, gap, prompt, task.title)
     return table
 
 

@@ -65,7 +65,7 @@ def report(
         Path | None, typer.Option(help="Write a page for the browser with all videos to this folder.")
     ] = None,
     figures: Annotated[
-        Path | None, typer.Option(help="Draw outcomes and replan intervals as PDF and PNG into this folder.")
+        Path | None, typer.Option(help="Draw outcomes, gaps and replan intervals as PDF and PNG into this folder.")
     ] = None,
     task_dir: Annotated[
         Path | None, typer.Option(help="With --html: folder of your own tasks, for their texts.")

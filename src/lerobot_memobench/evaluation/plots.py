@@ -1,4 +1,4 @@
-"""Figures of a report: outcomes of rollouts as bars, and rates by replan interval.
+"""Figures of a report: outcomes of rollouts as bars, rates by replan interval, and success by gap.
 
 Colours are safe for the colour-blind; hatches, markers and dashes keep them apart in grey. Operations have the colours
 of videos and of the HTML report (Okabe and Ito's palette). The figures of the paper are drawn by
@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
-from lerobot_memobench.evaluation.metrics import METRICS, Rate
+from lerobot_memobench.evaluation.gaps import GROUPS, success_by_gap
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, wilson
 from lerobot_memobench.evaluation.records import Run, sweeps
 from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.io import draft_of
@@ -124,6 +125,8 @@ def draw_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
     files = save(draw_outcomes(bars(runs)), folder, "outcomes")
     if sweeps(runs):
         files += save(draw_replan(runs), folder, "replan")
+    if any(success_by_gap(run.records) for run in runs):
+        files += save(draw_gaps(runs), folder, "gap")
     return files
 
 
@@ -259,3 +262,32 @@ def _draw_curve(place: Any, found: Curve, style: Mapping[str, Any]) -> None:
         low, high = ([100 * interval[k] for interval in intervals] for k in (0, 1))
         place.fill_between(list(found), low, high, color=style["color"], alpha=0.15, lw=0, zorder=1)
     place.plot(list(found), values, **style, lw=1.9 if intervals else 1.1, zorder=3, clip_on=False)
+
+
+# --- success by gap ---
+
+
+def draw_gaps(runs: Sequence[Run]) -> Figure:
+    """Draw the rate of reached checkpoints over their gap, a line per evaluation, with Wilson's intervals."""
+    from matplotlib.lines import Line2D
+
+    found = {run.name: success_by_gap(run.records) for run in runs}
+    groups = [group for group in GROUPS if any(group in each for each in found.values())]
+    styles = {name: line_style(number, published=False) for number, name in enumerate(found)}
+    with paper_style():
+        figure = new_figure(5.0, 2.7)
+        place = figure.subplots()
+        for name, counts in found.items():
+            places = [k for k, group in enumerate(groups) if group in counts]
+            rates = [counts[groups[k]][0] / counts[groups[k]][1] for k in places]
+            intervals = [wilson(rate, counts[groups[k]][1]) for rate, k in zip(rates, places, strict=True)]
+            low, high = ([100 * interval[end] for interval in intervals] for end in (0, 1))
+            place.fill_between(places, low, high, color=styles[name]["color"], alpha=0.15, lw=0, zorder=1)
+            place.plot(places, [100 * rate for rate in rates], **styles[name], lw=1.9, zorder=3, clip_on=False)
+        place.set_xticks(range(len(groups)), groups)
+        place.set_xlabel("gap from cue to use, control steps")
+        place.set_ylabel("checkpoints reached, %")
+        place.set_ylim(0, 102)
+        place.grid(axis="y", color=GRID, lw=0.5)
+        legend_below(figure, {name: Line2D([], [], **styles[name]) for name in found}, 3)
+        return figure

@@ -16,6 +16,7 @@ from typing import Any
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
+from lerobot_memobench.tasks.gap import gaps
 from lerobot_memobench.tasks.metadata import Metadata, read_text
 from lerobot_memobench.tasks.task import (
     BDDL_FILE,
@@ -201,6 +202,7 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
             }
             for checkpoint in task.checkpoints
         ],
+        "gaps": [None if gap is None else gap._asdict() for gap in gaps(task)],
         "state_dim": int(state_dim),
     }
 

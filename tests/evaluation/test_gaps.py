@@ -1,0 +1,61 @@
+"""Gaps: the shipped figures cover the catalogue, and an evaluation is grouped by them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.evaluation.gaps import success_by_gap
+from lerobot_memobench.evaluation.plots import draw_figures
+from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.protocol import IDLE_STEPS
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.gap import gaps, longest_gap
+from tests.support.logs import rollout
+
+COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
+HIDING = "find_the_tomato_hidden_in_one_of_the_drawers"
+
+
+@pytest.mark.parametrize("suite", ["published", "strict"])
+def test_every_checkpoint_of_the_catalogue_was_measured(suite: str) -> None:
+    for task in map(get_task, task_names(suite=suite)):
+        found = gaps(task)
+        assert len(found) == len(task.checkpoints)
+        assert all(gap is None or 0 < gap.least <= gap.median <= gap.most for gap in found)
+        # An instruction needs no memory, a prompt does.
+        assert (found[0] is None) == (task.prompt is None)
+        if suite == "strict":
+            longest = longest_gap(task)
+            assert longest is not None
+            assert longest.median > 30
+            assert longest.idles == (task.prompt is not None)
+
+
+def test_checkpoints_are_grouped_by_gap() -> None:
+    """The third checkpoint counts for those episodes only that came to it."""
+    done = [[True, True, True, True], [True, True, False, False], [True, False, False, False]]
+    records = [rollout(COUNTING, "temporal", "SUUC", marks, all(marks), k) for k, marks in enumerate(done)]
+    found = success_by_gap(records)
+    assert sum(count for _, count in found.values()) == 4 + 3 + 2
+    assert sum(reached for reached, _ in found.values()) == 4 + 2 + 1
+    assert success_by_gap([rollout("my_own_task", "temporal", "S", [True], True, 0)]) == {}
+
+
+def test_idling_of_the_seed_is_part_of_a_gap() -> None:
+    groups = {
+        group
+        for seed in range(20_000, 20_040)
+        for group in success_by_gap([rollout(HIDING, "spatial", "SUC", [False] * 3, False, 0, seed=seed)])
+    }
+    assert len(groups) > 1
+    assert IDLE_STEPS < 2048
+
+
+def test_figure_is_drawn_for_tasks_of_the_catalogue(tmp_path: Path) -> None:
+    records = [rollout(HIDING, "spatial", "SUC", [True, k > 1, k > 2], k > 2, k) for k in range(4)]
+    write_episodes(tmp_path / "log", records)
+    files = draw_figures(read_runs([tmp_path / "log"]), tmp_path)
+    assert {"gap.pdf", "gap.png"} <= {file.name for file in files}
