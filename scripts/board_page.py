@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-import math
+import itertools
 from collections.abc import Iterable, Iterator
-from functools import cache
 from html import escape
 from pathlib import Path
 
-from lerobot_memobench.board.rows import BoardRow, board_json, board_rows, evidence_text, pauses_text, rate_text
+from lerobot_memobench.board.rows import BoardRow, board_rows, evidence_text, pauses_text, rate_text
 from lerobot_memobench.evaluation.metrics import METRICS, Rate
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE
 
@@ -19,55 +18,45 @@ BOARD = Path(__file__).resolve().parents[1] / "results" / "board"
 PLACE = "<!-- board -->"
 """Line of the page that the table replaces."""
 HEAD = (
-    *("rank", "policy", "suite", "assets", "inputs", "parameters", "training data"),
-    *METRICS,
-    *("follows evidence", "change by pauses", "without memory, SR", "episodes of each task", "run by us"),
+    *("policy", "rank", *METRICS, "follows evidence", "change by pauses", "without memory, SR", "suite", "assets"),
+    *("inputs", "parameters", "training data", "episodes of each task", "run by us"),
 )
 WAITING = ("ACT", "Diffusion Policy", "SmolVLA", "π0.5")
 """Policies with a recipe on the page and without a result."""
 
-__all__ = ["PLACE", "board_json", "rows", "table"]
+UNRANKED = 1000
+"""Value by which rows without a rank are sorted."""
 
 Cell = tuple[str, float | str]
 """HTML of a cell, and the value by which it is sorted."""
 
 
-@cache
-def rows() -> tuple[BoardRow, ...]:
-    """Return the rows of the board; they are computed once per build."""
-    return tuple(board_rows(BOARD))
-
-
 def table() -> str:
     """Return the board as an HTML table."""
-    ranks = iter(range(1, len(rows()) + 1))
-    lines = [
-        _line((str(rank), rank) if row.ranked and (rank := next(ranks)) else (NOT_APPLICABLE, math.inf), row)
-        for row in rows()
-    ]
+    ranks = itertools.count(1)
+    lines = [_line(next(ranks) if row.ranked else None, row) for row in board_rows(BOARD)]
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in HEAD)
     body = "\n".join([*lines, *_waiting()])
     whole = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>"
-    data = '<p><a href="../board.json">Data as JSON</a></p>'
-    return f'<div class="board">\n<table id="board">\n{whole}\n</table>\n</div>\n{data}'
+    return f'<div class="board">\n<table id="board">\n{whole}\n</table>\n</div>'
 
 
-def _line(rank: Cell, row: BoardRow) -> str:
+def _line(rank: int | None, row: BoardRow) -> str:
     """Return the HTML of one row; a row that was not rerun is grey."""
     about = row.about
     links = " ".join(f'<a href="{escape(link)}" rel="nofollow noopener">{key}</a>' for key, link in about.links.items())
     policy = f"{escape(about.model)}<br><small>{escape(about.submitter)}, {about.date}{links and f', {links}'}</small>"
     count = about.parameters
     cells: list[Cell] = [
-        rank,
         (policy, about.model.lower()),
-        *((escape(text), text) for text in (row.suite, row.assets, row.inputs)),
-        (NOT_APPLICABLE if count is None else f"{count:,}", -1 if count is None else count),
-        (escape(about.training_data), about.training_data),
+        (NOT_APPLICABLE, UNRANKED) if rank is None else (str(rank), rank),
         *(_rate(row.rates[metric]) for metric in METRICS),
         (evidence_text(row.evidence), (row.evidence.rates["follows"].value or 0) if row.evidence else -1),
         (pauses_text(row.pauses), row.pauses.value if row.pauses else -2),
         _rate(row.without_memory),
+        *((escape(text), text) for text in (row.suite, row.assets, row.inputs)),
+        (NOT_APPLICABLE if count is None else f"{count:,}", -1 if count is None else count),
+        (escape(about.training_data), about.training_data),
         (f"{row.episodes}<br><small>{escape(row.seeds)}</small>", row.episodes),
         ("yes" if row.rerun else "no", int(row.rerun)),
     ]
@@ -82,9 +71,9 @@ def _waiting() -> Iterator[str]:
     """Yield grey rows of policies that wait for a result."""
     for name in WAITING:
         policy = f'{name}<br><small><a href="#recipes">recipe</a></small>'
-        known: list[Cell] = [(NOT_APPLICABLE, math.inf), (policy, name.lower())]
-        known += [(text, text) for text in ("strict", "package", "pixels")]
-        yield _html([*known, *[(NOT_APPLICABLE, -2)] * (len(HEAD) - len(known) - 1), ("not run", -1)], "unverified")
+        known = {"suite": "strict", "assets": "package", "inputs": "pixels", "run by us": "not run"}
+        cells = [(text := known.get(title, NOT_APPLICABLE), text if title in known else -2) for title in HEAD[2:]]
+        yield _html([(policy, name.lower()), (NOT_APPLICABLE, UNRANKED), *cells], "unverified")
 
 
 def _html(cells: Iterable[Cell], kind: str) -> str:

@@ -518,15 +518,6 @@ def slug(name: str) -> str:
     return name.replace(",", "")
 
 
-# --- the board ---
-
-
-@cache
-def board() -> dict[str, Any]:
-    """Return `scripts/board_page.py` as a dictionary of its names."""
-    return runpy.run_path(str(ROOT / "scripts" / "board_page.py"))
-
-
 @cache
 def task_places() -> dict[str, tuple[int, int]]:
     """Return the position of each task's picture in the sheet, name -> (left, top), pixels."""
@@ -602,7 +593,6 @@ def on_files(files: Any, config: Any) -> Any:
         files.append(File.generated(config, path, content=make()))
     for source, path in COPIES.items():
         files.append(File.generated(config, path, content=copy_of(source)))
-    files.append(File.generated(config, "benchmark/board.json", content=board()["board_json"](board()["rows"]())))
     for number in range(1, 31):
         files.append(File.generated(config, f"figures/tasks/{number:02}.png", content=scene(number)))
     return files
@@ -611,7 +601,10 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Adapt the links of a page that leave ``docs``, and fill in the board (called by MkDocs)."""
     found = relink(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
-    return found.replace(board()["PLACE"], board()["table"]()) if page.file.src_uri == BOARD_PAGE else found
+    if page.file.src_uri == BOARD_PAGE:
+        board = runpy.run_path(str(ROOT / "scripts" / "board_page.py"))
+        found = found.replace(board["PLACE"], board["table"]())
+    return found
 
 
 def breakable(page: str) -> str:

@@ -15,8 +15,8 @@ document.addEventListener("DOMContentLoaded", () => {
     button.textContent = head.textContent;
     head.replaceChildren(button);
     button.addEventListener("click", () => {
-      const numeric = !Number.isNaN(Number(value(body.rows[0], column)));
-      const first = numeric && column > 0 ? "descending" : "ascending";
+      const numeric = [...body.rows].some((row) => !Number.isNaN(Number(value(row, column))));
+      const first = numeric && column > 1 ? "descending" : "ascending";
       const other = first === "ascending" ? "descending" : "ascending";
       const order = head.getAttribute("aria-sort") === first ? other : first;
       heads.forEach((each) => each.removeAttribute("aria-sort"));

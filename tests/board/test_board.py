@@ -266,7 +266,7 @@ def test_row_with_controls(evaluated: Path, board: Path, tmp_path: Path) -> None
     assert (row.pauses.value, row.without_memory.value) == (0.0, pytest.approx(0.6))
     assert row.evidence.rates["follows"].value == pytest.approx(2 / 3, abs=0.01)
     page = load_script("board_page")
-    html = page._line(("1", 1), row)
+    html = page._line(None, row)
     assert '<tr class="unverified">' in html
     assert html.count("<td") == len(page.HEAD) == page.table().split("</tr>")[1].count("<td")
     in_card(lambda card: card["policy"].update(sha256="1" * 64))(folder / "pauses")

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from lerobot_memobench.board.check import SEEDS, ranked, read_board
 from lerobot_memobench.board.submission import EVIDENCE, PAUSES, About, Submission
 from lerobot_memobench.envs.episode_log import INPUTS
 from lerobot_memobench.evaluation.comparison import Difference, compare
 from lerobot_memobench.evaluation.evidence import Evidence
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, percent, stand_ins_of
+from lerobot_memobench.evaluation.metrics import Rate, Row, stand_ins_of
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure
 from lerobot_memobench.io import checked, parsed
 from lerobot_memobench.protocol import PAPER
@@ -38,8 +36,6 @@ class BoardRow:
         seeds: split, with the number of the run of a sealed one.
         episodes: of each task.
         rates: average of SR, MSR, MUR and MCR.
-        types: the same by memory type.
-        tasks: the same by task.
         evidence: average of the evidence control.
         pauses: change of SR by the pauses.
         without_memory: SR of the partner without a memory.
@@ -55,8 +51,6 @@ class BoardRow:
     seeds: str
     episodes: int
     rates: Row
-    types: dict[str, Row]
-    tasks: dict[str, Row]
     evidence: Evidence | None
     pauses: Difference | None
     without_memory: Rate | None
@@ -78,7 +72,9 @@ def board_row(
     evaluation, controls = submission.evaluation, submission.controls
     protocol, run = evaluation.protocol, evaluation.run
     evidence = controls[EVIDENCE].run.evidence if EVIDENCE in controls else None
-    changes: Iterable[Difference] = compare(run, controls[PAUSES].run).differences if PAUSES in controls else ()
+    changes: tuple[Difference, ...] = ()
+    if PAUSES in controls:
+        changes = compare(run, controls[PAUSES].run, permutations=100).differences
     partner = next((each for each in others if each.name == submission.about.without_memory), None)
     split = SEEDS[protocol["seed_base"]]
     return BoardRow(
@@ -92,8 +88,6 @@ def board_row(
         seeds=split if split == PAPER else f"{split}, run {evaluation.card['sealed']['run']}",
         episodes=protocol["episodes"],
         rates=run.summary.average,
-        types=run.summary.memory_types,
-        tasks=run.summary.tasks,
         evidence=evidence.average if evidence else None,
         pauses=next((each for each in changes if each.kind == "average" and each.metric == "SR"), None),
         without_memory=None if partner is None else partner.evaluation.run.summary.average["SR"],
@@ -129,26 +123,3 @@ def pauses_text(found: Difference | None) -> str:
         return NOT_APPLICABLE
     low, high = found.interval
     return f"{figure(found.value, sign=True)} [{figure(low)} to {figure(high)}]"
-
-
-def board_json(rows: Iterable[BoardRow]) -> str:
-    """Return the rows as JSON: per cent, null where not applicable."""
-    return json.dumps([_data(row) for row in rows], indent=1) + "\n"
-
-
-def _data(row: BoardRow) -> dict[str, Any]:
-    evidence, pauses, without = row.evidence, row.pauses, row.without_memory
-    return {
-        "name": row.name,
-        **row.about.model_dump(),
-        **{key: getattr(row, key) for key in ("ranked", "rerun", "suite", "assets", "inputs", "seeds", "episodes")},
-        **{metric: percent(row.rates[metric].value) for metric in METRICS},
-        "intervals": {
-            metric: None if (interval := row.rates[metric].interval) is None else [percent(end) for end in interval]
-            for metric in METRICS
-        },
-        "follows_evidence": None if evidence is None else percent(evidence.rates["follows"].value),
-        "chance": None if evidence is None else percent(evidence.chance),
-        "pauses": None if pauses is None else percent(pauses.value),
-        "without_memory_SR": None if without is None else percent(without.value),
-    }
