@@ -30,6 +30,8 @@ SHEET = DOCS / "figures" / "tasks.png"
 """Initial scenes of all published tasks, from `scripts/gallery.py`."""
 SHEET_SIDE = 256
 
+BOARD_PAGE = "benchmark/board.md"
+
 COPIES = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "develop/contributing.md",
@@ -600,8 +602,12 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Adapt the links of a page that leave ``docs`` (called by MkDocs)."""
-    return relink(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
+    """Adapt the links of a page that leave ``docs``, and fill in the board (called by MkDocs)."""
+    found = relink(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
+    if page.file.src_uri == BOARD_PAGE:
+        board = runpy.run_path(str(ROOT / "scripts" / "board_page.py"))
+        found = found.replace(board["PLACE"], board["table"]())
+    return found
 
 
 def breakable(page: str) -> str:

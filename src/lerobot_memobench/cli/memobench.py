@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lerobot_memobench.cli import data
+from lerobot_memobench.cli.board import export, submit
 from lerobot_memobench.cli.console import Suite, WhichSuite, console, note, run_app, say
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.report import compare, merge, report, rerun
@@ -240,7 +241,7 @@ COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
     "Look around": (tasks, objects, doctor),
     "Demonstrations": (generate, data.convert, cache, data.view, data.validate, data.describe, data.push),
     "Train": (recipe, conformance),
-    "Results": (test_sealed, report, compare, merge, rerun),
+    "Results": (test_sealed, report, compare, merge, rerun, submit, export),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 

@@ -1,0 +1,33 @@
+"""Check the board: ``python -m lerobot_memobench.board BOARD [CHANGED]``.
+
+CHANGED is a file with the paths that a pull request changes, separated by NUL (``git diff -z --name-only``). The exit
+status is 1 where a submission is refused.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from lerobot_memobench.board.check import check_paths, read_board
+from lerobot_memobench.errors import MemobenchError
+
+
+def main(words: list[str]) -> int:
+    """Check the board; print the names of its rows, or the reason of a refusal."""
+    if not 1 <= len(words) <= 2:
+        print(__doc__, file=sys.stderr)
+        return 2
+    try:
+        if words[1:]:
+            check_paths(filter(None, Path(words[1]).read_text().split("\0")))
+        rows = read_board(Path(words[0]))
+    except MemobenchError as error:
+        print(f"refused: {error}", file=sys.stderr)
+        return 1
+    print(f"accepted: {', '.join(row.name for row in rows)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

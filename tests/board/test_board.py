@@ -1,0 +1,367 @@
+"""The board: a valid submission is accepted, doctored ones are refused, exports are readable by other tools."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_memobench.board.__main__ import main as check_board
+from lerobot_memobench.board.check import check_paths, check_submission, read_board
+from lerobot_memobench.board.exports import huggingface_yaml, vla_eval_json
+from lerobot_memobench.board.rows import board_row, board_rows
+from lerobot_memobench.board.submission import CARD, LOG, About, read_submission, write_submission
+from lerobot_memobench.board.text import PROMISES
+from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.datasets.generation import task_hash
+from lerobot_memobench.envs.episode import referent_of
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.run.card import new_card, with_episodes, write_card
+from lerobot_memobench.run.sealed import scenes_hash
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.evidence import chance, scene_and_variant
+from tests.support.scripts import load_script
+
+ROOT = Path(__file__).parents[2]
+TASKS = task_names(suite="strict")
+ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
+VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
+Json = dict[str, Any]
+
+
+# --- a valid evaluation and its submission ---
+
+
+def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Json:
+    """A rollout of a strict task: every third one fails at its first checkpoint."""
+    published = get_task(name)
+    scene, seed = episode, first + episode
+    task = referent_of(published, seed)
+    if settings.get("evidence"):
+        scene, variant = scene_and_variant(published, episode)
+        seed, task = first + scene, published.variant(variant)
+    success = episode % 3 > 0
+    marks = [speed * (k + 1) + scene if success or k else None for k in range(len(task.checkpoints))]
+    choice = {"choice": task.variant_index if success else None, "answered": success}
+    choice |= {"variants": len(published.random_variants), "chance": chance(published)}
+    return {
+        **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed, "referent": "drawn"},
+        **{"variant": task.variant_index, "replan_steps": 5, "prompt_steps": 100, "prompt_shown": None},
+        **{"steps": 900 + scene, "success": success},
+        **(choice if settings.get("evidence") else {}),
+        "checkpoints": [
+            {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
+            for c, step in zip(task.checkpoints, marks, strict=True)
+        ],
+        **{"failure": None if success else "storage_failure", "suite": "strict", "lost": False},
+        **{"scene_hash": f"{name[:20]}-{seed}", "wall_s": 2.0, "policy": "act 0123", "run": "r", "inputs": "pixels"},
+    }
+
+
+def evaluation(folder: Path, first: int = 7, speed: int = 50, **settings: Any) -> Path:
+    """Write the folder of an evaluation of the strict suite: 10 episodes of each task, of those with variants 12."""
+    names = [name for name in TASKS if not settings.get("evidence") or get_task(name).num_variants > 1]
+    count = 12 if settings.get("evidence") else 10
+    records = [line(name, episode, first, speed, **settings) for name in names for episode in range(count)]
+    block = EnvSettings(suite="strict", seed_base=first, replan_steps=5, **settings).protocol_block
+    card = new_card(
+        protocol={"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
+        policy={"type": "act", "seed": first, "settings": {}, "sha256": "0" * 64},
+        checkpoint={"path": "user/one", "revision": "abc", "files": {}},
+        trained_on={"repo_id": "user/data", "revision": "def"},
+        task_files={name: task_hash(get_task(name)) for name in names},
+        settings={},
+        runs=[{"command": ["lerobot"], "batch_size": 1, "versions": VERSIONS, "git_commit": None, "machine": {}}],
+    )
+    folder.mkdir(parents=True)
+    write_episodes(folder, records)
+    write_card(folder, with_episodes(card, records))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return evaluation(tmp_path_factory.mktemp("evaluated") / "one")
+
+
+@pytest.fixture(scope="module")
+def board(evaluated: Path) -> Path:
+    """A board with one valid row; do not change it."""
+    write_submission(evaluated.parent / "board" / "one", About(**ABOUT), {"": evaluated})
+    return evaluated.parent / "board"
+
+
+def test_valid_submission_is_accepted(board: Path) -> None:
+    (row,) = board_rows(board)
+    assert (row.ranked, row.rerun, row.episodes, row.suite, row.inputs) == (False, False, 10, "strict", "pixels")
+    assert row.rates["SR"].value == pytest.approx(0.6)
+
+
+def test_board_of_the_repository_is_valid() -> None:
+    rows = board_rows(ROOT / "results" / "board")
+    assert {row.name: row.rerun for row in rows} == dict.fromkeys((row.name for row in rows), True)
+    assert {row.name: f"{row.rates['SR'].value:.4f}" for row in rows}["memobench_small"] == "0.9775"
+
+
+# --- doctored submissions ---
+
+
+def first_failure(records: list[Json]) -> Json:
+    return next(record for record in records if not record["success"])
+
+
+def in_log(change: Callable[[list[Json]], object], *, card: bool = False) -> Callable[[Path], None]:
+    """A change of the log, and of the card's episodes with ``card``."""
+
+    def apply(folder: Path) -> None:
+        lines = [json.loads(each) for each in gzip.decompress((folder / LOG).read_bytes()).splitlines()]
+        change(lines)
+        (folder / LOG).write_bytes(gzip.compress("".join(json.dumps(each) + "\n" for each in lines).encode()))
+        if card:
+            in_card(lambda content: change(content["episodes"]))(folder)
+
+    return apply
+
+
+def in_card(change: Callable[[Json], object]) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        content = json.loads((folder / CARD).read_text())
+        change(content)
+        (folder / CARD).write_text(json.dumps(content))
+
+    return apply
+
+
+def stating(key: str, value: Any) -> Callable[[Path], None]:
+    """A statement of the submitter."""
+    return in_card(lambda content: content["submission"].__setitem__(key, value))
+
+
+def to_success(records: list[Json]) -> None:
+    first_failure(records).update(success=True, failure=None)
+
+
+def linked(folder: Path) -> None:
+    (folder / LOG).unlink()
+    (folder / LOG).symlink_to("/etc/passwd")
+
+
+def traversing(folder: Path) -> None:
+    (folder / "evidence").symlink_to("../../elsewhere")
+
+
+def sealed(folder: Path) -> None:
+    """Move all seeds to the sealed ones, with the variants that they draw, without a commitment."""
+
+    def move(records: list[Json]) -> None:
+        for record in records:
+            record["seed"] = 100_007 + record["episode"]
+            record["variant"] = referent_of(get_task(record["task"]), record["seed"]).variant_index
+
+    in_log(move, card=True)(folder)
+    in_card(lambda card: (card["protocol"].update(seed_base=100_007), card["policy"].update(seed=100_007)))(folder)
+
+
+def other_variant(records: list[Json]) -> None:
+    record = next(each for each in records if each["task"].startswith("find_the_artichoke_hidden"))
+    record["variant"] = 1 + record["variant"] % 3
+
+
+DOCTORED: dict[str, tuple[Callable[[Path], object], str]] = {
+    "edited log": (in_log(to_success), "card and log disagree"),
+    "success with a failure class": (in_log(lambda log: first_failure(log).update(success=True), card=True), "failure"),
+    "checkpoint after the end": (in_log(lambda log: log[1].update(steps=10), card=True), "checkpoints within them"),
+    "other seeds": (in_card(lambda card: card["protocol"].update(seed_base=20_000)), "seeds that count"),
+    "shifted seed": (in_log(lambda log: log[3].update(seed=99), card=True), "has the seed 99"),
+    "other variant": (in_log(other_variant, card=True), "drew the variants"),
+    "other setting": (in_card(lambda card: card["protocol"].update(horizon=600)), "horizon: 600"),
+    "missing episode": (in_log(lambda log: log.pop(5), card=True), "episode 5, is missing"),
+    "wrong count": (in_card(lambda card: card["protocol"].update(episodes=50)), "is missing in the log"),
+    "repeated line": (in_log(lambda log: log.append(log[0])), "a second line"),
+    "script in a name": (stating("model", "One<script>alert(1)</script>"), "model = "),
+    "markup in a name": (stating("submitter", "[me](javascript:1)"), "submitter = "),
+    "link to a script": (stating("links", {"code": "javascript:alert(1)"}), "begins with https"),
+    "unknown statement": (stating("html", "x"), "html"),
+    "unknown file": (lambda folder: (folder / "run.py").write_text("print()"), "holds 'run.py'"),
+    "missing log": (lambda folder: (folder / LOG).unlink(), f"lacks {LOG}"),
+    "link to a file": (linked, "is a link"),
+    "link to a folder": (traversing, "is a link"),
+    "large card": (lambda folder: (folder / CARD).write_bytes(b" " * (3 << 20)), "expected at most 2.0 MiB"),
+    "large log": (lambda folder: (folder / LOG).write_bytes(gzip.compress(b" " * (9 << 20))), "larger than 8.0 MiB"),
+    "no log": (lambda folder: (folder / LOG).write_bytes(b"text"), "no whole gzip file"),
+    "other task files": (in_card(lambda card: card["task_files"].update({TASKS[0]: "f" * 16})), "the files of"),
+    "mixed versions": (
+        in_card(lambda card: card["runs"].append({**card["runs"][0], "versions": {**VERSIONS, "mujoco": "4.0.0"}})),
+        "its parts ran under mujoco",
+    ),
+    "mixed world": (in_log(lambda log: log[0].update(world="libero"), card=True), "world=libero"),
+    "mixed policy": (in_log(lambda log: log[9].update(policy="act 4567")), "of the policy 'act 4567'"),
+    "hidden inputs": (in_log(lambda log: log[9].update(inputs="privileged object state")), "inputs=privileged"),
+    "sealed without commitment": (sealed, "commitment of the sealed test"),
+}
+
+
+@pytest.mark.parametrize("name", DOCTORED)
+def test_doctored_submission_is_refused(board: Path, tmp_path: Path, name: str) -> None:
+    change, reason = DOCTORED[name]
+    folder = shutil.copytree(board / "one", tmp_path / "one")
+    change(folder)
+    with pytest.raises(MemobenchError) as refused:
+        check_submission(read_submission(folder))
+    assert reason in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_committed_sealed_result_is_accepted(board: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(board / "one", tmp_path / "one")
+    sealed(folder)
+    commitment = {"policy": "0" * 64, "release": "0.2.0", "run": 2, "earlier": []}
+    in_card(lambda card: card.update(sealed={**commitment, "scenes": scenes_hash(card)}))(folder)
+    check_submission(found := read_submission(folder))
+    assert board_row(found).seeds == "sealed, run 2"
+
+
+@pytest.mark.parametrize("change", [None, in_log(to_success, card=True)], ids=["copied", "copied and edited"])
+def test_copied_card_is_refused(board: Path, tmp_path: Path, change: Callable[[Path], None] | None) -> None:
+    both = shutil.copytree(board, tmp_path / "board")
+    copy = shutil.copytree(both / "one", both / "two")
+    if change:
+        change(copy)
+    with pytest.raises(MemobenchError, match="has the episodes of the row 'one'"):
+        read_board(both)
+
+
+@pytest.mark.parametrize("name", ["One", "a b", "..", "<b>", "a" * 65])
+def test_unsafe_names_of_rows_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(MemobenchError, match="found the folder"):
+        read_submission(tmp_path / name)
+
+
+# --- controls, the page ---
+
+
+def test_row_with_controls(evaluated: Path, board: Path, tmp_path: Path) -> None:
+    """The policy is as good with pauses, and partners are shown by their SR."""
+    controls = {
+        "evidence": evaluation(tmp_path / "e", evidence=True),
+        "pauses": evaluation(tmp_path / "p", pause_steps=100),
+    }
+    about = About(**ABOUT | {"without_memory": "one", "links": {"code": "https://one.example/code"}})
+    folder = write_submission(tmp_path / "board" / "two", about, {"": evaluation(tmp_path / "m", speed=60), **controls})
+    others = read_board(board)
+    check_submission(found := read_submission(folder), others)
+    row = board_row(found, others)
+    assert row.pauses is not None
+    assert row.evidence is not None
+    assert row.without_memory is not None
+    assert (row.pauses.value, row.without_memory.value) == (0.0, pytest.approx(0.6))
+    assert row.evidence.rates["follows"].value == pytest.approx(2 / 3, abs=0.01)
+    page = load_script("board_page")
+    html = page._line(None, row)
+    assert '<tr class="unverified">' in html
+    assert html.count("<td") == len(page.HEAD) == page.table().split("</tr>")[1].count("<td")
+    in_card(lambda card: card["policy"].update(sha256="1" * 64))(folder / "pauses")
+    with pytest.raises(MemobenchError, match="is of another policy"):
+        check_submission(read_submission(folder))
+
+
+# --- commands ---
+
+
+def test_submission_of_a_new_user_is_accepted(
+    evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["submit", str(evaluated), "--name", "mine", "--model", "Mine", "--submitter", "@me"]
+    words += ["--training-data", "1,500 demonstrations", "--parameters", "450000000", "--out", "out"]
+    assert main([*words[:5], "<b>", *words[6:]]) == 2
+    assert not Path("out/mine").exists()
+    assert main(words) == 0
+    text = Path("out/mine.md").read_text()
+    assert "| SR | 60.0 [" in text
+    assert all(f"- [ ] {promise}" in text for promise in PROMISES)
+    shutil.copytree("out/mine", "results/board/mine")
+    changed = Path("changed")
+    changed.write_text(f"results/board/mine/{CARD}\0results/board/mine/{LOG}\0")
+    assert check_board(["results/board", "changed"]) == 0
+    changed.write_text(f"{changed.read_text()}src/lerobot_memobench/board/check.py\0")
+    assert check_board(["results/board", "changed"]) == 1
+    assert "also changes 'src/" in capsys.readouterr().err
+    assert main([*words[:3], "other", *words[4:]]) == 2  # a copy of the row that is there now
+    assert "has the episodes of the row 'mine'" in capsys.readouterr().err
+
+
+def test_other_pull_requests_may_change_any_file() -> None:
+    check_paths(["src/x.py", "results/board/reruns.json"])
+
+
+def test_page_template_and_form_ask_for_the_same() -> None:
+    template = (ROOT / ".github/PULL_REQUEST_TEMPLATE/submission.md").read_text()
+    form = (ROOT / ".github/ISSUE_TEMPLATE/results.yml").read_text()
+    page = (ROOT / "docs/benchmark/board.md").read_text()
+    assert all(promise in text for promise in PROMISES for text in (template, form))
+    assert all(name in text for name in (CARD, LOG, "evidence", "pauses") for text in (template, form, page))
+
+
+# --- exports ---
+
+
+def test_export_for_lerobot(board: Path, tmp_path: Path) -> None:
+    """The keys of LeRobot's evaluation, and those that its comparison reads."""
+    assert main(["export", str(board / "one"), "--as", "lerobot", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "eval_info.json").read_text())
+    successes = {f"{each['task_group']}/{each['task_id']}": each["metrics"]["successes"] for each in found["per_task"]}
+    assert len(successes) == 30
+    assert all(flags == [episode % 3 > 0 for episode in range(10)] for flags in successes.values())
+    assert found["overall"]["n_success"] == sum(group["n_success"] for group in found["per_group"].values()) == 180
+    assert found["per_task"][0]["pc_success_ci95"] == pytest.approx([31.27, 83.18], abs=0.01)
+    assert {"avg_sum_reward", "avg_max_reward", "pc_success", "n_episodes", "eval_s", "eval_ep_s"} <= {
+        *found["overall"]
+    }
+    assert found["provenance"] == {
+        **{"policy_revision": "abc", "dataset_revision": "def", "seed": 7, "episodes_per_task": 10},
+        **{"sim_version": "3.9.0", "tool": {"name": "lerobot_policy_memobench", "version": "0.2.0"}},
+    }
+    compare = pytest.importorskip("lerobot.scripts.lerobot_eval_compare", reason="LeRobot's comparison is in review")
+    assert compare.load_task_successes(tmp_path / "eval_info.json") == successes
+
+
+def test_export_for_hugging_face(board: Path) -> None:
+    import yaml
+    from huggingface_hub import parse_eval_result_entries
+
+    (run,) = read_runs([board / "one"])
+    entries = parse_eval_result_entries(yaml.safe_load(huggingface_yaml(run, "user/memobench")))
+    assert [entry.task_id for entry in entries] == ["strict_sr", "strict_msr", "strict_mur", "strict_mcr"]
+    assert (entries[0].dataset_id, entries[0].value) == ("user/memobench", 60.0)
+    assert "inputs: pixels" in str(entries[0].notes)
+
+
+VLA_EVAL_FIELDS: dict[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(("model", "display_name", "benchmark", "curated_by", "notes", "date_added", "weight_type"), str),
+    **dict.fromkeys(("reported_paper", "params"), (str, type(None))),
+    **{"overall_score": (float, type(None)), "suite_scores": dict, "task_scores": dict},
+}
+"""Our statement of the fields of an entry; the schema itself is read where ``VLA_EVAL_SCHEMA`` names it."""
+
+
+def test_export_for_vla_evaluation_harness(board: Path) -> None:
+    (run,) = read_runs([board / "one"])
+    found = json.loads(vla_eval_json(run))
+    (entry,) = found["results"]
+    assert {key: isinstance(entry[key], kind) for key, kind in VLA_EVAL_FIELDS.items()} == dict.fromkeys(entry, True)
+    assert (entry["benchmark"], entry["curated_by"], entry["overall_score"]) == ("memobench_strict", "@one", None)
+    assert sum(entry["suite_scores"].values()) / 4 == pytest.approx(60.0)
+    if schema := os.environ.get("VLA_EVAL_SCHEMA"):
+        import jsonschema
+
+        jsonschema.Draft7Validator(json.loads(Path(schema).read_text())).validate(found)
