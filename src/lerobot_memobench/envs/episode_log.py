@@ -121,8 +121,10 @@ class Outcome(TypedDict, total=False):
         prompt_steps: control steps before the execution: demonstration prompt and idling.
         steps: execution steps.
         paused_steps: control steps of pauses; only with pauses.
-        corrupt: delete, swap or noise of the policy's memory; absent without. corrupt_step, reshow, interference: of
-            `EnvSettings`; absent for their defaults.
+        corrupt: delete, swap or noise of the policy's memory; absent without.
+        corrupt_step: execution step of the corruption; absent for 0, the end of the prompt.
+        reshow: whether the prompt played a second time; absent without.
+        interference: number of episodes of other tasks before the execution; absent without.
         corrupted: whether the memory was corrupted before the episode ended.
         choice: evidence episodes: variant that the policy acted on; None for no variant.
         answered: evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant.
