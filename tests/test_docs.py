@@ -159,6 +159,16 @@ def test_site_is_built_strictly(tmp_path: Path) -> None:
     assert "The memory study" in (tmp_path / "results/study/index.html").read_text()
 
 
+TEST = re.compile(r"`((?:tests|research)/[\w/]+\.py)::(\w+)`")
+
+
+def test_tests_that_pages_name_exist() -> None:
+    found = [each for page in PAGES for each in TEST.findall(page.read_text(encoding="utf-8"))]
+    missing = [f"{file}::{test}" for file, test in found if f"\ndef {test}(" not in (ROOT / file).read_text()]
+    assert found
+    assert missing == []
+
+
 # --- figures ---
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig, check_loop
 from lerobot_memobench.envs.episode_log import Acting
 from lerobot_memobench.envs.evaluation_file import check_protocol
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
@@ -129,6 +129,7 @@ class MEMOBench(StepBenchmark):
         self._settings = EnvSettings().changed(
             **settings, seed_base=seed, replan_steps=n_action_steps, prompt_in=prompt_in
         )
+        check_loop(self._settings)
         chosen = str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks))
         selected = MemobenchEnvConfig(tasks=chosen, **asdict(self._settings)).selected()
         self._tasks = {folder.name: (memory_type, folder) for memory_type, _, folder in selected}

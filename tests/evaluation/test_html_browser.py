@@ -331,6 +331,17 @@ def test_long_lists_are_filled_on_demand(browser: Any, tmp_path: Path) -> None:
     assert 0 < box["top"] < 900
 
 
+def test_side_by_side_opens_on_a_pair_that_ends_differently(browser: Any, tmp_path: Path) -> None:
+    failed = {"failure": "storage_failure", "steps": 25}
+    for name, last in (("mine", {}), ("other", failed)):
+        ends = ({}, {}, last)
+        write_episodes(tmp_path / name, [rollout(STOVE, k, [("S", 10, 10)], **end) for k, end in enumerate(ends)])
+    write_html([tmp_path / "mine", tmp_path / "other"], tmp_path / "page")
+    for chosen, episode in (("", 2), (f"&ep={STOVE}.1", 1)):
+        show(browser, tmp_path / "page" / "index.html", f"view=compare{chosen}")
+        browser.wait(f"document.querySelector('.row[aria-current]').dataset.id === '{STOVE}.{episode}'")
+
+
 def test_one_control_moves_both_videos(browser: Any, report: Path) -> None:
     """The shorter rollout stays on its last frame."""
     show(browser, report, PAIR)

@@ -180,9 +180,16 @@ def test_csv(sweep: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str
     text = csv_text([["=cmd()", -3.5, None], ["@SUM(1)", "a, b", "-"]], ["name", "figure", "rest"])
     assert list(csv.reader(io.StringIO(text)))[1:] == [["'=cmd()", "-3.5", ""], ["'@SUM(1)", "a, b", "'-"]]
     found = build(sweep)
-    rows = list(csv.DictReader(io.StringIO(csv_tables(found)["tasks"])))
-    (row,) = [row for row in rows if (row["evaluation"], row["task"]) == ("mine_&_co k=20", "one")]
-    assert [row[key] for key in ("n", "SR", "SR low", "SR high", "MCR")] == ["4", "75.0", "30.1", "95.4", ""]
+    rows = list(csv.DictReader(io.StringIO(csv_tables(found)["joined"])))
+    (row,) = [row for row in rows if row["task"] == "one"]
+    name = "mine_&_co k=20"
+    assert [row[f"SR {name}{end}"] for end in ("", " low", " high")] == ["75.0", "30.1", "95.4"]
+    assert row[f"MCR {name}"] == ""
+    assert [row["task"] for row in rows] == ["one", "temporal", "two_of_them", "spatial", "average of memory types"]
+    (alone,) = [
+        row for row in csv.DictReader(io.StringIO(csv_tables(build(sweep[:1]))["tasks"])) if row["task"] == "one"
+    ]
+    assert alone["n"] == "4"
     words = [f"mine={run.folder}" for run in sweep]
     formats = [word for name in ("csv", "json", "latex", "markdown", "table") for word in ("--format", name)]
     assert main(["report", *words, *formats, "--out", str(tmp_path / "out")]) == 0

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs import episode
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, read_episodes
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
@@ -38,6 +38,7 @@ from lerobot_memobench.run.rollout import (
     roll,
 )
 from lerobot_memobench.sim.object_layout import SIZE
+from lerobot_memobench.tasks.catalogue import task_folder
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -141,6 +142,49 @@ CASES: dict[str, tuple[str, dict[str, Any], list[int]]] = {
 
 def logged(folder: Path) -> list[dict[str, Any]]:
     return [{key: value for key, value in line.items() if key != "wall_s"} for line in read_episodes(folder)]
+
+
+class Watched:
+    """A policy that needs no observation, and notes which it got and when its memory was corrupted."""
+
+    def __init__(self) -> None:
+        self.acted, self.processed, self.corruptions = 0, [], []
+
+    def reset(self) -> None:
+        pass
+
+    def needs_observation(self) -> bool:
+        return False
+
+    def has_planned_action(self) -> bool:
+        return True
+
+    def process(self, inputs: dict[str, Any]) -> dict[str, Any]:
+        self.processed.append(self.acted)
+        return inputs
+
+    def select_action(self, inputs: dict[str, Any]) -> torch.Tensor:
+        self.acted += 1
+        return torch.zeros(2, 7)
+
+    def corrupt_memory(self, how: str, rows: list[int]) -> None:
+        self.corruptions.append((how, rows, self.acted))
+
+
+@pytest.mark.parametrize(
+    ("settings", "at"),
+    [({}, PROMPT), ({"reshow": True}, PROMPT), ({"corrupt_step": 3}, PROMPT + 3)],
+)
+def test_memory_is_corrupted_before_the_frame_is_observed(settings: dict[str, Any], at: int, tmp_path: Path) -> None:
+    asked = {"corrupt": "swap", "tasks": HIGHLIGHT, "horizon": HORIZON, "render": "fast", "obs_type": OBJECTS}
+    config = MemobenchEnvConfig(**asked, **settings)
+    env = config.opener(None, UNKNOWN_POLICY, tmp_path)(task_folder(HIGHLIGHT), 2, False)
+    policy = Watched()
+    roll(env, Actor(policy, [policy.process], (lambda action: action, dict)), [7, 8], corrupt="swap")
+    env.close()
+    assert policy.corruptions == [("swap", [0, 1], at)]
+    assert at in policy.processed
+    assert [line["corrupted"] for line in read_episodes(tmp_path)] == [True, True]
 
 
 @pytest.mark.parametrize("case", [*CASES, "act"])

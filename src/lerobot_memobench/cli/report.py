@@ -128,7 +128,7 @@ def compare(
 ) -> None:
     """Compare two evaluations of the same episodes, pair by pair. McNemar for success, sign-flip for the rates.
 
-    Evaluations that differ in pauses, speed, oracle memory or shuffled subgoals are reported as that control.
+    Evaluations that differ in the setting of a control (pauses, corrupted memory, interference, …) are reported as it.
     """
     from lerobot_memobench.evaluation.comparison import compare as compared
     from lerobot_memobench.evaluation.comparison import comparison_csv, comparison_report

@@ -32,7 +32,7 @@ from lerobot_memobench.envs.observations import (
     prompt_in,
 )
 from lerobot_memobench.envs.pacing import longest
-from lerobot_memobench.envs.settings import AUTO, PIXELS, STEPS, EnvSettings
+from lerobot_memobench.envs.settings import AUTO, INTACT, PIXELS, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
 
@@ -101,10 +101,12 @@ class MemobenchEnvConfig(_WithSettings):
         return asdict(self.settings)
 
     def selected(self) -> list[tuple[str, int, Path]]:
-        """Return memory type, task id and folder of each chosen task; with `evidence`, of tasks with variants.
+        """Return memory type, task id and folder of each chosen task that the controls apply to.
+
+        `evidence` needs variants; corruption at step 0, `reshow` and `interference` need a prompt.
 
         Raises:
-            MemobenchError: a task is unknown or of another suite, or no chosen task has variants for `evidence`.
+            MemobenchError: a task is unknown or of another suite, or a control applies to no chosen task.
         """
         from lerobot_memobench.tasks.catalogue import find_tasks, load_task, resolve_tasks, task_folder, task_index
 
@@ -121,6 +123,13 @@ class MemobenchEnvConfig(_WithSettings):
         else:
             folders = [task_folder(name) for name in resolve_tasks(self.tasks, self.suite)]
             tasks = [(folder.parent.name, task_index(folder.name), folder) for folder in folders]
+        if self.settings.needs_prompt:
+            tasks = [task for task in tasks if load_task(task[2]).prompt is not None]
+            if not tasks:
+                raise MemobenchError(
+                    "corrupt= (at step 0), reshow= and interference= act on the demonstration prompt, and no chosen "
+                    "task has one; choose object or procedural tasks, or set corrupt_step="
+                )
         if not self.evidence:
             return tasks
         found = [task for task in tasks if load_task(task[2]).num_variants > 1]
@@ -137,6 +146,7 @@ class MemobenchEnvConfig(_WithSettings):
         LeRobot's own commands call this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
         """
         chosen = self.selected()  # raises before a folder is created
+        check_loop(self.settings)
         opened = self.opener(None, UNKNOWN_POLICY, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
@@ -190,6 +200,19 @@ class MemobenchEnvConfig(_WithSettings):
         if self.resume or not has_log(folder):
             return folder
         return next(place for k in count(2) if not (place := folder / f"evaluation-{k}").exists())
+
+
+def check_loop(settings: EnvSettings) -> None:
+    """Refuse corruption in the loops of other tools, which do not pass it on to the policy.
+
+    Raises:
+        MemobenchError: the settings ask for it.
+    """
+    if settings.corrupt != INTACT:
+        raise MemobenchError(
+            f"found corrupt={settings.corrupt} in a loop that cannot change a policy's memory; use `lerobot eval "
+            "env=memobench`, or leave it out"
+        )
 
 
 def _vector(

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
-from lerobot_memobench.envs.settings import DEFAULTS, EnvSettings, steps_per_action
+from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.experts.expert import Expert
@@ -61,8 +61,8 @@ class Episode:
     Args:
         task: the task of the catalogue.
         settings: settings of the environment. An episode uses ``referent``, ``demonstration_prompt``, ``horizon``,
-            ``protocol``, ``render``, ``pause_steps``, ``speed`` and ``replan_steps``. Without the demonstration prompt,
-            objects that it hides are hidden before the first frame.
+            ``protocol``, ``render``, ``pause_steps``, ``speed``, ``replan_steps``, ``corrupt_step``, ``reshow`` and
+            ``interference``. Without the demonstration prompt, objects that it hides are hidden before the first frame.
         render: size and quality of frames; None for those of ``settings``.
         changes: settings by name that replace those of ``settings``.
 
@@ -74,6 +74,9 @@ class Episode:
         applied_action: action (7,) float32 executed in the last step.
         rested: whether the last step was part of a pause: the scene was at rest and only the clock advanced.
         fault: reason of an aborted execution, or None.
+        waits: whether other episodes are shown between prompt and execution.
+        corrupts: whether the policy's memory is corrupted before the policy observes this frame. corrupted: whether it
+            has been.
         choice: the variant that the policy acts on; None outside evidence episodes.
     """
 
@@ -129,14 +132,22 @@ class Episode:
         self._expert: Expert | None = None
         self._blind: Iterator[NDArray[np.float32]] | None = None
         self._prompt: Prompt | None = None
+        self._reshows = self.settings.reshow
+        self.corrupts = self.corrupted = False
+        self.waits, self._interrupts = False, self.settings.interference > 0
+        self._keeps_prompt = keep_prompt
         if self.demonstration_prompt or (task.prompt is not None and not task.prompt.restores):
-            longest = PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
-            file = prompt_file(task, self.seed, self.scene_hash) if keep_prompt else None
-            self._prompt = prompt_of(PromptDemonstrator(task, self.sim, self._rng(2)), self.sim, longest, file)
+            self._prompt = self._new_prompt()
         if not self.demonstration_prompt:
             self._hide_objects()
         self._execution_step = first_execution_step(self.published, self.seed, self.demonstration_prompt)
         self._begin_if_due()
+
+    def _new_prompt(self) -> Prompt:
+        """Return the prompt from its beginning; the scene has to be in its initial state."""
+        longest = PROMPT_HORIZON if self.task.prompt_steps is None else self.task.prompt_steps
+        file = prompt_file(self.task, self.seed, self.scene_hash) if self._keeps_prompt else None
+        return prompt_of(PromptDemonstrator(self.task, self.sim, self._rng(2)), self.sim, longest, file)
 
     def _hide_objects(self) -> None:
         """Play a hiding prompt before the first frame, so that the objects are hidden although it is not shown."""
@@ -160,15 +171,37 @@ class Episode:
     def _end_prompt(self, prompt: Prompt) -> None:
         """Restore the initial scene, except for hidden objects."""
         self.prompt_shown = prompt.succeeded
+        if self._reshows:
+            self._reshows = False
+            self.sim.end_prompt(self._start)
+            self._execution_step += self.step_index
+            self._prompt = self._new_prompt()
+            self._corrupt_at(0)
+            return
         self.sim.end_prompt(self._start, () if self.task.prompt is None else self.task.prompt.places)
         self._prompt = None
+        self.waits = self._interrupts
+
+    def wait(self, last: bool = False) -> None:
+        """Advance the clock while another episode is shown (`interference`); ``last``: no other follows."""
+        self.step_index += 1
+        self._execution_step += 1
+        self.waits = not last
+        self._begin_if_due()
+
+    def _corrupt_at(self, step: int) -> None:
+        """Corrupt the memory at this frame if the settings name this execution step."""
+        settings = self.settings
+        due = settings.corrupt != INTACT and step == settings.corrupt_step and not self.corrupted
+        self.corrupts, self.corrupted = due, self.corrupted or due
 
     def _begin_if_due(self) -> None:
         """Start the execution if prompt and idling have ended."""
-        if self._prompt is not None or self.step_index < self._execution_step:
+        if self._prompt is not None or self.waits or self.step_index < self._execution_step:
             return
         self.sim.begin_execution()
         self.exec_start = self.step_index
+        self._corrupt_at(0)
         # A wrong atom that already holds, such as an object on the plate, is not a mistake of the policy.
         self._wrong_atoms = [atom for atom in _wrong_atoms(self.task) if not self.sim.holds(atom)]
 
@@ -180,7 +213,7 @@ class Episode:
     @property
     def idling(self) -> bool:
         """Whether the robot idles: the prompt has ended, or the task has none, and the execution has not started."""
-        return self.phase == PROMPT and self._prompt is None
+        return self.phase == PROMPT and self._prompt is None and not self.waits
 
     @property
     def at_rest(self) -> bool:
@@ -244,6 +277,7 @@ class Episode:
 
     def step(self, action: ArrayLike) -> None:
         """Advance by one control step. The action has no effect in the prompt; after a fault the step has none."""
+        self.corrupts = False
         if self.phase == PROMPT:
             self._step_prompt()
             self._begin_if_due()
@@ -256,6 +290,7 @@ class Episode:
         if self.rested:
             return
         self.progress.step(self.sim.holds)
+        self._corrupt_at(self.exec_steps)
         if self.choice is not None:
             self.choice.step(self.sim.holds)
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong_atoms)

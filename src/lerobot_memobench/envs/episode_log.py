@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDic
 
 from annotated_types import Ge, Le
 
-from lerobot_memobench.envs.settings import GOALS, IDLE
+from lerobot_memobench.envs.settings import GOALS, IDLE, INTACT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -121,6 +121,11 @@ class Outcome(TypedDict, total=False):
         prompt_steps: control steps before the execution: demonstration prompt and idling.
         steps: execution steps.
         paused_steps: control steps of pauses; only with pauses.
+        corrupt: delete, swap or noise of the policy's memory; absent without.
+        corrupt_step: execution step of the corruption; absent for 0, the end of the prompt.
+        reshow: whether the prompt played a second time; absent without.
+        interference: number of episodes of other tasks before the execution; absent without.
+        corrupted: whether the memory was corrupted before the episode ended.
         choice: evidence episodes: variant that the policy acted on; None for no variant.
         answered: evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant.
         variants: evidence episodes: number of variants of the task.
@@ -142,6 +147,11 @@ class Outcome(TypedDict, total=False):
     prompt_steps: Count | None
     steps: Count | None
     paused_steps: Whole
+    corrupt: Name
+    corrupt_step: Count
+    reshow: bool
+    interference: Count
+    corrupted: bool
     choice: Count | None
     answered: bool
     variants: Count
@@ -212,6 +222,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         "prompt_shown": episode.prompt_shown,
         "steps": episode.exec_steps,
         **({"paused_steps": episode.pacing.paused_steps} if episode.pacing.pauses else {}),
+        **_memory_controls(episode),
         "success": episode.success,
         **({} if choice is None else evidence_line(task, choice.variant, choice.answered)),
         "checkpoints": [
@@ -226,6 +237,14 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         "scene_hash": episode.scene_hash,
         "wall_s": round(wall_s, 3),
     }
+
+
+def _memory_controls(episode: Episode) -> dict[str, Any]:
+    """Return the settings of corruption and interference that differ from the protocol's, and their effect."""
+    settings = episode.settings
+    found = {name: getattr(settings, name) for name in ("corrupt", "corrupt_step", "reshow", "interference")}
+    found = {name: value for name, value in found.items() if value != OMITTED[name]}
+    return found | ({"corrupted": episode.corrupted} if "corrupt" in found else {})
 
 
 def evidence_line(task: Task, choice: int | None, answered: bool) -> dict[str, Any]:
@@ -465,6 +484,7 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, "world": MEMOBENCH, "protocol": BY_PAPER},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, "render_every": 1},
+    **{"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0},
 }
 """Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
 steps per rendered picture, exists in earlier versions only."""

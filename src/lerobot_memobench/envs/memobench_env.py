@@ -26,6 +26,7 @@ from lerobot_memobench.envs.episode_log import (
     read_log,
 )
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_protocol
+from lerobot_memobench.envs.interference import Interference
 from lerobot_memobench.envs.observations import (
     METADATA,
     REWARDS,
@@ -110,6 +111,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.render_mode = render_mode
         self._task = self._task.in_world(cast("World", settings.world))
         self.task = self._task.name
+        if settings.needs_prompt and self._task.prompt is None:
+            raise MemobenchError(
+                f"{self.task} has no demonstration prompt, and corrupt= (at step 0), reshow= and interference= act on "
+                "it; choose another task, or set corrupt_step="
+            )
         if log_dir is not None:  # fail before the first episode
             file_name(self.task, "the name of a task")
         self._episode: Episode | None = None
@@ -123,6 +129,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._log = self._opened_log(log_dir) if log_dir is not None else None
         self._video: VideoRecorder | None = None
         self._observer = Observer(settings.obs_type)
+        self._others: Interference | None = None
         self._began = self._closed = False
         self._not_run: str | None = None
         self._warned: set[str] = set()
@@ -133,7 +140,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state of a copy: everything except the running episode, with its scene and generators."""
-        return {**vars(self), "_episode": None, "_video": None, "_began": False}
+        return {**vars(self), "_episode": None, "_others": None, "_video": None, "_began": False}
 
     @property
     def episode(self) -> Episode:
@@ -143,6 +150,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._episode
 
     @property
+    def _shown(self) -> Episode:
+        """The episode that is observed: the running one, or another one (`interference`)."""
+        return self.episode if self._others is None or self._others.shown is None else self._others.shown
+
+    @property
     def _max_episode_steps(self) -> int:
         """Upper bound of steps for LeRobot's loop: the horizon with pauses, prompt and idling."""
         task = self._task
@@ -150,7 +162,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             return self._longest
         prompt = self.settings.demonstration_prompt and task.prompt is not None
         longest_prompt = PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
-        return self._longest + (longest_prompt if prompt else 0) + (IDLE_STEPS if task.idles else 0)
+        prompts = longest_prompt * (1 + self.settings.reshow) if prompt else 0
+        return self._longest + prompts + self.settings.longest_interference + (IDLE_STEPS if task.idles else 0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -172,6 +185,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         _warn_of_sealed_seed(self._scene_seed, self._log_dir)
         with self._ending_episode():
             self.episode.reset(self._scene_seed, variant, keep_prompt=named)
+            if settings.interference:
+                self._others = self._others or Interference(self._task, settings)
+                self._others.begin(self._scene_seed)
         if self._not_run is not None:
             return blank(self.observation_space), self._info()
         self._describe(0)
@@ -212,7 +228,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             # As in a dataset, checkpoints of this step count from the next frame on.
             completed = self.episode.progress.index
             with self._ending_episode():
-                self.episode.step(action)
+                if self._others is None or not self._others.step(self.episode):
+                    self.episode.step(action)
         if self._not_run is not None:
             self._end()
             return blank(self.observation_space), 0.0, False, True, self._info()
@@ -239,7 +256,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def _observe(self) -> None:
         """Observe the current frame and add it to the video, which skips pauses."""
         filmed = self._video is not None and not self.episode.rested
-        self._observer.observe(self.episode, recorded=filmed)
+        self._observer.observe(self._shown, recorded=filmed)
         if self._video is not None and filmed:
             self._video.add(self.render())
 
@@ -285,7 +302,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def _describe(self, completed: int) -> None:
         """Set the instruction, which LeRobot reads at every step; with oracle memory it ends with the memory text."""
-        task = self._task if self._episode is None else self._episode.task
+        task = self._task if self._episode is None else self._shown.task
         self.task_description = task.language
         if self.settings.oracle_memory:
             self.task_description = with_memory(task.language, memory_text(task, completed))
@@ -313,7 +330,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         episode = self.episode
         observation: dict[str, Any] = {
             **self._observer.observation(),
-            "agent_pos": episode.sim.proprio(),
+            "agent_pos": self._shown.sim.proprio(),
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.clock], dtype=np.float32),
         }
@@ -339,6 +356,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "phase": episode.phase,
             "checkpoints_completed": episode.progress.index,
             **({} if episode.fault is None else {"fault": episode.fault.why}),
+            **({"corrupt": True} if episode.corrupts else {}),
         }
 
     def render(self) -> NDArray[np.uint8]:
@@ -348,12 +366,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: no episode is running.
         """
         self._check_began("render")
-        return self._observer.frame(self.episode) if self._not_run is None else _black()
+        return self._observer.frame(self._shown) if self._not_run is None else _black()
 
     def close(self) -> None:
         """Release the scene; the next `reset` opens it again. Closing twice is allowed."""
         self._discard_video()
-        self._episode = None
+        self._episode = self._others = None
         self._began, self._closed = False, True
 
     def _discard_video(self) -> None:

@@ -162,7 +162,7 @@ def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
         longest: maximum number of control steps of an execution.
     """
     reach = np.repeat(np.array([3.0, 2 * np.pi, 0.1], np.float32), (3, 3, 2))  # m, rad, m
-    longest += PROMPT_HORIZON + IDLE_STEPS
+    longest += (1 + settings.reshow) * PROMPT_HORIZON + IDLE_STEPS + settings.longest_interference
     parts: dict[str, spaces.Space[Any]] = {
         "agent_pos": spaces.Box(-reach, reach, (PROPRIO_DIM,), np.float32),
         # LeRobot passes unknown numeric keys to the policy as `observation.<key>`. From these two, a policy with a
@@ -206,7 +206,7 @@ class Observer:
 
     Attributes:
         needed: whether the policy reads the following frames. If not, observations repeat an earlier frame, except
-            for the first and the last frame of the execution.
+            for the first and the last frame of the execution, and the frame before which memory is corrupted.
     """
 
     def __init__(self, obs_type: str) -> None:
@@ -222,7 +222,7 @@ class Observer:
 
     def observe(self, episode: Episode, *, recorded: bool) -> None:
         """Observe the current frame if it is needed; ``recorded``: it is part of a video."""
-        always = episode.done or episode.step_index == episode.exec_start
+        always = episode.done or episode.step_index == episode.exec_start or episode.corrupts
         if not episode.at_rest:
             self._pictures_at_rest = self._objects_at_rest = False
         if self._has_objects and (always or self.needed) and not self._objects_at_rest:

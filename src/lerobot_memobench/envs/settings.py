@@ -18,6 +18,7 @@ from lerobot_memobench.protocol import (
     EVALUATION_SEED,
     HORIZON,
     IDLE_STEPS,
+    PROMPT_HORIZON,
     PROTOCOLS,
     UPSTREAM,
     UPSTREAM_HORIZON,
@@ -43,12 +44,17 @@ EVERY = -1
 SLOWEST = 10
 """Maximum number of control steps per action, see ``speed``."""
 
+INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
+CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
+"""Values of ``corrupt``: what happens to the memory of the policy."""
+
 IDLE, GOALS, STRICT_GOALS = "idle", "goals", 2
 """Protocol keys of strict tasks: maximum idle steps before the execution, and revision of the goals. Goals of revision
 1 could be reached without memory, by marks in the scene and a clock."""
 UPSTREAM_ONLY = {
     **{"suite": PUBLISHED, "referent": REFERENTS[0], "oracle_memory": False},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False},
+    **{"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0},
 }
 """Settings with a fixed value in the authors' evaluation."""
 
@@ -89,6 +95,10 @@ class EnvSettings:
     pause_steps: int = setting(0, "control steps of each pause, at moments drawn by the seed (pause control)", least=0)
     speed: float = setting(1.0, "1, 0.5, 0.33, ...: an action takes 1, 2, 3, ... control steps (speed control)")
     evidence: bool = setting(False, "run each scene with each variant of its task (evidence control)")
+    corrupt: str = setting(INTACT, "delete, swap (between rows) or noise the policy's memory once", CORRUPTIONS)
+    corrupt_step: int = setting(0, "execution step at which corrupt acts; 0: at the end of the prompt", least=0)
+    reshow: bool = setting(False, "the prompt plays a second time, after corrupt has acted")
+    interference: int = setting(0, "episodes of other tasks shown between prompt and execution", least=0)
     expert_action: bool = setting(False, "add the scripted expert's action as observation.expert_action")
     blind_action: bool = setting(False, "add the blind published routine's action as observation.blind_action")
     videos: int = setting(0, "number of first episodes of each task recorded as videos; -1 for all", least=EVERY)
@@ -110,6 +120,31 @@ class EnvSettings:
             self._follow_upstream()
         if self.evidence:
             check_referent(self.referent)
+        self._check_memory_controls()
+
+    def _check_memory_controls(self) -> None:
+        """Check that the settings of corruption and interference do not exclude each other."""
+        if self.corrupt_step and (self.corrupt == INTACT or self.reshow):
+            raise MemobenchError(
+                f"found corrupt_step={self.corrupt_step} with corrupt={self.corrupt} and reshow="
+                f"{str(self.reshow).lower()}; a step needs corrupt=delete, swap or noise, and reshow=true needs step "
+                "0, because prompts play before the execution"
+            )
+        if self.interference and (self.corrupt != INTACT or self.reshow):
+            raise MemobenchError(
+                f"found interference={self.interference} with corrupt={self.corrupt} and reshow="
+                f"{str(self.reshow).lower()}; expected one control, run an evaluation for each"
+            )
+        if self.needs_prompt and (self.prompt_in == RESET or not self.demonstration_prompt):
+            raise MemobenchError(
+                "corrupt= (at step 0), reshow= and interference= act while the policy observes the prompt; leave out "
+                "prompt_in=reset and demonstration_prompt=false, and evaluate a policy that reads prompts"
+            )
+
+    @property
+    def needs_prompt(self) -> bool:
+        """Whether a control acts between prompt and execution, so that only tasks with a prompt are run."""
+        return self.reshow or self.interference > 0 or (self.corrupt != INTACT and self.corrupt_step == 0)
 
     def _check(self, name: str, kind: str, accepted: Mapping[str, Any]) -> None:
         """Check the type of a setting, and its accepted values."""
@@ -141,6 +176,11 @@ class EnvSettings:
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def longest_interference(self) -> int:
+        """Maximum number of control steps of the other episodes between prompt and execution."""
+        return self.interference * (PROMPT_HORIZON + IDLE_STEPS + self.horizon + 2)
 
     def changed(self, **changes: Any) -> EnvSettings:
         """Return a copy with changed values.

@@ -215,7 +215,7 @@ def compare(
         MemobenchError: the protocols differ in something else, or no episode is in both.
     """
     control = control_between(a, b)
-    allowed = {*allow, *([] if control is None or control.of_policy else [control.setting])}
+    allowed = {*allow, *([] if control is None or control.of_policy else [control.setting, *control.also])}
     pairs = _like_pairs(a, b, allowed)
     notes = tuple(_notes(a, b, pairs, control))
     a, b = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
@@ -266,7 +266,7 @@ def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
 
 def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> list[str]:
     """Return warnings for the reader: differing settings, episodes left out, gaps of the logs."""
-    meant = () if control is None else (control.setting,)
+    meant = () if control is None else (control.setting, *control.also)
     notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol, ignore=meant)]
     notes += other_physics(a, b)
     left = {run.name: len(run.records) - len(pairs) for run in (a, b)}

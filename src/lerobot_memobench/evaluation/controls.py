@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY
+from lerobot_memobench.envs.settings import INTACT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Record, Summary, percent, summarise
 from lerobot_memobench.evaluation.records import Run
@@ -39,6 +40,7 @@ class Control:
         gap_closed: whether the share of the gap to 100 % is reported.
         by_checkpoint: whether prefix completion is compared checkpoint by checkpoint.
         value: the setting's only value that is the control; None: every value but the default.
+        also: settings that may differ as well, because they are parts of the control.
     """
 
     title: str
@@ -50,6 +52,7 @@ class Control:
     gap_closed: bool = False
     by_checkpoint: bool = False
     value: Any = None
+    also: tuple[str, ...] = ()
 
     def value_in(self, run: Run) -> Any:
         """Return the setting's value in an evaluation, the default where its log does not record it."""
@@ -73,6 +76,32 @@ CONTROLS = (
         1.0,
         "Each action takes longer, so all events happen later. A policy that reads a clock loses; a policy that "
         "remembers events loses no more than the expert.",
+        one_policy=True,
+    ),
+    Control(
+        "Corrupted memory",
+        "corrupt",
+        INTACT,
+        "The memory of the second evaluation's policy was deleted, swapped or made noisy once, at corrupt_step. "
+        "Metrics that do not fall do not depend on the memory before that step. With reshow the evidence was shown "
+        "again: a policy that recovers falls less than without it.",
+        one_policy=True,
+        also=("corrupt_step", "reshow"),
+    ),
+    Control(
+        "Prompt shown again",
+        "reshow",
+        False,
+        "The demonstration prompt plays twice in the second evaluation. After a corruption of the memory, a gain is "
+        "the policy's recovery; without one, a change is the effect of the longer prompt alone.",
+        one_policy=True,
+    ),
+    Control(
+        "Interference",
+        "interference",
+        0,
+        "In the second evaluation the policy observes episodes of other tasks between prompt and execution, without "
+        "a reset. A memory of the latest frames loses the prompt; a memory that selects by the task keeps it.",
         one_policy=True,
     ),
     Control(

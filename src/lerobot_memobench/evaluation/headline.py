@@ -11,7 +11,7 @@ from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
 
-PACE = ("pause_steps", "speed")
+CONTROLLED = ("pause_steps", "speed", "corrupt", "corrupt_step", "reshow", "interference")
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
 
 
@@ -53,7 +53,11 @@ def protocol_phrases(run: Run) -> list[str]:
         *_seeds(run),
         _extent(records),
         *_replan(records),
-        *(f"{name}={run.protocol[name]:g}" for name in PACE if run.protocol.get(name, OMITTED[name]) != OMITTED[name]),
+        *(
+            f"{name}={str(run.protocol[name]).lower()}"
+            for name in CONTROLLED
+            if run.protocol.get(name, OMITTED[name]) != OMITTED[name]
+        ),
         *(["each scene with each variant"] if run.protocol.get("evidence") else []),
     ]
 

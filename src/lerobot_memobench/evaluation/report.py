@@ -37,6 +37,7 @@ from lerobot_memobench.evaluation.report_tables import (
     departures,
     failures_table,
     inputs_sentence,
+    joined_table,
     memory_types_table,
     overview,
     paper_section,
@@ -117,15 +118,16 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     check_paper_rows(runs, paper)
     found, controls = [], list(controls_among(runs))
     if len(runs) > 1:
-        found.append(Section("Evaluations", (overview(runs),), notes=tuple(unlike(runs))))
+        found.append(Section("Evaluations", (overview(runs), joined_table(runs)), notes=tuple(unlike(runs))))
     found += [sweep(method, group) for method, group in sweeps(runs).items()]
     found += [comparison_section(each, overall=True) for each in controls]
     found += granularity_section(runs, paper)
     for run in runs:
         section = _section(run)
-        if len(runs) > 1:
+        if len(runs) > 1:  # their rates by task are joined
             where = f"Evaluation in {run.folder}."
-            section = replace(section, title=run.name, sentences=(where, *section.sentences))
+            tables = tuple(table for table in section.tables if table.key != "tasks")
+            section = replace(section, title=run.name, tables=tables, sentences=(where, *section.sentences))
         found += [section, *_evidence(run)]
     if paper:
         found.append(paper_section(runs))

@@ -233,6 +233,40 @@ def wide_table(
     )
 
 
+def joined_table(runs: Sequence[Run]) -> Table:
+    """Return one row per task, memory type and average, with the rates of all evaluations next to each other."""
+    absent: Row = dict.fromkeys(METRICS, Rate(None, 0))
+    rows: list[tuple[Cell, ...]] = []
+    strong, rules = [], []
+
+    def add(name: Cell, found: Iterable[Row]) -> None:
+        each = list(found)
+        rows.append((name, *(row[metric] for metric in METRICS for row in each)))
+
+    for memory_type in MEMORY_TYPES:
+        names = dict.fromkeys(name for run in runs for name in _tasks_of(run.summary, memory_type))
+        if not names:
+            continue
+        for name in names:
+            add(Name(name), (run.summary.tasks.get(name, absent) for run in runs))
+        strong.append(len(rows))
+        add(memory_type, (run.summary.memory_types.get(memory_type, absent) for run in runs))
+        rules.append(len(rows))
+    strong.append(len(rows))
+    add(AVERAGE, (run.summary.average for run in runs))
+    return Table(
+        "joined",
+        "Rates by task",
+        ("task", *(run.name for _ in METRICS for run in runs)),
+        tuple(rows),
+        note="Per cent; – is not applicable. Intervals: in CSV, JSON and the report of each evaluation alone.",
+        groups=(("", 1), *((metric, len(runs)) for metric in METRICS)),
+        strong=frozenset(strong),
+        rules=frozenset(rules),
+        intervals=False,
+    )
+
+
 # --- one method at several replan intervals ---
 
 

@@ -58,7 +58,7 @@ class Table:
         groups: (title, columns) over the header, from the left; "" for none.
         strong: rows that sum up, by index. rules: rows before which a line is drawn.
         best: (row, column) of the cells to be marked as best.
-        intervals: whether rates are followed by their interval.
+        intervals: whether rates are followed by their interval; CSV always has its bounds.
     """
 
     key: str
@@ -390,8 +390,9 @@ def terminal_table(table: Table) -> RichTable | Unbroken:
         title=table.title or None, title_justify="left", header_style="bold", pad_edge=False, box=box.SIMPLE_HEAD
     )
     for column, (title, name) in enumerate(zip(table.titles, table.header, strict=True)):
-        # Rates are so narrow that a group's whole title does not fit over them.
-        header = f"{title[:4]}.\n{name}" if title else name
+        # Rates are so narrow that the title of a long group does not fit over them.
+        short = title if len(title) <= 4 else f"{title[:4]}."
+        header = f"{short}\n{name}" if title else name
         result.add_column(header, justify="left" if table.is_text(column) else "right", overflow="fold")
     for index in range(len(table.rows)):
         if index in table.rules:
@@ -422,7 +423,8 @@ def _in_parts(table: Table) -> list[Table]:
     parts: list[list[int]] = [[]]
     for _, group in groupby([column for column, title in enumerate(titles) if title], titles.__getitem__):
         columns = list(group)
-        if parts[-1] and len(leading) + len(parts[-1]) + len(columns) > MOST_COLUMNS:
+        wished = [*leading, *parts[-1], *columns]
+        if parts[-1] and (len(wished) > MOST_COLUMNS or sum(_least_width(table, k) for k in wished) > WIDTH):
             parts.append([])
         parts[-1] += columns
     if len(parts) == 1:
@@ -431,6 +433,15 @@ def _in_parts(table: Table) -> list[Table]:
         _columns(table, [*leading, *part], table.title if k == 0 else f"{table.title}, continued")
         for k, part in enumerate(parts)
     ]
+
+
+def _least_width(table: Table, column: int) -> int:
+    """Return the width of a column whose texts are broken between words and whose names are whole."""
+    interval = " [{}–{}]" if table.intervals else None
+    cells = [(row[column], _words(row[column], interval)) for row in table.rows]
+    named = any(isinstance(cell, Name) for cell, _ in cells)
+    texts = [text for _, text in cells] if named else [word for _, text in cells for word in text.split()]
+    return max(map(len, [*table.header[column].split(), *texts]), default=0) + 2
 
 
 def _columns(table: Table, chosen: Sequence[int], title: str) -> Table:
@@ -489,10 +500,8 @@ def _csv_rows(table: Table) -> list[dict[str, object]]:
                 found |= {f"{name} {order.replace('_', ' ')}": percent(r.value) for order, r in cell._asdict().items()}
             elif column in rates:
                 rate = cell if isinstance(cell, Rate) else Rate(None, 0)
-                found[name] = percent(rate.value)
-                if table.intervals:
-                    low, high = rate.interval or (None, None)
-                    found |= {f"{name} low": percent(low), f"{name} high": percent(high)}
+                low, high = rate.interval or (None, None)
+                found |= {name: percent(rate.value), f"{name} low": percent(low), f"{name} high": percent(high)}
             elif cell != "":
                 found[name] = cell
         rows.append(found)

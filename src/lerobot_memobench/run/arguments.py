@@ -56,6 +56,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
             for key in (
                 *("protocol", "demonstration_prompt", "prompt_in", "horizon"),
                 *("pause_steps", "speed", "evidence", "videos"),
+                *("corrupt", "corrupt_step", "reshow", "interference"),
             )
         },
         "episodes": ("eval.n_episodes",),

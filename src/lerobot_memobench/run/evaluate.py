@@ -17,6 +17,7 @@ from lerobot.utils.random_utils import set_seed
 
 from lerobot_memobench.envs.configuration_memobench import Opener
 from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.envs.settings import SWAP
 from lerobot_memobench.jobs.threads import limit_torch
 from lerobot_memobench.policies.lerobot_config import acting, quiet
 from lerobot_memobench.policies.memory_reads import ReadLog
@@ -45,7 +46,9 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     actor = load_actor(plan)
     limit_torch(sum(parameter.numel() for parameter in actor.policy.parameters()))
     begin()
-    environment = replace(plan.environment, resume=has_log(plan.log))
+    # Logged rows of a resumed batch rest, and have no memory to swap.
+    rests = plan.environment.corrupt != SWAP
+    environment = replace(plan.environment, resume=rests and has_log(plan.log))
     asked = range(plan.seed, plan.seed + plan.grid.runs)
     by = acting(policy, plan.policy_path, asked, environment.settings)
     environments = Environments(environment.opener(policy, by, plan.log), plan.settings.use_async_envs is not False)
@@ -61,7 +64,7 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
             env = environments.of(task, len(batch))
             seeds.begin(task.name, batch.start)
             with nullcontext() if reads is None else reads.noting(task.name, actor.policy, batch) as ended:
-                roll(env, actor, batch, ended)
+                roll(env, actor, batch, ended, scenes.corrupt)
             done += len(batch)
             advance(done, total, task.name)
 

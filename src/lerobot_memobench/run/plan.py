@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
-from lerobot_memobench.envs.settings import OBJECTS, PIXELS
+from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.jobs.threads import cores
@@ -163,6 +163,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     grid = make_grid(asked, environment)
     plan = EvaluationPlan(asked, policy, environment, grid, output, log, options, tuple(command))
     check_policy_fits(plan)
+    check_corruption(plan)
     check_split(plan)
     check_scenes(plan)
     if options.slurm is None:  # there, each part checks its own machine
@@ -220,6 +221,31 @@ def check_policy_fits(plan: EvaluationPlan) -> None:
                 "out, or evaluate memobench_mem"
             )
         check()
+
+
+def check_corruption(plan: EvaluationPlan) -> None:
+    """Refuse ``corrupt`` for a policy that does not offer its memory, and a swap without another row.
+
+    Raises:
+        MemobenchError: it is refused.
+    """
+    how, policy = plan.environment.corrupt, plan.policy
+    if how == INTACT:
+        return
+    from lerobot.policies.factory import get_policy_class
+
+    # The configuration of memobench_mem names its memory; the class offers the method.
+    if getattr(policy, "memory", None) == "none" or not hasattr(get_policy_class(policy.type), "corrupt_memory"):
+        raise MemobenchError(
+            f"corrupt={how} needs a policy with a memory and a method corrupt_memory(how, rows), and {policy.type} "
+            "has none; leave corrupt= out, or evaluate memobench_mem with a memory"
+        )
+    sizes = {len(plan.grid.runs_of(number)) for _, number in plan.grid.cells()}
+    if how == SWAP and min(sizes) < 2:
+        raise MemobenchError(
+            f"corrupt={how} exchanges the memories of a batch, and found a batch of one episode (batch_size="
+            f"{plan.batch}, episodes={plan.grid.runs}); choose a batch size without such a remainder"
+        )
 
 
 def check_split(plan: EvaluationPlan) -> None:

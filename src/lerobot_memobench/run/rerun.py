@@ -155,7 +155,7 @@ def check_extent(card: Mapping[str, Any], plan: EvaluationPlan) -> None:
             f"the card's settings run {grid.runs} episodes of {len(tasks)} tasks, and its protocol names "
             f"{asked['episodes']} of {len(asked['tasks'])}; expected a card of `lerobot eval`"
         )
-    most = longest(plan.environment.settings)
+    most = longest(plan.environment.settings) + plan.environment.settings.longest_interference
     if most > MOST_STEPS:
         raise MemobenchError(
             f"an episode of the card may take {most:,} control steps; expected at most {MOST_STEPS:,}, so run its "

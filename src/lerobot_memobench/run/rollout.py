@@ -22,6 +22,7 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from numpy.typing import NDArray
 
+from lerobot_memobench.envs.settings import INTACT
 from lerobot_memobench.protocol import CLOCK
 
 PIXELS, PHASE, STEP = "pixels", "phase", "step"
@@ -62,12 +63,13 @@ class Actor:
         return found
 
 
-def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = None) -> None:
+def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = None, corrupt: str = INTACT) -> None:
     """Run one episode in each row; the environments write the log.
 
     Args:
         env: vector environment of `MemobenchEnvConfig`.
         seeds: one per row.
+        corrupt: what happens to the memory of rows when their environments report so, see `EnvSettings`.
     """
     actor.policy.reset()
     # Without the option a frozen row would stay frozen for this rollout.
@@ -76,10 +78,14 @@ def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = Non
     check_env_attributes_and_types(env)
     inputs = Inputs(env, actor)
     done = np.zeros(env.num_envs, bool)
+    corrupted: list[int] = []
     for step in range(1, limit + 1):
-        action = actor.act(inputs.of(observation))
+        if corrupted:
+            actor.policy.corrupt_memory(corrupt, corrupted)
+        action = actor.act(inputs.of(observation, drawn=bool(corrupted)))
         inputs.announce()
-        observation, _, terminated, truncated, _ = env.step(action)
+        observation, _, terminated, truncated, info = env.step(action)
+        corrupted = np.flatnonzero(info.get("corrupt", ())).tolist()
         done = done | terminated | truncated | (step == limit)
         if ended is not None:
             ended(done)
@@ -105,13 +111,13 @@ class Inputs:
             self._env.call("need_observation", needed)
             self._drawn = needed
 
-    def of(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return the policy's inputs.
+    def of(self, observation: dict[str, Any], drawn: bool = False) -> dict[str, Any]:
+        """Return the policy's inputs; ``drawn``: the environment drew this frame without being asked.
 
         Where its next action is planned, they are the previous inputs with the present clock. Where it reads no
         pictures, they contain the previous pictures.
         """
-        begins = self._phase is None or bool((observation[PHASE] != self._phase).any())
+        begins = drawn or self._phase is None or bool((observation[PHASE] != self._phase).any())
         self._phase = np.array(observation[PHASE])
         if self._planned and not begins:
             now = {

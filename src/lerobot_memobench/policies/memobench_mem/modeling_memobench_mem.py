@@ -23,6 +23,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTIO
 from torch import Tensor, nn
 from transformers.initialization import no_init_weights
 
+from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_weights
@@ -293,6 +294,23 @@ class MemobenchMemPolicy(PI05Policy):
         self._began: float | None = None
         self._thread = threading.get_ident()
         self._acting_rows: list[int] = []
+
+    def corrupt_memory(self, how: str, rows: Sequence[int]) -> None:
+        """Change what rows remember, before they observe the next frame; planned actions are kept.
+
+        Args:
+            how: ``delete``: they remember from the next frame on; ``swap``: they get the memory of the next row of the
+                batch; ``noise``: normal noise with the standard deviation of its values is added to it.
+        """
+        memory = self.model.memory
+        assert memory is not None  # `run.plan` refuses others
+        held = self.rollout.rows
+
+        def noised(row: int) -> Any:
+            return memory.noised(held[row].memory, torch.Generator().manual_seed(held[row].seed))
+
+        changed = {DELETE: lambda row: None, SWAP: self.rollout.of_next, NOISE: noised}[how]
+        self.rollout.corrupt(rows, changed)
 
     def drop_queued_actions(self) -> None:
         """Replan at the next step and keep the histories; LeRobot's main branch calls it for a new instruction."""

@@ -25,7 +25,8 @@ class Row:
 
     Attributes:
         clock: phase and control step since the phase began. position: control step since the episode began.
-        memory: state of the memory mechanism; None before the first frame.
+        memory: state of the memory mechanism; None before the first frame. intact: its state before a corruption.
+        emptied: whether the next frame is the memory's first, after a corruption.
         missed: step of the first frame that should have been written and was not observed; None: none.
         queue: remaining planned actions. last: the last action (A,).
         pose: of the hand when the last chunk was planned (`begin_chunk`).
@@ -36,6 +37,8 @@ class Row:
     position: int = 0
     frozen: bool = False
     memory: Any = None
+    intact: Any = None
+    emptied: bool = False
     missed: int | None = None
     seed: int = 0
     queue: deque[Tensor] = field(default_factory=deque)
@@ -121,12 +124,17 @@ class Rollout:
                 held.missed = due
         steps, frozen = [row.position for row in self.rows], [row.frozen for row in self.rows]
         written = [
-            begins or step % self.stride == 0 or (self.late and step // self.stride > last // self.stride)
-            for begins, step, last in zip(started, steps, before, strict=True)
+            begins
+            or held.emptied
+            or step % self.stride == 0
+            or (self.late and step // self.stride > last // self.stride)
+            for held, begins, step, last in zip(self.rows, started, steps, before, strict=True)
         ]
         wanted = [row for row, writes in enumerate(written) if writes and not frozen[row]]
         if wanted and self.remembers:
             write(wanted)
+        for row in wanted:
+            self.rows[row].emptied = False
         return steps, started, frozen
 
     def _tick(self, number: int, clock: tuple[int, int]) -> bool:
@@ -141,6 +149,23 @@ class Rollout:
         if not row.frozen:  # the execution's clock starts at 0, continues the prompt's, or is missing
             row.position += step - last[1] if step > last[1] >= 0 else 1 + max(step, 0)
         return False
+
+    def corrupt(self, rows: Sequence[int], changed: Callable[[int], Any]) -> None:
+        """Replace the memories of rows.
+
+        Args:
+            changed: returns the new memory of a row; None: the row begins with its next frame, as an episode does.
+        """
+        for row in rows:
+            self.rows[row].intact = self.rows[row].memory
+        for row in rows:
+            self.rows[row].memory = changed(row)
+            self.rows[row].emptied = self.rows[row].memory is None
+
+    def of_next(self, row: int) -> Any:
+        """Return the memory of the next row of the batch, as it was before a corruption."""
+        other = self.rows[(row + 1) % len(self.rows)]
+        return other.memory if other.intact is None else other.intact
 
     def writes_next(self) -> bool:
         """Return whether the next frame of any row will be written."""

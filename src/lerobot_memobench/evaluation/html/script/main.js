@@ -109,8 +109,10 @@ function drawEpisodes(run, chosen, refill) {
     byId("clear").hidden = FILTERS.every((key) => !chosen[key]);
     list.fill(found, partners);
   }
-  // A filter may have hidden the selected rollout; the first one found then stands for it.
-  const episode = list.episodes.find((it) => it.id === chosen.ep) ?? list.episodes[0];
+  // Without a selection, or where a filter hides it: side by side the first pair that ends differently, else the first.
+  const differs = (it) => beside && solved(it) !== solved(list.partners.get(it.id));
+  const episode =
+    list.episodes.find((it) => it.id === chosen.ep) ?? list.episodes.find(differs) ?? list.episodes[0];
   list.selected = episode;
   if (!episode) return (pair.clear(), detail.clear());
   list.mark(episode.id);

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -19,6 +19,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemorySpec,
     MemoryTokens,
     Query,
+    with_noise,
 )
 from lerobot_memobench.policies.memobench_mem.objects import ObjectPool
 
@@ -46,11 +47,18 @@ class Frame:
     Attributes:
         step: control step since the episode began. stored: (P', D') on the CPU, as returned by the encoder.
         tokens: its memory tokens (P, d_m), kept after the first read; only of objects, whose tokens are small.
+        noise: seed of noise on its memory tokens (``corrupt=noise``); stored objects hold class numbers.
     """
 
     step: int
     stored: Tensor
     tokens: Tensor | None = None
+    noise: int | None = None
+
+
+def noisy(tokens: Tensor, seed: int | None) -> Tensor:
+    """Return the memory tokens (P, d_m) of a frame, with noise if there is a seed."""
+    return tokens if seed is None else with_noise(tokens, torch.Generator().manual_seed(seed))
 
 
 @dataclass
@@ -123,6 +131,8 @@ class Frames(MemoryMechanism):
         places[real], steps[:] = torch.arange(len(read)), torch.tensor([frame.step for frame in read])
         places, steps, real = places.to(device), steps.to(device), real.to(device)
         each = self._each(read, steps)
+        if any(frame.noise is not None for frame in read):
+            each = torch.stack([noisy(tokens, frame.noise) for tokens, frame in zip(each, read, strict=True)])
         return self._tokens(each[places].flatten(1, 2), real, steps[places])
 
     def _each(self, read: list[Frame], steps: Tensor) -> Tensor:
@@ -141,6 +151,11 @@ class Frames(MemoryMechanism):
     def join(self, states: Sequence[Any]) -> list[list[Frame]]:
         """Concatenate the rows of several states."""
         return [row for state in states for row in state]
+
+    def noised(self, state: Any, generator: torch.Generator) -> list[list[Frame]]:
+        """Return the frames with noise on their memory tokens."""
+        seed = generator.initial_seed()
+        return [[replace(frame, noise=seed + frame.step) for frame in row] for row in state]
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
         """Encode each frame once for all samples that read it."""

@@ -223,6 +223,11 @@ class MemoryMechanism(nn.Module, ABC):
         """Concatenate the rows of several states."""
         return {name: torch.cat([state[name] for state in states]) for name in states[0]}
 
+    def noised(self, state: State, generator: torch.Generator) -> State:
+        """Return the state with noise on what it holds of frames, not on times and counts (``corrupt=noise``)."""
+        held = {name: value for name, value in state.items() if not name.endswith("steps")}
+        return {**state, **{name: with_noise(value, generator) for name, value in held.items()}}
+
     # -- a training --------------------------------------------------------------------------------------------------
 
     @classmethod
@@ -341,6 +346,14 @@ class MemoryMechanism(nn.Module, ABC):
             batch: the training batch, and `Reading.outputs` of its fusion.
         """
         return {}
+
+
+def with_noise(values: Tensor, generator: torch.Generator) -> Tensor:
+    """Return values plus normal noise of their own standard deviation; integers are returned unchanged."""
+    if not values.is_floating_point() or values.numel() < 2:
+        return values
+    noise = torch.randn(values.shape, generator=generator).to(values)
+    return values + values.std() * noise
 
 
 def _rows(state: dict[str, Tensor], chosen: Any) -> dict[str, Tensor]:

@@ -24,6 +24,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     NoSettings,
     Query,
+    with_noise,
 )
 
 if TYPE_CHECKING:
@@ -151,6 +152,10 @@ class Motion(MemoryMechanism):
         later = torch.cat([motions[:, 1:], moved], dim=1)
         motions = torch.where(first, motions, torch.where(second, moved.expand_as(motions), later))
         return {"frame": tokens.to(state["frame"].dtype), "motions": motions, "frames": (count + 1).clamp(max=2)}
+
+    def noised(self, state: Any, generator: torch.Generator) -> dict[str, Tensor]:
+        """Return the state with noise on its motions, not on the last frame."""
+        return {**state, "motions": with_noise(state["motions"], generator)}
 
     def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
         """Encode the motions to one token."""
