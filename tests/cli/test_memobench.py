@@ -169,7 +169,7 @@ def test_a_report_is_printed_and_written_beside_the_log(tmp_path: Path, capsys: 
     a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
     assert main(["report", f"p={a}", f"p={b}"]) == 0
     out = capsys.readouterr().out
-    assert out.count("average of memory types") == 2
+    assert out.count("average of memory types") == 3, "of both, and joined"
     assert "SR 75.0 at 20" in out
     assert "75.0 [30.1–95.4]" in out
     found = json.loads((tmp_path / "a" / "report.json").read_text())
@@ -185,15 +185,16 @@ def test_a_report_is_written_in_several_formats(tmp_path: Path) -> None:
     assert main(["report", a, b, *words, "--out", str(out)]) == 0
     assert sorted(path.name for path in out.iterdir()) == ["report.json", "report.tex", "tables"]
     tables = {path.stem: list(csv.DictReader(path.open())) for path in sorted((out / "tables").iterdir())}
-    assert list(tables) == ["failures", "memory-types", "overview", "prefix", "tasks"]
+    assert list(tables) == ["failures", "joined", "memory-types", "overview", "prefix"]
     found = json.loads((out / "report.json").read_text())["evaluations"]
-    for row, (name, figures) in zip(tables["tasks"], found.items(), strict=True):
+    row = tables["joined"][0]
+    assert row["task"] == "a_task"
+    for name, figures in found.items():
         rates, intervals = figures["tasks"]["a_task"], figures["intervals"]["tasks"]["a_task"]
-        assert (row["evaluation"], row["task"], int(row["n"])) == (name, "a_task", rates["n"])
         for metric in ("SR", "MSR", "MUR"):
-            assert float(row[metric]) == rates[metric]
-            assert [float(row[f"{metric} {bound}"]) for bound in ("low", "high")] == intervals[metric]
-        assert row["MCR"] == row["MCR low"] == ""
+            assert float(row[f"{metric} {name}"]) == rates[metric]
+            assert [float(row[f"{metric} {name} {bound}"]) for bound in ("low", "high")] == intervals[metric]
+        assert row[f"MCR {name}"] == row[f"MCR {name} low"] == ""
     prefix = tables["prefix"][0]
     assert [float(prefix[f"c{k} any order"]) for k in (1, 2)] == found["a"]["prefix"]["a_task"]
     assert [float(prefix[f"c{k} in order"]) for k in (1, 2)] == found["a"]["ordered_prefix"]["a_task"]

@@ -62,7 +62,14 @@ def assert_clock_never_goes_back(frames: list[dict[str, Any]]) -> None:
     assert steps == list(range(len(steps)))
 
 
-@pytest.mark.parametrize("words", [("delete",), ("swap", "reshow=true"), ("noise", "corrupt_step=3")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("swap", "reshow=true"),
+        pytest.param(("delete",), marks=pytest.mark.slow),
+        pytest.param(("noise", "corrupt_step=3"), marks=pytest.mark.slow),
+    ],
+)
 def test_the_shipped_policy_is_corrupted(words: tuple[str, ...], tmp_path: Path) -> None:
     how, *more = words
     settings = [f"tasks={HIGHLIGHT}", "referent=random", "episodes=2", "batch_size=2", "horizon=8", "device=cpu"]
