@@ -557,7 +557,7 @@ PAGES: dict[str, Callable[[], str]] = {
 """Generated page of the site -> function that returns its text."""
 
 
-LINK = re.compile(r"(?<!!)\[([^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*)\]\(([^()\s]+)\)")
+LINK = re.compile(r"\[([^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*)\]\(([^()\s]+)\)")
 
 
 def relink(markdown: str, source: str, page: str) -> str:

@@ -150,6 +150,11 @@ def test_navigation_lists_every_page_once() -> None:
     assert [url for url, count in urls.items() if count > 1] == []
 
 
+def test_pictures_of_copied_pages_are_in_the_site() -> None:
+    adapted = reference.relink("![rates](../docs/figures/study.png)", "results/study.md", "results/study.md")
+    assert adapted == "![rates](../figures/study.png)"
+
+
 @pytest.mark.slow
 def test_site_is_built_strictly(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
