@@ -150,6 +150,12 @@ def to_success(records: list[Json]) -> None:
     first_failure(records).update(success=True, failure=None)
 
 
+def later(records: list[Json]) -> None:
+    for record in records:
+        if record["success"]:
+            record["steps"] += 1
+
+
 def linked(folder: Path) -> None:
     (folder / LOG).unlink()
     (folder / LOG).symlink_to("/etc/passwd")
@@ -230,7 +236,11 @@ def test_committed_sealed_result_is_accepted(board: Path, tmp_path: Path) -> Non
     assert board_row(found).seeds == "sealed, run 2"
 
 
-@pytest.mark.parametrize("change", [None, in_log(to_success, card=True)], ids=["copied", "copied and edited"])
+@pytest.mark.parametrize(
+    "change",
+    [None, in_log(to_success, card=True), in_log(later, card=True)],
+    ids=["copied", "copied with another success", "copied with later ends"],
+)
 def test_copied_card_is_refused(board: Path, tmp_path: Path, change: Callable[[Path], None] | None) -> None:
     both = shutil.copytree(board, tmp_path / "board")
     copy = shutil.copytree(both / "one", both / "two")

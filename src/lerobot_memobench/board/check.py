@@ -265,8 +265,8 @@ def _check_original(submission: Submission, other: Submission) -> None:
 def _copied(mine: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any]]) -> float:
     """Return the share of equal episodes among those in which both policies succeed in the same scene.
 
-    Two policies seldom need the same number of steps to each checkpoint. Failures do not count: two policies may reach
-    nothing.
+    Two policies seldom need the same number of steps to each checkpoint; steps after the last one are easily edited.
+    Failures do not count: two policies may reach nothing.
     """
     scenes = {(record["task"], record.get("scene_hash")): record for record in theirs if record["success"]}
     pairs = [
@@ -274,7 +274,7 @@ def _copied(mine: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any
         for record in mine
         if record["success"] and (key := (record["task"], record.get("scene_hash"))) in scenes
     ]
-    equal = sum(a["steps"] == b["steps"] and a["checkpoints"] == b["checkpoints"] for a, b in pairs)
+    equal = sum(a["checkpoints"] == b["checkpoints"] for a, b in pairs)
     return equal / len(pairs) if len(pairs) >= FEWEST else 0.0
 
 
