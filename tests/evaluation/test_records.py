@@ -141,7 +141,7 @@ def test_other_settings_are_noted_in_every_format(tmp_path: Path) -> None:
     report = build(read_runs(found))
     for name in ("markdown", "table", "latex", "json"):
         text = " ".join(WRITERS[name](report).split()).replace("\\_", "_")
-        assert f"b was not run as a was {words}" in text, name
+        assert f"a and b have different protocols {words}" in text, name
         assert "c was not run" not in text, name
     assert words in (write_html(found, tmp_path / "page").page).read_text()
     assert '"notices":[]' in (write_html([found[0], found[2]], tmp_path / "page").page).read_text()

@@ -169,7 +169,7 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
 
 
 def unlike(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each of several evaluations that was not run as the first one was.
+    """Return a sentence for each of several evaluations whose protocol differs from the first one's.
 
     Replan intervals may differ: they are compared on purpose.
     """
@@ -178,8 +178,8 @@ def unlike(runs: Sequence[Run]) -> list[str]:
         first = runs[0].name
         if found := differences(runs[0].protocol, run.protocol, extent=True, ignore=("replan_steps",)):
             notes.append(
-                f"{run.name} was not run as {first} was ({'; '.join(found)}, the first value being that of {first}): "
-                "their figures do not compare; `memobench compare` does so over the episodes in common, where it can"
+                f"{first} and {run.name} have different protocols ({'; '.join(found)}; the first value is that of "
+                f"{first}): do not compare their rates; `memobench compare` compares common episodes"
             )
         notes += other_physics(runs[0], run)
     return notes
