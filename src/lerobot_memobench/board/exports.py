@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from lerobot_memobench.board.check import MOST, SEEDS
 from lerobot_memobench.board.submission import ABOUT, About
-from lerobot_memobench.envs.episode_log import INPUTS, OMITTED
+from lerobot_memobench.envs.episode_log import INPUTS, with_omitted
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, Row, by_task, percent, wilson
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.io import checked
@@ -105,7 +105,7 @@ def huggingface_yaml(run: Run, dataset: str) -> str:
     import yaml
     from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
-    about, suite = about_of(run), _protocol(run)["suite"]
+    about, suite = about_of(run), with_omitted(run.protocol)["suite"]
     source = about.links.get("code") if about else None
     entries = [
         EvalResultEntry(
@@ -122,12 +122,8 @@ def huggingface_yaml(run: Run, dataset: str) -> str:
     return yaml.safe_dump(eval_result_entries_to_yaml(entries), sort_keys=False, allow_unicode=True)
 
 
-def _protocol(run: Run) -> Mapping[str, Any]:
-    return {**OMITTED, **run.protocol}
-
-
 def _conditions(run: Run) -> str:
-    protocol = _protocol(run)
+    protocol = with_omitted(run.protocol)
     return (
         f"{protocol['suite']} suite, referent {protocol.get('referent')}, inputs: {protocol.get(INPUTS)}, "
         f"{protocol['episodes']} episodes of each of {len(protocol['tasks'])} tasks, seeds from "
@@ -152,7 +148,7 @@ def vla_eval_json(run: Run) -> str:
     ``overall_score`` is set for the standard protocol only: all tasks of the suite, 50 episodes each, seeds that count.
     Otherwise the average is ``reported_avg`` of ``task_scores``, as that board asks.
     """
-    about, protocol, summary = about_of(run), _protocol(run), run.summary
+    about, protocol, summary = about_of(run), with_omitted(run.protocol), run.summary
     model = model_of(run)
     whole = sorted(protocol["tasks"]) == sorted(task_names(suite=protocol["suite"])) and protocol["episodes"] == MOST
     day = about.date if about else str(run.card.get("written", ""))[:10]

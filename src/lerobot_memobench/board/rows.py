@@ -12,7 +12,7 @@ from lerobot_memobench.envs.episode_log import INPUTS
 from lerobot_memobench.evaluation.comparison import Difference, compare
 from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import Rate, Row, stand_ins_of
-from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure, with_interval
 from lerobot_memobench.io import checked, parsed
 from lerobot_memobench.protocol import PAPER
 from lerobot_memobench.tasks.task import LIBERO
@@ -105,8 +105,7 @@ def rate_text(rate: Rate | None) -> str:
     """Return a rate in per cent with its interval: ``97.8 [95.2–99.0]``."""
     if rate is None or rate.value is None or rate.interval is None:
         return NOT_APPLICABLE
-    low, high = rate.interval
-    return f"{figure(rate.value)} [{figure(low)}–{figure(high)}]"
+    return with_interval(rate.value, *rate.interval)
 
 
 def evidence_text(found: Evidence | None) -> str:
@@ -114,7 +113,7 @@ def evidence_text(found: Evidence | None) -> str:
     if found is None:
         return NOT_APPLICABLE
     follows = found.rates["follows"]
-    return f"{figure(follows.value)} [{figure(follows.low)}–{figure(follows.high)}], chance {figure(found.chance)}"
+    return f"{with_interval(follows.value, follows.low, follows.high)}, chance {figure(found.chance)}"
 
 
 def pauses_text(found: Difference | None) -> str:

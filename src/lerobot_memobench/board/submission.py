@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, OMITTED, POLICY, EpisodeRecord, key_of, read_log
+from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, EpisodeRecord, key_of, read_log, with_omitted
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run, asked_for
@@ -125,7 +125,7 @@ class Evaluation:
     @property
     def protocol(self) -> dict[str, Any]:
         """The protocol of the card, with the values that earlier cards omit."""
-        return {**OMITTED, **self.card["protocol"]}
+        return with_omitted(self.card["protocol"])
 
     @property
     def run(self) -> Run:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDic
 
 from annotated_types import Ge, Le
 
-from lerobot_memobench.envs.settings import GOALS, IDLE, INTACT
+from lerobot_memobench.envs.settings import GOALS, IDLE, MEMORY_CONTROLS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -242,8 +242,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
 def _memory_controls(episode: Episode) -> dict[str, Any]:
     """Return the settings of corruption and interference that differ from the protocol's, and their effect."""
     settings = episode.settings
-    found = {name: getattr(settings, name) for name in ("corrupt", "corrupt_step", "reshow", "interference")}
-    found = {name: value for name, value in found.items() if value != OMITTED[name]}
+    found = {name: value for name, usual in MEMORY_CONTROLS.items() if (value := getattr(settings, name)) != usual}
     return found | ({"corrupted": episode.corrupted} if "corrupt" in found else {})
 
 
@@ -484,7 +483,7 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, "world": MEMOBENCH, "protocol": BY_PAPER},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, "render_every": 1},
-    **{"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0},
+    **MEMORY_CONTROLS,
 }
 """Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
 steps per rendered picture, exists in earlier versions only."""
@@ -495,6 +494,11 @@ EXTENT = ("tasks", "episodes")
 MOST_EPISODES = 100_000
 """Largest number of episodes of one task; bounds the memory that a damaged file can request."""
 Episodes = Annotated[int, Ge(0), Le(MOST_EPISODES)]
+
+
+def with_omitted(protocol: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a protocol with the values of settings that earlier versions omit."""
+    return {**OMITTED, **protocol}
 
 
 def differences(
@@ -515,8 +519,8 @@ def differences(
         ignore: settings that may differ.
     """
     left_out = {*ignore, POLICY, *(() if extent else EXTENT)}
-    first = {k: v for k, v in {**OMITTED, **a}.items() if k not in left_out}
-    found = _differing(first, {**OMITTED, **b})
+    first = {k: v for k, v in with_omitted(a).items() if k not in left_out}
+    found = _differing(first, with_omitted(b))
     if policy:
         found += _differing(a.get(POLICY) or {}, b.get(POLICY) or {}, f"{POLICY}.")
     return found

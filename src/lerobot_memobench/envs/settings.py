@@ -48,13 +48,16 @@ INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 """Values of ``corrupt``: what happens to the memory of the policy."""
 
+MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0}
+"""Settings of corruption and interference, with their values in the protocol."""
+
 IDLE, GOALS, STRICT_GOALS = "idle", "goals", 2
 """Protocol keys of strict tasks: maximum idle steps before the execution, and revision of the goals. Goals of revision
 1 could be reached without memory, by marks in the scene and a clock."""
 UPSTREAM_ONLY = {
     **{"suite": PUBLISHED, "referent": REFERENTS[0], "oracle_memory": False},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False},
-    **{"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0},
+    **MEMORY_CONTROLS,
 }
 """Settings with a fixed value in the authors' evaluation."""
 

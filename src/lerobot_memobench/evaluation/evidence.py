@@ -19,7 +19,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, by_task, percent, wilson
 from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, percentiles
-from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, figure
+from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, figure, with_interval
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -241,7 +241,7 @@ def _row(name: str, found: Evidence) -> tuple[Cell, ...]:
 
 
 def _cell(found: Estimate) -> Numbers:
-    return Numbers(f"{figure(found.value)} [{figure(found.low)}–{figure(found.high)}]")
+    return Numbers(with_interval(found.value, found.low, found.high))
 
 
 def evidence_data(found: FoundEvidence, records: Sequence[Record]) -> dict[str, Any]:

@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import OMITTED, POLICY
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS
 from lerobot_memobench.evaluation.metrics import Record, policy_inputs, stand_ins_of
 from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
 
-CONTROLLED = ("pause_steps", "speed", "corrupt", "corrupt_step", "reshow", "interference")
+CONTROLLED = ("pause_steps", "speed", *MEMORY_CONTROLS)
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
 from lerobot_memobench.evaluation.gaps import GROUPS, success_by_gap
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, wilson
+from lerobot_memobench.evaluation.metrics import METRICS, Rate
 from lerobot_memobench.evaluation.records import Run, sweeps
 from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.io import draft_of
@@ -125,8 +125,9 @@ def draw_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
     files = save(draw_outcomes(bars(runs)), folder, "outcomes")
     if sweeps(runs):
         files += save(draw_replan(runs), folder, "replan")
-    if any(success_by_gap(run.records) for run in runs):
-        files += save(draw_gaps(runs), folder, "gap")
+    by_gap = {run.name: success_by_gap(run.records) for run in runs}
+    if any(by_gap.values()):
+        files += save(draw_gaps(by_gap), folder, "gap")
     return files
 
 
@@ -216,7 +217,7 @@ def _label(found: Sequence[Bar], k: int) -> str:
 # --- rates by replan interval ---
 
 Curve = Mapping[int, Rate]
-"""Replan interval -> rate."""
+"""Replan interval, or place on an axis -> rate."""
 
 
 def draw_replan(runs: Sequence[Run]) -> Figure:
@@ -267,23 +268,22 @@ def _draw_curve(place: Any, found: Curve, style: Mapping[str, Any]) -> None:
 # --- success by gap ---
 
 
-def draw_gaps(runs: Sequence[Run]) -> Figure:
-    """Draw the rate of reached checkpoints over their gap, a line per evaluation, with Wilson's intervals."""
+def draw_gaps(found: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
+    """Draw the rate of reached checkpoints over their gap, a line per evaluation, with Wilson's intervals.
+
+    Args:
+        found: name of an evaluation -> its `success_by_gap`.
+    """
     from matplotlib.lines import Line2D
 
-    found = {run.name: success_by_gap(run.records) for run in runs}
     groups = [group for group in GROUPS if any(group in each for each in found.values())]
     styles = {name: line_style(number, published=False) for number, name in enumerate(found)}
     with paper_style():
         figure = new_figure(5.0, 2.7)
         place = figure.subplots()
         for name, counts in found.items():
-            places = [k for k, group in enumerate(groups) if group in counts]
-            rates = [counts[groups[k]][0] / counts[groups[k]][1] for k in places]
-            intervals = [wilson(rate, counts[groups[k]][1]) for rate, k in zip(rates, places, strict=True)]
-            low, high = ([100 * interval[end] for interval in intervals] for end in (0, 1))
-            place.fill_between(places, low, high, color=styles[name]["color"], alpha=0.15, lw=0, zorder=1)
-            place.plot(places, [100 * rate for rate in rates], **styles[name], lw=1.9, zorder=3, clip_on=False)
+            curve = {groups.index(group): Rate(done / count, count) for group, (done, count) in counts.items()}
+            _draw_curve(place, curve, styles[name])
         place.set_xticks(range(len(groups)), groups)
         place.set_xlabel("gap from cue to use, control steps")
         place.set_ylabel("checkpoints reached, %")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from lerobot_memobench.envs.episode_log import OMITTED
+from lerobot_memobench.envs.episode_log import with_omitted
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
@@ -413,7 +413,7 @@ def departures(run: Run) -> list[str]:
     if counts != {PAPER_EPISODES}:
         low, high = min(counts), max(counts)
         found.append(f"{low if low == high else f'{low} to {high}'} episodes of each instead of {PAPER_EPISODES}")
-    known = {**OMITTED, **run.protocol}
+    known = with_omitted(run.protocol)
     for key, value in PAPER_PROTOCOL.items():
         if key in known and known[key] != value:
             found.append(f"{key.replace('_', ' ')} {known[key]} instead of {value}")

@@ -117,6 +117,11 @@ def figure(value: float | None, sign: bool = False) -> str:
     return NOT_APPLICABLE if found is None else f"{found:{'+' if sign else ''}.1f}"
 
 
+def with_interval(value: float | None, low: float | None, high: float | None) -> str:
+    """Return a fraction and its interval as percentages: ``97.8 [95.2–99.0]``."""
+    return f"{figure(value)} [{figure(low)}–{figure(high)}]"
+
+
 def _words(cell: Cell, interval: str | None, escape: Callable[[str], str] = str) -> str:
     """Return a cell as text; ``interval`` is how an interval is written, None for not at all."""
     if isinstance(cell, PrefixRates):
