@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from folders import Setting, StrictTask
-from words import AS_BEGUN, CABINET, DRAWERS, HOME, PLACES, TIMES, Texts, left_ajar, region, times
+from words import AS_BEGUN, CABINET, COUNTS, DRAWERS, HOME, ORDINALS, PLACES, TIMES, Texts, left_ajar, region, times
 
+from lerobot_memobench.tasks.difficulty import difficulty_of_count
 from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Never, Round, When
 
 REST = 40
@@ -123,16 +124,22 @@ def _setting(event: Counted, number: int) -> Setting:
         tuple(formula for formula, _ in steps),
         tuple(texts for _, texts in steps),
         f"{asked[0].upper()}{asked[1:]}, coming home after each time, and then rest.",
+        difficulty=difficulty_of_count(number),
     )
 
 
 def _checkpoints(event: Counted, number: int) -> list[tuple[Formula, Texts]]:
     """Return three checkpoints for each number: all variants of a task share the labels of their checkpoints."""
-    underway = [(_begun(event, k), _opened(event, k, number)) for k in range(1, number + 1)]
-    complete = [(_done(event, k), _counted(event, k, number)) for k in range(1, number + 1)]
+
+    def underway(k: int) -> tuple[Formula, Texts]:
+        return _begun(event, k), _opened(event, k, number)
+
+    def complete(k: int) -> tuple[Formula, Texts]:
+        return _done(event, k), _counted(event, k, number)
+
     if number == 1:
-        return [underway[0], complete[0], (And((_done(event, 1), HOME)), _home(event))]
-    return complete if number == 3 else [complete[0], underway[1], complete[1]]
+        return [underway(1), complete(1), (And((_done(event, 1), HOME)), _home(event))]
+    return [complete(1), underway(2) if number == 2 else complete((number + 1) // 2), complete(number)]
 
 
 def _done(event: Counted, number: int) -> Formula:
@@ -144,7 +151,7 @@ def _begun(event: Counted, number: int) -> Formula:
 
 
 def _counted(event: Counted, done: int, asked: int) -> Texts:
-    left = {0: "nothing is left to do", 1: "once more to go", 2: "two more to go"}[asked - done]
+    left = {0: "nothing is left to do", 1: "once more to go"}.get(asked - done, f"{COUNTS[asked - done]} more to go")
     return (
         f"{event.coarse}, {done} of {asked}",
         f"{event.did}, {TIMES[done]} by now",
@@ -153,7 +160,7 @@ def _counted(event: Counted, done: int, asked: int) -> Texts:
 
 
 def _opened(event: Counted, k: int, asked: int) -> Texts:
-    which = {1: "the first", 2: "the second", 3: "the third"}[k]
+    which = f"the {ORDINALS[k]}"
     coarse, intermediate, fine = event.opened
     return (
         f"{coarse}, {k} of {asked}",

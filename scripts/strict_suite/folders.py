@@ -12,6 +12,7 @@ from bddl_text import format_bddl
 from lerobot_memobench.io import write_file
 from lerobot_memobench.tasks.bddl import Region, parse_bddl
 from lerobot_memobench.tasks.catalogue import CATALOGUE_DIR, get_task
+from lerobot_memobench.tasks.difficulty import EASY, Difficulty
 from lerobot_memobench.tasks.formula import Formula, to_lists
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, STRICT, Prompt, Task
 
@@ -21,7 +22,7 @@ LONGEST_ROW = 110
 
 @dataclass(frozen=True)
 class Setting:
-    """A variant that a seed can draw: instruction, goal and memory texts (K checkpoints)."""
+    """A variant that a seed can draw from ``difficulty`` on: instruction, goal and memory texts (K checkpoints)."""
 
     language: str
     goal: Formula
@@ -29,6 +30,7 @@ class Setting:
     memory: tuple[tuple[str, str, str], ...]
     demo_summary: str
     prompt: Prompt | None = None
+    difficulty: Difficulty = EASY
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,7 @@ def _variant(one: Setting, first: Setting) -> dict[str, Any]:
         "subtask_goals": [to_lists(goal) for goal in one.checkpoints],
         "memory": [list(texts) for texts in one.memory],
         "demo_summary": one.demo_summary,
+        **({"difficulty": one.difficulty} if one.difficulty != EASY else {}),
     }
 
 

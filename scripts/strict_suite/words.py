@@ -11,7 +11,9 @@ AS_BEGUN = Atom("asbegun", ())
 CABINET = "wooden_cabinet_1"
 DRAWERS = ("top", "middle", "bottom")
 PLACES = tuple(Region(f"{drawer}_region", CABINET) for drawer in DRAWERS)
-TIMES = {1: "once", 2: "twice", 3: "three times"}
+COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
+ORDINALS = ("", "first", "second", "third")
+TIMES = {1: "once", 2: "twice"} | {k: f"{COUNTS[k]} times" for k in range(3, len(COUNTS))}
 Texts = tuple[str, str, str]
 
 

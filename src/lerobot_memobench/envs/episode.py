@@ -140,7 +140,9 @@ class Episode:
             self._prompt = self._new_prompt()
         if not self.demonstration_prompt:
             self._hide_objects()
-        self._execution_step = first_execution_step(self.published, self.seed, self.demonstration_prompt)
+        self._execution_step = first_execution_step(
+            self.published, self.seed, self.demonstration_prompt, self.settings.degree.idle_steps
+        )
         self._begin_if_due()
 
     def _new_prompt(self) -> Prompt:
@@ -366,7 +368,7 @@ def referent_of(task: Task, seed: int) -> Task:
     return task.variant(int(order[position]))
 
 
-def first_execution_step(task: Task, seed: int, demonstration_prompt: bool) -> int:
+def first_execution_step(task: Task, seed: int, demonstration_prompt: bool, idle_steps: int = IDLE_STEPS) -> int:
     """Return the first step of the execution in a seed's episode; 0 for a task that does not idle.
 
     The seed draws the idling time independently of the variant.
@@ -374,11 +376,12 @@ def first_execution_step(task: Task, seed: int, demonstration_prompt: bool) -> i
     Args:
         task: the task of the catalogue, before a variant is drawn.
         demonstration_prompt: whether the task's prompt is part of the episode.
+        idle_steps: maximum number of idle steps.
     """
     if not task.idles:
         return 0
     prompt = (task.prompt_steps or 0) if demonstration_prompt else 0
-    return prompt + int(generator(task, seed, 5).integers(IDLE_STEPS, endpoint=True))
+    return prompt + int(generator(task, seed, 5).integers(idle_steps, endpoint=True))
 
 
 def generator(task: Task, seed: int, stream: int) -> np.random.Generator:

@@ -36,6 +36,7 @@ from lerobot_memobench.io import (
     write_file,
 )
 from lerobot_memobench.protocol import BY_PAPER
+from lerobot_memobench.tasks.difficulty import STANDARD
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.task import MEMOBENCH, PUBLISHED, Task
@@ -481,7 +482,7 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 
 
 OMITTED: dict[str, Any] = {
-    **{"suite": PUBLISHED, "world": MEMOBENCH, "protocol": BY_PAPER},
+    **{"suite": PUBLISHED, "world": MEMOBENCH, "difficulty": STANDARD, "protocol": BY_PAPER},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, "render_every": 1},
     **MEMORY_CONTROLS,
 }

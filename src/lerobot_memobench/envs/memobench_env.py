@@ -44,7 +44,6 @@ from lerobot_memobench.io import file_name
 from lerobot_memobench.protocol import (
     ACTION_DIM,
     EXECUTION,
-    IDLE_STEPS,
     IMAGE_SIZE,
     PROMPT,
     PROMPT_HORIZON,
@@ -53,6 +52,7 @@ from lerobot_memobench.protocol import (
     UNSEEDED,
 )
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
+from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import World
@@ -109,7 +109,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             settings = settings.changed(prompt_in=STEPS)
         self.settings = settings
         self.render_mode = render_mode
-        self._task = self._task.in_world(cast("World", settings.world))
+        self._task = self._task.in_world(cast("World", settings.world)).at(cast("Difficulty", settings.difficulty))
         self.task = self._task.name
         if settings.needs_prompt and self._task.prompt is None:
             raise MemobenchError(
@@ -163,7 +163,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         prompt = self.settings.demonstration_prompt and task.prompt is not None
         longest_prompt = PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
         prompts = longest_prompt * (1 + self.settings.reshow) if prompt else 0
-        return self._longest + prompts + self.settings.longest_interference + (IDLE_STEPS if task.idles else 0)
+        return (
+            self._longest
+            + prompts
+            + self.settings.longest_interference
+            + (self.settings.degree.idle_steps if task.idles else 0)
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -17,12 +17,12 @@ from lerobot_memobench.protocol import (
     BY_PAPER,
     EVALUATION_SEED,
     HORIZON,
-    IDLE_STEPS,
     PROMPT_HORIZON,
     PROTOCOLS,
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
+from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
 from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS, STRICT, SUITES, WORLDS, check_world
 
@@ -83,6 +83,7 @@ class EnvSettings:
 
     suite: str = setting(PUBLISHED, "published tasks, or strict: 30 variants that need a memory", SUITES)
     world: str = setting(MEMOBENCH, "scenes of this package, or of the paper with LIBERO's assets", WORLDS)
+    difficulty: str = setting(STANDARD, "number of repetitions and idling time of strict tasks", DIFFICULTIES)
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
     obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
@@ -118,7 +119,11 @@ class EnvSettings:
             )
         if self.suite == STRICT:
             check_world(self.world, self.suite)
-            self._set(referent=DRAWN)
+            self._set(referent=DRAWN, horizon=self.degree.horizon if self.horizon == HORIZON else self.horizon)
+        elif self.difficulty != STANDARD:
+            raise MemobenchError(
+                f"difficulty={self.difficulty} is for strict tasks; set suite={STRICT}, or leave it out"
+            )
         if self.protocol == UPSTREAM:
             self._follow_upstream()
         if self.evidence:
@@ -181,9 +186,14 @@ class EnvSettings:
             object.__setattr__(self, name, value)
 
     @property
+    def degree(self) -> Degree:
+        """Repetitions, idling time and horizon of the difficulty."""
+        return degree_of(self.difficulty)
+
+    @property
     def longest_interference(self) -> int:
         """Maximum number of control steps of the other episodes between prompt and execution."""
-        return self.interference * (PROMPT_HORIZON + IDLE_STEPS + self.horizon + 2)
+        return self.interference * (PROMPT_HORIZON + self.degree.idle_steps + self.horizon + 2)
 
     def changed(self, **changes: Any) -> EnvSettings:
         """Return a copy with changed values.
@@ -201,7 +211,7 @@ class EnvSettings:
     def protocol_block(self) -> dict[str, Any]:
         """Settings that must agree to join or compare two evaluations."""
         agreed = {name: value for name, value in asdict(self).items() if name not in NOT_COMPARED}
-        return {**agreed, **revision(self.suite)}
+        return {**agreed, **revision(self.suite, self.difficulty)}
 
 
 NOT_COMPARED = ("expert_action", "blind_action", "videos")
@@ -210,9 +220,9 @@ SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in N
 """Settings with an effect on rollouts."""
 
 
-def revision(suite: str) -> dict[str, int]:
+def revision(suite: str, difficulty: str) -> dict[str, int]:
     """Return protocol entries of a suite that changed with versions: idling and goals of strict tasks."""
-    return {IDLE: IDLE_STEPS, GOALS: STRICT_GOALS} if suite == STRICT else {}
+    return {IDLE: degree_of(difficulty).idle_steps, GOALS: STRICT_GOALS} if suite == STRICT else {}
 
 
 def steps_per_action(speed: float) -> int:

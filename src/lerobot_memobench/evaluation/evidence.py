@@ -22,6 +22,7 @@ from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, perc
 from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, figure, with_interval
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.difficulty import DIFFICULTIES
 
 RATES = ("follows", "wrong", "undecided", "success")
 """A warranted choice: the answer is the evidence's; another answer was given; none was; the goal held at the end."""
@@ -173,7 +174,7 @@ def _permuted(scene: Sequence[Record], rng: np.random.Generator, draws: int) -> 
 def _alike(name: str) -> tuple[dict[int, str], dict[int, int]]:
     """Return variant -> instruction and variant -> first variant with its goal; empty for unknown tasks."""
     try:
-        task = get_task(name)
+        task = get_task(name).at(DIFFICULTIES[-1])
     except MemobenchError:
         return {}, {}
     variants = [task.variant(k) for k in task.random_variants]

@@ -112,7 +112,8 @@ class EvaluationPlan:
         """Task -> number of variants with which each of its scenes is run, with evidence."""
         from lerobot_memobench.tasks.catalogue import load_task
 
-        return {task.name: len(load_task(task.folder).random_variants) for task in self.grid.tasks}
+        tasks = {task.name: load_task(task.folder).at(self.environment.difficulty) for task in self.grid.tasks}
+        return {name: len(task.random_variants) for name, task in tasks.items()}
 
     @property
     def resuming_command(self) -> str:

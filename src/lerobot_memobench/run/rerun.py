@@ -44,6 +44,7 @@ from lerobot_memobench.run.arguments import (
 from lerobot_memobench.run.card import PACKAGES, detector_hash, drawn_with, first_variant_mismatch, versions
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
+from lerobot_memobench.tasks.difficulty import STANDARD
 from lerobot_memobench.tasks.task import PUBLISHED
 
 MOST_STEPS = 100 * HORIZON
@@ -180,7 +181,7 @@ def check_version(card: Mapping[str, Any]) -> None:
     run, protocol = card["runs"][-1], card["protocol"]
     version = f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
     problem = first_variant_mismatch(card["episodes"])
-    for name, here in revision(protocol.get("suite", PUBLISHED)).items():
+    for name, here in revision(protocol.get("suite", PUBLISHED), protocol.get("difficulty", STANDARD)).items():
         if (there := protocol.get(name, OMITTED[name])) != here:
             problem = problem or f"{name}={there} on the card, {name}={here} here"
     if problem is not None:

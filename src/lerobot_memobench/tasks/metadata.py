@@ -15,6 +15,7 @@ from annotated_types import Ge, Le, Len, MinLen
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import read_json, short
 from lerobot_memobench.tasks.bddl import Problem
+from lerobot_memobench.tasks.difficulty import EASY, Difficulty
 from lerobot_memobench.tasks.formula import Formula, parse_formula, rename
 from lerobot_memobench.tasks.task import OPERATIONS, Checkpoint, MemoryType, Prompt, PromptKind, Suite, Texts, Variant
 
@@ -57,6 +58,7 @@ class VariantData(TypedDict):
     language: NotRequired[str]
     prompt: NotRequired[PromptData | None]
     replaces_published: NotRequired[bool]
+    difficulty: NotRequired[Difficulty]
 
 
 class MetadataFile(TypedDict):
@@ -200,6 +202,7 @@ class Metadata:
             language=value.get("language", ""),
             prompt=self.prompt(value.get("prompt"), f"{key}.prompt"),
             replaces_published=value.get("replaces_published", False),
+            difficulty=value.get("difficulty", EASY),
         )
 
     def _check_substitute(self, substitute: Mapping[str, str], key: str) -> None:

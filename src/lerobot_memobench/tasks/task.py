@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.tasks.bddl import Region
+from lerobot_memobench.tasks.difficulty import EASY, STANDARD, Difficulty, draws
 from lerobot_memobench.tasks.formula import Atom, Formula, rename
 
 MemoryType = Literal["temporal", "spatial", "object", "procedural"]
@@ -117,6 +118,7 @@ class Variant:
         language: instruction; overrides the task's.
         prompt: demonstration prompt; overrides the substituted prompt.
         replaces_published: whether the published goal is looser (accepts another order); then variant 0 is not drawn.
+        difficulty: lowest difficulty at which it is drawn.
     """
 
     languages: tuple[Texts, ...]
@@ -128,6 +130,7 @@ class Variant:
     language: str = ""
     prompt: Prompt | None = None
     replaces_published: bool = False
+    difficulty: Difficulty = EASY
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +157,7 @@ class Task:
         spoilt_as: failure class of an episode with an unreachable goal; None classifies by checkpoints.
         world: assets, placement, contacts and predicates: `memobench` (this package) or `libero` (the paper). A setting
             of the evaluation, never of a task's files.
+        difficulty: variants that are drawn; a setting of the evaluation too.
     """
 
     name: str
@@ -180,10 +184,12 @@ class Task:
     drawn: bool = False
     spoilt_as: str | None = None
     world: World = "memobench"
+    difficulty: Difficulty = STANDARD
 
-    # Compare files, variant and world, so that pickled copies in worker processes are equal and hashable.
-    def _key(self) -> tuple[str, str, str, int, str]:
-        return self.name, self.bddl_text, json.dumps(self.metadata, sort_keys=True), self.variant_index, self.world
+    # Compare files, variant and settings, so that pickled copies in worker processes are equal and hashable.
+    def _key(self) -> tuple[str | int, ...]:
+        metadata = json.dumps(self.metadata, sort_keys=True)
+        return self.name, self.bddl_text, metadata, self.variant_index, self.world, self.difficulty
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Task) and self._key() == other._key()
@@ -200,6 +206,10 @@ class Task:
         check_world(world, self.suite)
         published = self.published and self.published.in_world(world)
         return dataclasses.replace(self, world=world, published=published)
+
+    def at(self, difficulty: Difficulty) -> Task:
+        """Return the task with the variants of another difficulty (strict tasks only)."""
+        return dataclasses.replace(self, difficulty=difficulty)
 
     @property
     def scene_name(self) -> str:
@@ -238,9 +248,10 @@ class Task:
 
     @property
     def random_variants(self) -> tuple[int, ...]:
-        """Indices drawn for a random referent: all, except 0 if a stricter variant replaces it."""
+        """Indices drawn for a random referent: those of the difficulty, without 0 if a stricter variant replaces it."""
         first = 1 if any(variant.replaces_published for variant in self.variants) else 0
-        return tuple(range(first, self.num_variants))
+        harder = {k for k, one in enumerate(self.variants, 1) if not draws(self.difficulty, one.difficulty)}
+        return tuple(k for k in range(first, self.num_variants) if k not in harder)
 
     def variant(self, k: int) -> Task:
         """Return the task with instruction, goal, checkpoints, texts and prompt of variant ``k``; 0 is published."""
