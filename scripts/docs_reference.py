@@ -16,7 +16,7 @@ import re
 import runpy
 import sys
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, NotRequired, Union, get_args, get_origin, get_type_hints
@@ -453,13 +453,34 @@ PROMPTS = {
 
 
 def tasks_page(suite: str) -> str:
-    """Return the cards of a suite's tasks."""
+    """Return the list of a suite's tasks, with links to their cards."""
     from lerobot_memobench.tasks.catalogue import get_task, task_names
+    from lerobot_memobench.tasks.gap import longest_gap
 
     known = needs(suite)
-    title = {"published": "Published tasks", "strict": "Strict tasks"}[suite]
+    rows = []
+    for number, name in enumerate(task_names(suite=suite), 1):
+        task = get_task(name)
+        rates = " · ".join(rate for rate, _ in known.get(name, {}).values())
+        link = f"[{title_of(task)}]({card_page(task)}#{slug(name)})"
+        rows.append([str(number), link, task.memory_type, task.operations, str(longest_gap(task) or "–"), rates])
+    return f"""# {suite.capitalize()} tasks
+
+`tasks=` accepts the numbers and names. *Operations* are those of the checkpoints: Storage, Update, Compression. The
+*gap* is the [longest of the task](gap.md). *Without a memory* is the best rate that was found for a policy that
+decides from pictures alone ([how](../results/necessity.md)), with fixed and with random referents if they differ.
+
+{table(["", "task", "memory type", "operations", "gap, control steps", "without a memory"], rows)}
+"""
+
+
+def cards_page(suite: str, memory_type: str) -> str:
+    """Return the cards of a suite's tasks of one memory type."""
+    from lerobot_memobench.tasks.catalogue import get_task, task_names, task_number
+
+    known = needs(suite)
     parts = [
-        f"# {title}",
+        f"# {suite.capitalize()} {memory_type} tasks",
         "A card per task, made from its files. *Without a memory* is the best rate that was found for a policy that "
         "decides from pictures alone ([how](../results/necessity.md)): a lower bound. The hand's pose and a "
         "clock may tell more.",
@@ -469,25 +490,30 @@ def tasks_page(suite: str) -> str:
             "The robot [idles](protocol.md#idling) before each execution. [Limitations of this "
             "suite](suites.md#limits-of-the-strict-suite)."
         )
-    kind = None
-    for number, name in enumerate(task_names(suite=suite), 1):
-        task = get_task(name)
-        if task.memory_type != kind:
-            kind = task.memory_type
-            parts.append(f"## {kind.capitalize()}")
-        parts += task_parts(number, task, known.get(name, {}))
+    for name in task_names(memory_type, suite):
+        parts += task_parts(task_number(name), get_task(name), known.get(name, {}))
     return "\n\n".join(parts) + "\n"
+
+
+def card_page(task: Any) -> str:
+    """Return the name of the page that holds a task's card."""
+    return f"tasks_{task.suite}_{task.memory_type}.md"
+
+
+def title_of(task: Any) -> str:
+    """Return a task's title: its instruction, or its name if the seed draws the instruction."""
+    title: str = task.name.replace("_", " ") if task.suite == "strict" else task.language
+    return title.capitalize()
 
 
 def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Iterator[str]:
     """Yield one task's card."""
     from lerobot_memobench.evaluation.tables import OPERATION_NAMES
-    from lerobot_memobench.tasks.catalogue import task_number
+    from lerobot_memobench.tasks.catalogue import get_task, task_number
     from lerobot_memobench.tasks.gap import gaps
 
     drawn = task.suite == "strict"  # the seed draws the instruction
-    title = task.name.replace("_", " ") if drawn else task.language
-    yield f"### {number}. {title.capitalize()} {{ #{slug(task.name)} }}"
+    yield f"## {number}. {title_of(task)} {{ #{slug(task.name)} }}"
     yield f"`{task.name}`"
     scene_of = task_number(task.derived_from or task.name)
     yield f"![Initial scene](../figures/tasks/{scene_of:02}.png){{ width=256 loading=lazy }}"
@@ -502,7 +528,8 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
     measured = " · ".join("–" if gap is None else str(gap) for gap in gaps(task))
     rows.append(["[gap](gap.md) of each checkpoint, control steps", measured])
     if task.derived_from:
-        rows.append(["scene of", f"[`{task.derived_from}`](tasks_published.md#{slug(task.derived_from)})"])
+        page = card_page(get_task(task.derived_from))
+        rows.append(["scene of", f"[`{task.derived_from}`]({page}#{slug(task.derived_from)})"])
     for referent, (rate, verdict) in known.items():
         where = "" if referent in ("both", "drawn") else f", referent {referent}"
         rows += [
@@ -543,6 +570,7 @@ def scene(number: int) -> bytes:
 
 # --- the site ---
 
+SUITES, MEMORY_TYPES = ("published", "strict"), ("temporal", "spatial", "object", "procedural")
 PAGES: dict[str, Callable[[], str]] = {
     "reference/lerobot.md": lerobot_page,
     "reference/memobench.md": memobench_page,
@@ -551,8 +579,12 @@ PAGES: dict[str, Callable[[], str]] = {
     "reference/schemas.md": schemas_page,
     "reference/policies.md": policies_page,
     "reference/python.md": python_page,
-    "benchmark/tasks_published.md": lambda: tasks_page("published"),
-    "benchmark/tasks_strict.md": lambda: tasks_page("strict"),
+    **{f"benchmark/tasks_{suite}.md": partial(tasks_page, suite) for suite in SUITES},
+    **{
+        f"benchmark/tasks_{suite}_{memory_type}.md": partial(cards_page, suite, memory_type)
+        for suite in SUITES
+        for memory_type in MEMORY_TYPES
+    },
 }
 """Generated page of the site -> function that returns its text."""
 

@@ -468,9 +468,14 @@ def test_task_pages_have_a_card_per_task() -> None:
     from lerobot_memobench.tasks.catalogue import task_names
 
     for suite in ("published", "strict"):
-        text = reference.tasks_page(suite)
-        assert all(f"\n`{task}`\n" in text for task in task_names(suite=suite))
-        assert text.count("needs a memory") >= 30
+        index = reference.tasks_page(suite)
+        for memory_type in ("temporal", "spatial", "object", "procedural"):
+            page = f"tasks_{suite}_{memory_type}.md"
+            cards = reference.PAGES[f"benchmark/{page}"]()
+            names = task_names(memory_type, suite)
+            assert all(f"\n`{name}`\n" in cards for name in names)
+            assert all(f"({page}#{reference.slug(name)})" in index for name in names)
+            assert cards.count("needs a memory") >= len(names)
 
 
 @pytest.mark.parametrize("number", [1, 6, 20, 30])

@@ -10,7 +10,7 @@ from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.difficulty import STANDARD, degree_of
 from lerobot_memobench.tasks.gap import gaps
 
-EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096)
+EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
 """Bounds of the groups, control steps; the first group needs no memory over time."""
 GROUPS = [f"{low}–{high - 1}" for low, high in pairwise(EDGES)]
 

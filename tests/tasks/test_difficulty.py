@@ -1,0 +1,90 @@
+"""Difficulties of strict tasks: variants, idling and horizon; the standard one is the suite as published."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from lerobot_memobench.envs.episode import Episode, referent_of
+from lerobot_memobench.envs.episode_log import differences
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.gaps import success_by_gap
+from lerobot_memobench.protocol import ACTION_DIM
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Difficulty
+from lerobot_memobench.tasks.task import STRICT
+from tests.support.logs import rollout
+
+STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
+HIDING = "find_the_artichoke_hidden_in_one_of_the_drawers"
+
+
+@pytest.mark.parametrize(("difficulty", "most"), list(zip(DIFFICULTIES, (2, 3, 5, 8), strict=True)))
+def test_a_difficulty_draws_all_counts_up_to_its_own(difficulty: Difficulty, most: int) -> None:
+    task = get_task(STOVE).at(difficulty)
+    drawn = Counter(referent_of(task, seed).language for seed in range(20_000, 20_000 + 3 * most))
+    words = ("once", "twice", *(f"{word} times" for word in ["three", "four", "five", "six", "seven", "eight"]))
+    asked = {f"turn the stove on and off {times}, leaving everything as it was": 3 for times in words[:most]}
+    assert drawn == asked
+
+
+def test_only_counting_tasks_have_harder_variants() -> None:
+    for name in task_names(suite=STRICT):
+        drawn = {len(get_task(name).at(difficulty).random_variants) for difficulty in DIFFICULTIES}
+        assert (len(drawn) > 1) == (get_task(name).family == "counting")
+
+
+@pytest.mark.parametrize(
+    ("difficulty", "idle", "horizon"), [("easy", 900, 1200), ("standard", 1800, 1200), ("extreme", 7200, 3200)]
+)
+def test_a_difficulty_sets_idling_and_horizon(difficulty: str, idle: int, horizon: int) -> None:
+    settings = EnvSettings(suite=STRICT, difficulty=difficulty)
+    assert (settings.horizon, settings.protocol_block["idle"]) == (horizon, idle)
+    assert EnvSettings(suite=STRICT, difficulty=difficulty, horizon=700).horizon == 700
+    episode = Episode(get_task(STOVE), settings)
+    episode.reset(20_000)
+    begins = episode._execution_step
+    assert 0 <= begins <= idle
+    assert begins == pytest.approx(idle * _share(20_000), abs=2)
+
+
+def _share(seed: int) -> float:
+    """Return the drawn share of the idling time, the same at all difficulties."""
+    episode = Episode(get_task(STOVE), EnvSettings(suite=STRICT))
+    episode.reset(seed)
+    return episode._execution_step / 1800
+
+
+def test_the_expert_counts_to_eight() -> None:
+    episode = Episode(get_task(STOVE).at("extreme"), EnvSettings(suite=STRICT, difficulty="extreme"))
+    episode.reset(20_000, variant=7)
+    while episode.phase == 0:
+        episode.step(np.zeros(ACTION_DIM))
+    while not episode.done:
+        episode.step(episode.expert_action())
+    assert (episode.success, episode.progress.index) == (True, 4)
+    assert episode.exec_steps > 1200
+
+
+def test_a_difficulty_is_for_strict_tasks_and_known() -> None:
+    with pytest.raises(MemobenchError, match="difficulty=hard is for strict tasks; set suite=strict"):
+        EnvSettings(difficulty="hard")
+    with pytest.raises(MemobenchError, match="easy"):
+        EnvSettings(suite=STRICT, difficulty="esay")
+
+
+def test_evaluations_of_two_difficulties_differ_and_earlier_protocols_are_standard() -> None:
+    hard, standard = (EnvSettings(suite=STRICT, difficulty=each).protocol_block for each in ("hard", STANDARD))
+    assert {each.split(":")[0] for each in differences(hard, standard)} == {"difficulty", "horizon", "idle"}
+    earlier = {name: value for name, value in standard.items() if name != "difficulty"}
+    assert differences(earlier, standard) == []
+
+
+def test_gaps_contain_the_idling_of_the_difficulty() -> None:
+    records = [rollout(HIDING, "spatial", "SUC", [False] * 3, False, 0, seed=seed) for seed in range(20_000, 20_040)]
+    groups = {name: list(success_by_gap(records, name)) for name in (STANDARD, "extreme")}
+    assert "4096–8191" in groups["extreme"]
+    assert "4096–8191" not in groups[STANDARD]
