@@ -22,6 +22,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, NotRequired, Union, get_args, get_origin, get_type_hints
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "src")]  # MkDocs runs this file without the checkout on its path
 SOURCE = ROOT / "src" / "lerobot_memobench"
 DOCS = ROOT / "docs"
 NECESSITY = ROOT / "results" / "necessity.parquet"
@@ -428,13 +429,17 @@ def python_page() -> str:
 
 
 def needs(suite: str) -> dict[str, dict[str, tuple[str, str]]]:
-    """Return task -> referent -> (best rate found without a memory in %, verdict)."""
+    """Return task -> referent -> (rate without a memory in %, verdict); the rate is a ceiling for strict tasks."""
     import pyarrow.parquet as pq
+
+    from lerobot_memobench.tasks.catalogue import get_task
+    from research.necessity.adversaries import ceiling
 
     found: dict[str, dict[str, tuple[str, str]]] = {}
     for row in pq.read_table(NECESSITY, filters=[("suite", "==", suite)]).to_pylist():
         rates = [row[key] for key in ("fixed_map", "any_order", "any_order_probabilities") if row[key] is not None]
-        found.setdefault(row["task"], {})[row["referent"]] = (f"{max(rates):.0f} %", row["memory_needed"])
+        rate = 100 * ceiling(get_task(row["task"])) if suite == "strict" else max(rates)
+        found.setdefault(row["task"], {})[row["referent"]] = (f"{rate:.0f} %", row["memory_needed"])
     return found
 
 
@@ -443,6 +448,14 @@ VERDICTS = {
     "order": "no: the goal also accepts another order, in which the current image determines each action",
     "yes": "yes: no policy that uses only the current images was found to succeed",
 }
+WITHOUT = {
+    "published": "*Without a memory* is the best rate that was found for a policy that decides from pictures alone "
+    "([how](../results/necessity.md)), with fixed and with random referents if they differ: a lower bound, because the "
+    "hand's pose and a clock can reveal more.",
+    "strict": "*Without a memory* is the [ceiling](suites.md#ceilings) of policies that decide at every step by the "
+    "present observation.",
+}
+"""Suite -> how the rate without a memory was found."""
 PROMPTS = {
     "routine": "shows the procedure",
     "pick": "picks up the referent",
@@ -467,8 +480,7 @@ def tasks_page(suite: str) -> str:
     return f"""# {suite.capitalize()} tasks
 
 `tasks=` accepts the numbers and names. *Operations* are those of the checkpoints: Storage, Update, Compression. The
-*gap* is the [longest of the task](gap.md). *Without a memory* is the best rate that was found for a policy that
-decides from pictures alone ([how](../results/necessity.md)), with fixed and with random referents if they differ.
+*gap* is the [longest of the task](gap.md). {WITHOUT[suite]}
 
 {table(["", "task", "memory type", "operations", "gap, control steps", "without a memory"], rows)}
 """
@@ -481,9 +493,7 @@ def cards_page(suite: str, memory_type: str) -> str:
     known = needs(suite)
     parts = [
         f"# {suite.capitalize()} {memory_type} tasks",
-        "A card per task, made from its files. *Without a memory* is the best rate that was found for a policy that "
-        "decides from pictures alone ([how](../results/necessity.md)): a lower bound. The hand's pose and a "
-        "clock may tell more.",
+        f"A card per task, made from its files. {WITHOUT[suite]}",
     ]
     if suite == "strict":
         parts.append(
@@ -623,7 +633,6 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the generated pages (called by MkDocs)."""
     from mkdocs.structure.files import File
 
-    sys.path.insert(0, str(ROOT / "src"))
     for path, make in PAGES.items():
         files.append(File.generated(config, path, content=make()))
     for source, path in COPIES.items():

@@ -70,7 +70,7 @@ def ceiling(task: Task) -> float:
     the first choice decides, and the observation is the same for all variants.
     """
     if task.family == "counting":
-        return float(np.mean([counted(number, rest_steps(task.goal)) for number in (1, 2, 3)]))
+        return float(np.mean([counted(1 + k, rest_steps(task.goal)) for k in task.random_variants]))
     if task.family == "ordering":
         return 1 / 27 if "three" in task.name else 1 / 4
     found = chance(task)
