@@ -109,7 +109,7 @@ function showSubgoal(line, episode, frame, level) {
 
 function whenWords({ phase, checkpoint }) {
   if (phase === "prompt") return "";
-  if (phase === "execution") return "Now: ";
+  if (phase === "execution") return checkpoint === null ? "" : "Next checkpoint: ";
   return checkpoint === null ? "At the end: " : "Still open at the end: ";
 }
 

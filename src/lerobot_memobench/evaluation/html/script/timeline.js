@@ -72,7 +72,7 @@ function subgoalWords(episode, now, level) {
   return checkpointText(episode.task, episode.variant, now.checkpoint, level);
 }
 
-/** Tell where the pointer is, from 0 to 1, and follow it while it is held down. Marks and cells seek by their own click. */
+/** Report the place of the pointer, from 0 to 1, and follow it while it is held down. Marks and cells seek by their own click. */
 function drag(event, root, slider, moved) {
   if (event.button !== 0 || event.target.closest(".mark, .cell") || !event.target.closest(".track")) return;
   const follow = ({ clientX }) => {
