@@ -1,6 +1,6 @@
 // What is selected is in the address after #, so a view can be bookmarked, sent to somebody and gone back to.
 
-const KEYS = ["view", "run", "beside", "type", "task", "op", "outcome", "q", "ep", "level"];
+const KEYS = ["view", "run", "second", "type", "task", "op", "outcome", "q", "ep", "level"];
 const VIEWS = DATA.runs.length > 1 ? ["overview", "episodes", "compare"] : ["overview", "episodes"];
 const FILTERS = ["type", "task", "op", "outcome", "q"];
 
@@ -11,18 +11,18 @@ function selection() {
   if (!DATA.runs.some((run) => run.name === chosen.run)) chosen.run = DATA.runs[0].name;
   if (!DATA.levels.includes(chosen.level)) chosen.level = "intermediate";
   if (!VIEWS.includes(chosen.view)) chosen.view = "overview";
-  if (!others(chosen.run).includes(chosen.beside)) chosen.beside = others(chosen.run)[0] ?? "";
+  if (!others(chosen.run).includes(chosen.second)) chosen.second = others(chosen.run)[0] ?? "";
   return chosen;
 }
 
-/** The names of the runs beside one. */
+/** Return the names of the other runs. */
 const others = (name) => DATA.runs.map((run) => run.name).filter((it) => it !== name);
 
 /** The address of the present selection with some changes. */
 function address(changes) {
   const next = new URLSearchParams();
   const values = { ...selection(), ...changes };
-  const defaults = { view: "overview", run: DATA.runs[0].name, level: "intermediate", beside: others(values.run)[0] };
+  const defaults = { view: "overview", run: DATA.runs[0].name, level: "intermediate", second: others(values.run)[0] };
   for (const key of KEYS) if (values[key] && values[key] !== defaults[key]) next.set(key, values[key]);
   return `#${next}`;
 }

@@ -53,8 +53,8 @@ const detail = {
       .map(([run, episode]) =>
         el("a", { href: address({ run: run.name, ep: episode.id }) }, outcomeMark(episode.outcome), run.name),
       );
-    const beside = el("a", { href: address({ view: "compare", ep: this.episode.id }) }, "side by side");
-    this.others.replaceChildren(...(links.length ? ["Same episode in ", ...links, beside] : []));
+    const pair = el("a", { href: address({ view: "compare", ep: this.episode.id }) }, "side by side");
+    this.others.replaceChildren(...(links.length ? ["Same episode in ", ...links, pair] : []));
   },
 
   clear() {

@@ -22,7 +22,7 @@ function dress(element, attributes, children) {
   return element;
 }
 
-/** Storage is a circle, Update a square, Compression a diamond: to be told apart without colour. */
+/** Storage is a circle, Update a square, Compression a diamond: distinguished without colour. */
 const OUTLINES = {
   S: () => svg("circle", { cx: 10, cy: 10, r: 8 }),
   U: () => svg("rect", { x: 2.5, y: 2.5, width: 15, height: 15, rx: 2.5 }),

@@ -43,7 +43,7 @@ function hasOutcome(episode, outcome) {
 
 const solved = (episode) => episode.outcome === "success";
 
-/** What a pair of rollouts can be found by, beside the outcomes of either. */
+/** Outcomes of a pair of rollouts, in addition to the outcomes of either. */
 const PAIR_OUTCOMES = {
   differs: ["only one succeeded", (a, b) => solved(a) !== solved(b)],
   first: ["only the first succeeded", (a, b) => solved(a) && !solved(b)],

@@ -78,27 +78,27 @@ function draw() {
   if (changed("view")) fillOutcomes(compared);
   if (changed("run"))
     options(
-      byId("beside"),
+      byId("second"),
       others(chosen.run).map((name) => [name, name]),
     );
-  byId("beside").parentElement.hidden = !compared;
-  for (const key of ["run", "beside", "level", "type", "task", "op", "outcome"]) byId(key).value = chosen[key];
+  byId("second").parentElement.hidden = !compared;
+  for (const key of ["run", "second", "level", "type", "task", "op", "outcome"]) byId(key).value = chosen[key];
   const filters = FILTERS.filter((key) => key !== "q" && chosen[key]).length;
   byId("chosen").textContent = filters ? ` (${filters})` : "";
   if (document.activeElement !== byId("q")) byId("q").value = chosen.q;
   if (!compared) pair.clear();
   if (overview) detail.stop();
   if (overview) drawOverview(run, chosen);
-  else drawEpisodes(run, chosen, changed("run", "beside", "view", "level", ...FILTERS));
+  else drawEpisodes(run, chosen, changed("run", "second", "view", "level", ...FILTERS));
   document.title = `${overview || !list.selected ? run.name : taskTitle(list.selected.task)} · MEMOBench`;
   if (drawn.view === chosen.view && changed("ep") && byId("more").open === false) byId("detail").scrollIntoView();
   drawn = chosen;
 }
 
 function drawEpisodes(run, chosen, refill) {
-  const beside = chosen.view === "compare" ? runNamed(chosen.beside) : null;
+  const second = chosen.view === "compare" ? runNamed(chosen.second) : null;
   if (refill) {
-    const partners = beside && new Map(beside.episodes.map((episode) => [episode.id, episode]));
+    const partners = second && new Map(second.episodes.map((episode) => [episode.id, episode]));
     const found = filtered(run, chosen, partners);
     const good = found.filter(solved).length;
     const others = partners && found.filter(({ id }) => solved(partners.get(id))).length;
@@ -110,21 +110,21 @@ function drawEpisodes(run, chosen, refill) {
     list.fill(found, partners);
   }
   // Without a selection, or where a filter hides it: side by side the first pair that ends differently, else the first.
-  const differs = (it) => beside && solved(it) !== solved(list.partners.get(it.id));
+  const differs = (it) => second && solved(it) !== solved(list.partners.get(it.id));
   const episode =
     list.episodes.find((it) => it.id === chosen.ep) ?? list.episodes.find(differs) ?? list.episodes[0];
   list.selected = episode;
   if (!episode) return (pair.clear(), detail.clear());
   list.mark(episode.id);
-  if (beside || detail.episode !== episode) detail.stop();
-  if (!beside) return detail.draw(run, episode, chosen);
+  if (second || detail.episode !== episode) detail.stop();
+  if (!second) return detail.draw(run, episode, chosen);
   detail.episode = null;
-  pair.draw([run, beside], [episode, list.partners.get(episode.id)], chosen);
+  pair.draw([run, second], [episode, list.partners.get(episode.id)], chosen);
 }
 
 function listen() {
   addEventListener("hashchange", draw);
-  for (const key of ["run", "beside", "level", "task", "op", "outcome"])
+  for (const key of ["run", "second", "level", "task", "op", "outcome"])
     byId(key).addEventListener("change", (event) => select({ [key]: event.target.value }, { keepHistory: true }));
   byId("type").addEventListener("change", (event) =>
     select({ type: event.target.value, task: "" }, { keepHistory: true }),
