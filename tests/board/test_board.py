@@ -441,6 +441,19 @@ def test_export_for_hugging_face(board: Path) -> None:
     assert "inputs: pixels" in str(entries[0].notes)
 
 
+def test_export_names_other_settings(evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A result at another difficulty has no overall score, even with all episodes."""
+    monkeypatch.setattr("lerobot_memobench.board.exports.MOST", 10)
+    folder = shutil.copytree(evaluated, tmp_path / "easy")
+    assert json.loads(vla_eval_json(read_runs([folder])[0]))["results"][0]["overall_score"] == pytest.approx(60.0)
+    in_card(lambda card: card["protocol"].update(difficulty="easy", idle=900))(folder)
+    (run,) = read_runs([folder])
+    (entry,) = json.loads(vla_eval_json(run))["results"]
+    assert entry["overall_score"] is None
+    assert "not the settings of the board (difficulty: easy and standard" in entry["notes"]
+    assert "difficulty: easy" in huggingface_yaml(run, "user/memobench")
+
+
 VLA_EVAL_FIELDS: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("model", "display_name", "benchmark", "curated_by", "notes", "date_added", "weight_type"), str),
     **dict.fromkeys(("reported_paper", "params"), (str, type(None))),

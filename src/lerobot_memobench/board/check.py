@@ -120,6 +120,12 @@ def check_submission(submission: Submission, others: Sequence[Submission] = ()) 
 # --- protocol ---
 
 
+def departures(protocol: Mapping[str, Any], **control: Any) -> list[str]:
+    """Return the settings that differ from those of the board, and of a control; raise for unknown values."""
+    board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
+    return differences(protocol, board.protocol_block, ignore=MAY_DIFFER)
+
+
 def _check_protocol(run: Evaluation, **control: Any) -> None:
     """Check that the card's settings are those of the board, and of a control."""
     protocol = run.protocol
@@ -132,7 +138,7 @@ def _check_protocol(run: Evaluation, **control: Any) -> None:
         raise MemobenchError(
             f"{run.place}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
         )
-    if found := differences(protocol, fixed, ignore=MAY_DIFFER):
+    if found := departures(protocol, **control):
         raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
 
 
