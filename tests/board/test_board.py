@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.board.__main__ import main as check_board
-from lerobot_memobench.board.check import check_paths, check_submission, read_board
+from lerobot_memobench.board.check import check_partners, check_paths, check_submission, read_board
 from lerobot_memobench.board.exports import huggingface_yaml, vla_eval_json
 from lerobot_memobench.board.rows import board_row, board_rows
 from lerobot_memobench.board.submission import CARD, LOG, About, read_submission, write_submission
@@ -58,6 +58,7 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
         **{"variant": task.variant_index, "replan_steps": 5, "prompt_steps": 100, "prompt_shown": None},
         **{"steps": 900 + scene, "success": success},
         **(choice if settings.get("evidence") else {}),
+        **({"paused_steps": 500} if settings.get("pause_steps") else {}),
         "checkpoints": [
             {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
             for c, step in zip(task.checkpoints, marks, strict=True)
@@ -98,6 +99,19 @@ def board(evaluated: Path) -> Path:
     """A board with one valid row; do not change it."""
     write_submission(evaluated.parent / "board" / "one", About(**ABOUT), {"": evaluated})
     return evaluated.parent / "board"
+
+
+@pytest.fixture(scope="module")
+def with_controls(board: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A valid submission with both controls, whose partner is the row of ``board``; do not change it."""
+    place = tmp_path_factory.mktemp("controls")
+    folders = {
+        "": evaluation(place / "m", speed=60),
+        "evidence": evaluation(place / "e", evidence=True),
+        "pauses": evaluation(place / "p", pause_steps=100),
+    }
+    about = About(**ABOUT | {"without_memory": "one", "links": {"code": "https://one.example/code"}})
+    return write_submission(place / "board" / "two", about, folders)
 
 
 def test_valid_submission_is_accepted(board: Path) -> None:
@@ -147,7 +161,10 @@ def stating(key: str, value: Any) -> Callable[[Path], None]:
 
 
 def to_success(records: list[Json]) -> None:
-    first_failure(records).update(success=True, failure=None)
+    record = first_failure(records)
+    record.update(success=True, failure=None)
+    for mark in record["checkpoints"]:
+        mark.update(first_step=50, ordered_step=50)
 
 
 def later(records: list[Json]) -> None:
@@ -186,6 +203,17 @@ DOCTORED: dict[str, tuple[Callable[[Path], object], str]] = {
     "edited log": (in_log(to_success), "card and log disagree"),
     "success with a failure class": (in_log(lambda log: first_failure(log).update(success=True), card=True), "failure"),
     "checkpoint after the end": (in_log(lambda log: log[1].update(steps=10), card=True), "checkpoints within them"),
+    "order after the end": (
+        in_log(lambda log: log[0]["checkpoints"][0].update(ordered_step=10**9), card=True),
+        "checkpoints within them",
+    ),
+    "success without checkpoints": (
+        in_log(lambda log: first_failure(log).update(success=True, failure=None), card=True),
+        "a success without all checkpoints",
+    ),
+    "unknown observations": (in_card(lambda card: card["protocol"].update(obs_type="eyes")), "obs_type is 'eyes'"),
+    "line of a control": (in_log(lambda log: log[0].update(corrupt="delete")), "corrupt=delete and the card"),
+    "pauses in the log only": (in_log(lambda log: log[0].update(paused_steps=300)), "has {'paused_steps': 300}"),
     "other seeds": (in_card(lambda card: card["protocol"].update(seed_base=20_000)), "seeds that count"),
     "shifted seed": (in_log(lambda log: log[3].update(seed=99), card=True), "has the seed 99"),
     "other variant": (in_log(other_variant, card=True), "drew the variants"),
@@ -227,6 +255,25 @@ def test_doctored_submission_is_refused(board: Path, tmp_path: Path, name: str) 
     assert "\n" not in str(refused.value)
 
 
+DOCTORED_CONTROLS: dict[str, tuple[str, Callable[[Path], object], str]] = {
+    "short pauses": ("pauses", in_card(lambda card: card["protocol"].update(pause_steps=1)), "pause_steps: 1 and 100"),
+    "log without pauses": ("pauses", in_log(lambda log: [each.pop("paused_steps") for each in log]), "paused_steps"),
+    "missing setting": ("pauses", in_card(lambda card: card["protocol"].pop("horizon")), "lacks horizon"),
+    "lower chance": ("evidence", in_log(lambda log: [each.update(chance=0.0) for each in log]), "'chance': 0.0"),
+    "no answer chosen": ("evidence", in_log(lambda log: log[1].update(answered=False), card=True), "answered"),
+    "parts of scenes": ("evidence", in_card(lambda card: card["protocol"].update(episodes=10)), "expected 12 to 600"),
+}
+
+
+@pytest.mark.parametrize("name", DOCTORED_CONTROLS)
+def test_doctored_control_is_refused(with_controls: Path, tmp_path: Path, name: str) -> None:
+    control, change, reason = DOCTORED_CONTROLS[name]
+    folder = shutil.copytree(with_controls, tmp_path / "two")
+    change(folder / control)
+    with pytest.raises(MemobenchError, match=reason):
+        check_submission(read_submission(folder))
+
+
 def test_committed_sealed_result_is_accepted(board: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(board / "one", tmp_path / "one")
     sealed(folder)
@@ -238,8 +285,13 @@ def test_committed_sealed_result_is_accepted(board: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     "change",
-    [None, in_log(to_success, card=True), in_log(later, card=True)],
-    ids=["copied", "copied with another success", "copied with later ends"],
+    [
+        None,
+        in_log(to_success, card=True),
+        in_log(later, card=True),
+        in_log(lambda log: [each.update(scene_hash=None) for each in log], card=True),
+    ],
+    ids=["copied", "copied with another success", "copied with later ends", "copied without hashes of scenes"],
 )
 def test_copied_card_is_refused(board: Path, tmp_path: Path, change: Callable[[Path], None] | None) -> None:
     both = shutil.copytree(board, tmp_path / "board")
@@ -248,6 +300,30 @@ def test_copied_card_is_refused(board: Path, tmp_path: Path, change: Callable[[P
         change(copy)
     with pytest.raises(MemobenchError, match="has the episodes of the row 'one'"):
         read_board(both)
+
+
+def test_partner_is_another_row_of_the_same_protocol(with_controls: Path, board: Path, tmp_path: Path) -> None:
+    others = read_board(board)
+    check_partners([*others, read_submission(with_controls)])
+    folder = shutil.copytree(with_controls, tmp_path / "two")
+    stating("without_memory", "two")(folder)
+    with pytest.raises(MemobenchError, match="'two', is no other row; known are 'one'"):
+        check_partners([*others, read_submission(folder)])
+    stating("without_memory", "one")(folder)
+    in_card(lambda card: card["protocol"].update(replan_steps=10))(folder)
+    with pytest.raises(MemobenchError, match="differ in replan_steps: 10 and 5"):
+        check_partners([*others, read_submission(folder)])
+
+
+def test_refusal_is_one_line(board: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A line of its own would be a command of GitHub's workflow, such as ``::add-mask::``."""
+    both = shutil.copytree(board, tmp_path / "board")
+    in_card(lambda card: card["protocol"].update(render="\n::error::x"))(both / "one")
+    assert check_board([str(both)]) == 1
+    assert check_board([str(tmp_path / "nowhere")]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert "render:  ::error::x and default" in first
+    assert "No such file" in second
 
 
 @pytest.mark.parametrize("name", ["One", "a b", "..", "<b>", "a" * 65])
@@ -259,14 +335,9 @@ def test_unsafe_names_of_rows_are_refused(tmp_path: Path, name: str) -> None:
 # --- controls, the page ---
 
 
-def test_row_with_controls(evaluated: Path, board: Path, tmp_path: Path) -> None:
+def test_row_with_controls(with_controls: Path, board: Path, tmp_path: Path) -> None:
     """The policy is as good with pauses, and partners are shown by their SR."""
-    controls = {
-        "evidence": evaluation(tmp_path / "e", evidence=True),
-        "pauses": evaluation(tmp_path / "p", pause_steps=100),
-    }
-    about = About(**ABOUT | {"without_memory": "one", "links": {"code": "https://one.example/code"}})
-    folder = write_submission(tmp_path / "board" / "two", about, {"": evaluation(tmp_path / "m", speed=60), **controls})
+    folder = shutil.copytree(with_controls, tmp_path / "two")
     others = read_board(board)
     check_submission(found := read_submission(folder), others)
     row = board_row(found, others)
@@ -294,7 +365,10 @@ def test_submission_of_a_new_user_is_accepted(
     words = ["submit", str(evaluated), "--name", "mine", "--model", "Mine", "--submitter", "@me"]
     words += ["--training-data", "1,500 demonstrations", "--parameters", "450000000", "--out", "out"]
     assert main([*words[:5], "<b>", *words[6:]]) == 2
-    assert not Path("out/mine").exists()
+    assert main([*words[:3], "../mine", *words[4:]]) == 2
+    assert main([*words, "--pauses", str(evaluated)]) == 2
+    assert "memobench: mine/pauses: pause_steps: 0" in capsys.readouterr().err
+    assert not Path("out").exists()
     assert main(words) == 0
     text = Path("out/mine.md").read_text()
     assert "| SR | 60.0 [" in text
@@ -308,6 +382,17 @@ def test_submission_of_a_new_user_is_accepted(
     assert "also changes 'src/" in capsys.readouterr().err
     assert main([*words[:3], "other", *words[4:]]) == 2  # a copy of the row that is there now
     assert "has the episodes of the row 'mine'" in capsys.readouterr().err
+
+
+def test_submission_replaces_an_earlier_one_only(with_controls: Path, evaluated: Path, tmp_path: Path) -> None:
+    """No control of the earlier submission remains, and no evaluation is overwritten."""
+    folder = shutil.copytree(with_controls, tmp_path / "two")
+    write_submission(folder, About(**ABOUT), {"": evaluated})
+    assert sorted(path.name for path in folder.iterdir()) == [LOG, CARD]
+    before = (evaluated / CARD).read_bytes()
+    with pytest.raises(MemobenchError, match="holds no submission"):
+        write_submission(evaluated, About(**ABOUT), {"": evaluated})
+    assert (evaluated / CARD).read_bytes() == before
 
 
 def test_other_pull_requests_may_change_any_file() -> None:
@@ -354,6 +439,19 @@ def test_export_for_hugging_face(board: Path) -> None:
     assert [entry.task_id for entry in entries] == ["strict_sr", "strict_msr", "strict_mur", "strict_mcr"]
     assert (entries[0].dataset_id, entries[0].value) == ("user/memobench", 60.0)
     assert "inputs: pixels" in str(entries[0].notes)
+
+
+def test_export_names_other_settings(evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A result at another difficulty has no overall score, even with all episodes."""
+    monkeypatch.setattr("lerobot_memobench.board.exports.MOST", 10)
+    folder = shutil.copytree(evaluated, tmp_path / "easy")
+    assert json.loads(vla_eval_json(read_runs([folder])[0]))["results"][0]["overall_score"] == pytest.approx(60.0)
+    in_card(lambda card: card["protocol"].update(difficulty="easy", idle=900))(folder)
+    (run,) = read_runs([folder])
+    (entry,) = json.loads(vla_eval_json(run))["results"]
+    assert entry["overall_score"] is None
+    assert "not the settings of the board (difficulty: easy and standard" in entry["notes"]
+    assert "difficulty: easy" in huggingface_yaml(run, "user/memobench")
 
 
 VLA_EVAL_FIELDS: dict[str, type | tuple[type, ...]] = {

@@ -50,7 +50,7 @@ BAD: dict[str, tuple[Any, ...]] = {
     "render": ("ultra",),
     "oracle_memory": (1,),
     "pause_steps": (-1,),
-    "speed": (0.0, 0.7, 2.0, float("nan"), "0.5"),
+    "speed": (0.0, 1e-320, 0.7, 2.0, float("nan"), "0.5"),
     "corrupt": ("erase",),
     "interference": (-1, 1.5),
     "evidence": (True,),  # not with the published referent

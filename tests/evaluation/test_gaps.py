@@ -41,6 +41,9 @@ def test_checkpoints_are_grouped_by_gap() -> None:
     found = success_by_gap(records)
     assert sum(count for _, count in found.values()) == 4 + 3 + 2
     assert sum(reached for reached, _ in found.values()) == 4 + 2 + 1
+    for record in records:  # logs of other tools omit it, as in prefix completion
+        record["checkpoints"][0].pop("ordered_step", None)
+    assert sum(reached for reached, _ in success_by_gap(records).values()) == 0
     assert success_by_gap([rollout("my_own_task", "temporal", "S", [True], True, 0)]) == {}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,13 @@ def test_a_difficulty_draws_all_counts_up_to_its_own(difficulty: Difficulty, mos
     words = ("once", "twice", *(f"{word} times" for word in ["three", "four", "five", "six", "seven", "eight"]))
     asked = {f"turn the stove on and off {times}, leaving everything as it was": 3 for times in words[:most]}
     assert drawn == asked
+
+
+@pytest.mark.parametrize(("difficulty", "horizon", "cut"), [("hard", 2000, False), ("hard", 1500, True)])
+def test_a_horizon_below_that_of_the_difficulty_cuts_off(difficulty: str, horizon: int, cut: bool) -> None:
+    settings = EnvSettings(suite=STRICT, difficulty=difficulty, horizon=horizon)
+    ended = SimpleNamespace(settings=settings, exec_steps=horizon, _limit=horizon, success=False, lost=False)
+    assert Episode.cut_off.fget(ended) == cut  # type: ignore[attr-defined]
 
 
 def test_only_counting_tasks_have_harder_variants() -> None:

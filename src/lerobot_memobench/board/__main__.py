@@ -20,10 +20,11 @@ def main(words: list[str]) -> int:
         return 2
     try:
         if words[1:]:
-            check_paths(filter(None, Path(words[1]).read_text().split("\0")))
+            check_paths(filter(None, Path(words[1]).read_bytes().decode(errors="replace").split("\0")))
         rows = read_board(Path(words[0]))
-    except MemobenchError as error:
-        print(f"refused: {error}", file=sys.stderr)
+    except (MemobenchError, OSError) as error:  # quoted lines could be commands of the workflow
+        printable = "".join(letter if letter.isprintable() else " " for letter in str(error))
+        print(f"refused: {printable}", file=sys.stderr)
         return 1
     print(f"accepted: {', '.join(row.name for row in rows)}")
     return 0

@@ -13,9 +13,9 @@ from typing import Any
 
 from lerobot_memobench.board.submission import EVIDENCE, PAUSES, Evaluation, Submission, read_submission
 from lerobot_memobench.datasets.generation import task_hash
-from lerobot_memobench.envs.episode_log import INPUTS, OMITTED, POLICY, differences
+from lerobot_memobench.envs.episode_log import INPUTS, OF_THE_POLICY, OMITTED, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, SIMULATOR
-from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.metrics import failure_of, operations, seed_base
@@ -33,7 +33,9 @@ MAY_DIFFER = {
     *("suite", "world", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
 }
 """Settings of the protocol that a submission may choose; all others have their defaults."""
-CONTROL_SETTING = {EVIDENCE: "evidence", PAUSES: "pause_steps"}
+CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {EVIDENCE: {"evidence": True}, PAUSES: {"pause_steps": 100}}
+CONTROL_FIELDS = ("paused_steps", "choice", "answered", "variants", "chance")
+"""Fields of a line of the log that only a control has."""
 KNOWN_INPUTS = (PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, NO_INPUT)
 COPIED = 0.5
 """Share of equal successful episodes, step for step, from which on one log counts as a copy of another."""
@@ -55,17 +57,25 @@ def read_board(board: Path) -> list[Submission]:
 
 
 def check_partners(submissions: Sequence[Submission]) -> None:
-    """Check that each partner without a memory is a row of the board.
+    """Check that each partner without a memory is another row of the board, with the same protocol.
 
     Raises:
         MemobenchError: one is not.
     """
-    names = [submission.name for submission in submissions]
+    protocols = {submission.name: submission.evaluation.protocol for submission in submissions}
     for submission in submissions:
-        partner = submission.about.without_memory
-        if partner is not None and partner not in names:
+        mine, partner = submission.name, submission.about.without_memory
+        others = protocols.keys() - {mine}
+        if partner is None:
+            continue
+        if partner not in others:
             raise MemobenchError(
-                f"{submission.name}: the partner without a memory, {partner!r}, is no row; {nearest(partner, names)}"
+                f"{mine}: the partner without a memory, {partner!r}, is no other row; {nearest(partner, others)}"
+            )
+        if found := differences(protocols[mine], protocols[partner], ignore=OF_THE_POLICY):
+            raise MemobenchError(
+                f"{mine} and its partner without a memory, {partner}, differ in {found[0]}; evaluate both with the "
+                "same settings"
             )
 
 
@@ -110,33 +120,38 @@ def check_submission(submission: Submission, others: Sequence[Submission] = ()) 
 # --- protocol ---
 
 
-def _check_protocol(run: Evaluation) -> None:
-    """Check that the card's settings are those of the board."""
+def departures(protocol: Mapping[str, Any], **control: Any) -> list[str]:
+    """Return the settings that differ from those of the board, and of a control; raise for unknown values."""
+    board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
+    return differences(protocol, board.protocol_block, ignore=MAY_DIFFER)
+
+
+def _check_protocol(run: Evaluation, **control: Any) -> None:
+    """Check that the card's settings are those of the board, and of a control."""
     protocol = run.protocol
-    expected = EnvSettings(**{key: protocol[key] for key in ("suite", "world", "referent") if key in protocol})
+    try:
+        expected = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
+    except MemobenchError as error:
+        raise MemobenchError(f"{run.place}: {error}") from None
     fixed = {key: value for key, value in expected.protocol_block.items() if key not in MAY_DIFFER}
     if missing := sorted({*fixed, *MAY_DIFFER} - {*protocol}):
         raise MemobenchError(
             f"{run.place}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
         )
-    if found := differences(protocol, fixed, ignore=MAY_DIFFER):
-        raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate without this setting")
+    if found := departures(protocol, **control):
+        raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
 
 
 def _check_control(run: Evaluation, control: Evaluation, name: str) -> None:
     """Check that an evaluation is of the same policy under one control."""
-    setting = CONTROL_SETTING[name]
+    _check_protocol(control, **CONTROL_SETTING[name])
     for key in ("type", "sha256", "settings"):
         mine, other = (each.card[POLICY].get(key) for each in (run, control))
         if mine != other:
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
-    mine, other = run.protocol, control.protocol
-    if mine[setting] == other[setting] or differences(mine, other, ignore=(setting,)):
-        raise MemobenchError(
-            f"{control.place} must differ from {run.place} in {setting} only; evaluate with the same settings and "
-            f"{setting}="
-        )
-    names = task_names(suite=mine["suite"])
+    if found := differences(run.protocol, control.protocol, ignore=CONTROL_SETTING[name]):
+        raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
+    names = task_names(suite=run.protocol["suite"])
     if name == EVIDENCE:
         names = [task for task in names if get_task(task).num_variants > 1]
     _check_evaluation(control, names)
@@ -179,15 +194,17 @@ def _check_extent(run: Evaluation, names: Sequence[str]) -> None:
     """Check that the log holds each episode of each task once, from the first seed of a split on."""
     protocol, seed = run.protocol, run.card[POLICY].get("seed")
     count, base = protocol["episodes"], protocol["seed_base"]
-    most = 12 * MOST if protocol["evidence"] else MOST
+    least, most = FEWEST, MOST
+    if protocol["evidence"]:  # whole scenes
+        least, most = max(len(get_task(name).random_variants) for name in names), 12 * MOST
     if base not in list(SEEDS) or seed != base:
         raise MemobenchError(
             f"{run.place}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
             "of the seeds that count"
         )
-    if not FEWEST <= count <= most or sorted(protocol["tasks"]) != sorted(names):
+    if not least <= count <= most or sorted(protocol["tasks"]) != sorted(names):
         raise MemobenchError(
-            f"{run.place}: the protocol has {count} episodes of {len(protocol['tasks'])} tasks; expected {FEWEST} to "
+            f"{run.place}: the protocol has {count} episodes of {len(protocol['tasks'])} tasks; expected {least} to "
             f"{most} of each of the {len(names)} tasks of the suite"
         )
     asked = set(itertools.product(names, range(count)))
@@ -204,7 +221,7 @@ def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
     """Check one line: settings as on the card, seed, and an outcome that this task can have."""
     protocol, named = run.protocol, (run.records[0].get(POLICY), str(run.card[POLICY].get("type")))
     where = f"{run.place}: {record['task']}, episode {record['episode']}"
-    for key in ("suite", "world", "protocol", "referent", "replan_steps", INPUTS):
+    for key in ("suite", "world", "protocol", "referent", "replan_steps", INPUTS, *MEMORY_CONTROLS):
         value = record.get(key, OMITTED.get(key))
         expected = protocol.get(key)
         if value != expected:
@@ -224,15 +241,32 @@ def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
         raise MemobenchError(
             f"{where} has other checkpoints than the task ({task.operations}); evaluate with this version"
         )
+    _check_control_fields(where, protocol, record)
     failure_of(record)
     steps, reached = record.get("steps"), [mark["first_step"] for mark in record["checkpoints"]]
-    if steps is None or not 0 <= steps <= protocol["horizon"] or any((step or 0) > steps for step in reached):
+    ordered = [mark.get("ordered_step") for mark in record["checkpoints"]]
+    within = all(step is None or 1 <= step <= (steps or 0) for step in (*reached, *ordered))
+    if steps is None or steps > protocol["horizon"] or not within:
         raise MemobenchError(
-            f"{where} has {steps} steps and checkpoints at {reached}; expected at most {protocol['horizon']} steps, "
-            "and checkpoints within them"
+            f"{where} has {steps} steps and checkpoints at {reached}, in order at {ordered}; expected at most "
+            f"{protocol['horizon']} steps, and checkpoints within them"
         )
     if record["success"] and (record.get("lost") or record.get("fault")):
         raise MemobenchError(f"{where} is a success and was lost or broken off; submit the log unchanged")
+    if record["success"] and protocol["suite"] == STRICT and None in reached:  # the goal includes each checkpoint
+        raise MemobenchError(f"{where} is a success without all checkpoints ({reached}); submit the log unchanged")
+
+
+def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+    """Check that a line has the fields of its control and no others, with the catalogue's variants and chance."""
+    expected = {"paused_steps": record.get("paused_steps")} if protocol["pause_steps"] else {}
+    if protocol["evidence"]:
+        choice = record.get("choice")
+        answered = choice is not None or record.get("answered", False)
+        expected |= evidence_line(get_task(record["task"]), choice, answered)
+    found = {key: record[key] for key in CONTROL_FIELDS if key in record}
+    if found != expected:
+        raise MemobenchError(f"{where} has {found}, expected {expected}; submit the log of this control unchanged")
 
 
 def _check_sealed(run: Evaluation) -> None:
@@ -268,11 +302,11 @@ def _copied(mine: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any
     Two policies seldom need the same number of steps to each checkpoint; steps after the last one are easily edited.
     Failures do not count: two policies may reach nothing.
     """
-    scenes = {(record["task"], record.get("scene_hash")): record for record in theirs if record["success"]}
+    scenes = {(record["task"], record["seed"]): record for record in theirs if record["success"]}
     pairs = [
         (record, scenes[key])
         for record in mine
-        if record["success"] and (key := (record["task"], record.get("scene_hash"))) in scenes
+        if record["success"] and (key := (record["task"], record["seed"])) in scenes
     ]
     equal = sum(a["checkpoints"] == b["checkpoints"] for a, b in pairs)
     return equal / len(pairs) if len(pairs) >= FEWEST else 0.0

@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from lerobot_memobench.board.check import MOST, SEEDS
+from lerobot_memobench.board.check import MOST, SEEDS, departures
 from lerobot_memobench.board.submission import ABOUT, About
 from lerobot_memobench.envs.episode_log import INPUTS, with_omitted
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, Row, by_task, percent, wilson
@@ -82,7 +82,7 @@ def _aggregate(records: Sequence[Record]) -> dict[str, Any]:
 def _provenance(run: Run) -> dict[str, Any]:
     card = run.card
     checkpoint, trained = card.get("checkpoint") or {}, card.get("trained_on") or {}
-    versions = card["runs"][-1]["versions"] if card.get("runs") else {}
+    versions = card["runs"][-1].get("versions", {}) if card.get("runs") else {}
     return {
         "policy_revision": checkpoint.get("revision") or card.get("policy", {}).get("sha256"),
         "dataset_revision": trained.get("revision") or trained.get("sha256"),
@@ -124,10 +124,11 @@ def huggingface_yaml(run: Run, dataset: str) -> str:
 
 def _conditions(run: Run) -> str:
     protocol = with_omitted(run.protocol)
+    found = departures(protocol)
     return (
         f"{protocol['suite']} suite, referent {protocol.get('referent')}, inputs: {protocol.get(INPUTS)}, "
         f"{protocol['episodes']} episodes of each of {len(protocol['tasks'])} tasks, seeds from "
-        f"{protocol.get('seed_base')}"
+        f"{protocol.get('seed_base')}{f'; not the settings of the board ({"; ".join(found)})' if found else ''}"
     )
 
 
@@ -154,7 +155,8 @@ def vla_eval_json(run: Run) -> str:
     day = about.date if about else str(run.card.get("written", ""))[:10]
     submitter = about.submitter if about else ""
     scores = {kind: _score(summary.memory_types[kind]) for kind in MEMORY_TYPES if kind in summary.memory_types}
-    standard, average = whole and protocol.get("seed_base") in SEEDS, _score(summary.average)
+    standard = whole and protocol.get("seed_base") in SEEDS and not departures(protocol)
+    average = _score(summary.average)
     tasks = {name: _score(row) for name, row in summary.tasks.items()}
     entry = {
         "model": re.sub(r"\W+", "_", model.lower()).strip("_"),

@@ -13,6 +13,7 @@ import hashlib
 import io
 import json
 import re
+import shutil
 import stat
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -228,15 +229,19 @@ def _records(file: Path, content: bytes) -> Iterator[Mapping[str, Any]]:
 
 
 def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]) -> Path:
-    """Write the folder of a submission, and return it.
+    """Write the folder of a submission, and return it. An earlier submission there is replaced.
 
     Args:
         folder: its last part is the name of the row.
         evaluations: "" for the evaluation itself, or a name of `CONTROLS` -> folder of a finished evaluation.
 
     Raises:
-        MemobenchError: an evaluation lacks its card or its log.
+        MemobenchError: an evaluation lacks its card or its log, or the folder holds something else.
     """
+    if folder.exists() and ABOUT not in read_evaluation(folder):
+        raise MemobenchError(f"{folder} exists and holds no submission; choose another --out or --name")
+    for control in {*CONTROLS} - {*evaluations}:
+        shutil.rmtree(folder / control, ignore_errors=True)
     for control, source in evaluations.items():
         place = folder / control
         place.mkdir(parents=True, exist_ok=True)

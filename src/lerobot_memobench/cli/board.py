@@ -62,10 +62,11 @@ def submit(
     """
     from lerobot_memobench.board.check import check_partners, check_submission, read_board
     from lerobot_memobench.board.rows import board_row
-    from lerobot_memobench.board.submission import LINKS, About, read_submission, write_submission
+    from lerobot_memobench.board.submission import LINKS, About, RowName, read_submission, write_submission
     from lerobot_memobench.board.text import pull_request
     from lerobot_memobench.io import checked
 
+    checked(name, RowName)
     links = dict(zip(LINKS, (code, weights, paper), strict=True))
     about = checked(
         {
@@ -79,8 +80,11 @@ def submit(
     others = [row for row in read_board(BOARD) if row.name != name] if BOARD.is_dir() else []
     with tempfile.TemporaryDirectory() as draft:
         written = write_submission(Path(draft) / "board" / name, about, sources)
-        found = read_submission(written)
-        check_submission(found, others)
+        try:
+            found = read_submission(written)
+            check_submission(found, others)
+        except MemobenchError as error:
+            raise MemobenchError(str(error).replace(f"{written.parent}/", "")) from None
         check_partners([*others, found] if BOARD.is_dir() else [])
         text = pull_request(board_row(found, others))
         write_submission(out / name, about, sources)

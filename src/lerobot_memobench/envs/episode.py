@@ -24,7 +24,6 @@ from lerobot_memobench.protocol import (
     CAMERAS,
     ENDED,
     EXECUTION,
-    HORIZON,
     IDLE_STEPS,
     IMAGE_SIZE,
     NO_CLOCK,
@@ -257,7 +256,7 @@ class Episode:
     @property
     def cut_off(self) -> bool:
         """Whether a horizon below the protocol's ended the episode."""
-        whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else HORIZON
+        whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else self.settings.degree.horizon
         return self.settings.horizon < whole and self.exec_steps >= self._limit and not (self.success or self.lost)
 
     @property

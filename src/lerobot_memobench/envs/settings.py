@@ -112,7 +112,7 @@ class EnvSettings:
             self._check(each.name, str(each.type), each.metadata)
         if self.referent == DRAWN and self.suite != STRICT:
             check_choice("referent", self.referent, REFERENTS)
-        if abs(steps_per_action(self.speed) * self.speed - 1) > 0.02 or not 1 / SLOWEST <= self.speed <= 1:
+        if not 1 / SLOWEST <= self.speed <= 1 or abs(steps_per_action(self.speed) * self.speed - 1) > 0.02:
             raise MemobenchError(
                 f"speed is {self.speed!r}; expected 1, 0.5, 0.33, 0.25 and so on down to {1 / SLOWEST}, so that an "
                 "action takes a whole number of control steps"

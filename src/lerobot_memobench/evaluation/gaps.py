@@ -40,7 +40,7 @@ def _samples(record: Record, idle_steps: int) -> Iterator[tuple[int, bool]]:
         steps = 0 if gap is None else gap.median
         if gap is not None and gap.idles and record.get("seed") is not None:
             steps += first_execution_step(task, record["seed"], False, idle_steps)
-        reached = checkpoint["ordered_step"] is not None
+        reached = checkpoint.get("ordered_step") is not None
         yield steps, reached
         if not reached:
             return
