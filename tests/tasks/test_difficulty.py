@@ -52,6 +52,7 @@ def test_a_difficulty_sets_idling_and_horizon(difficulty: str, idle: int, horizo
     settings = EnvSettings(suite=STRICT, difficulty=difficulty)
     assert (settings.horizon, settings.protocol_block["idle"]) == (horizon, idle)
     assert EnvSettings(suite=STRICT, difficulty=difficulty, horizon=700).horizon == 700
+    assert settings.changed(difficulty="hard").horizon == 2000
     episode = Episode(get_task(STOVE), settings)
     episode.reset(20_000)
     begins = episode._execution_step

@@ -92,7 +92,7 @@ class EnvSettings:
     )
     demonstration_prompt: bool = setting(True, "object and procedural tasks start with their demonstration prompt")
     prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or in reset", PROMPT_IN)
-    horizon: int = setting(HORIZON, "execution steps per episode", least=1)
+    horizon: int = setting(HORIZON, "execution steps per episode; the default follows the difficulty", least=1)
     replan_steps: int | None = setting(None, "actions executed per prediction; pauses start between chunks", least=1)
     render: str = setting("default", "fast has no shadows; high is for figures and ten times slower", QUALITIES)
     oracle_memory: bool = setting(False, "the instruction ends with the completed checkpoints (oracle memory control)")
@@ -205,6 +205,8 @@ class EnvSettings:
         for name in changes:
             if name not in known:
                 raise MemobenchError(f"unknown environment setting {name!r}; {nearest(name, known)}")
+        if "difficulty" in changes and self.horizon == self.degree.horizon:
+            changes = {"horizon": HORIZON} | changes  # the new difficulty has its own
         return replace(self, **changes)
 
     @property
