@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode import Episode, referent_of
-from lerobot_memobench.envs.episode_log import differences
+from lerobot_memobench.envs.episode_log import differences, episode_record, write_episodes
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.evaluation.gaps import success_by_gap
+from lerobot_memobench.evaluation.headline import protocol_phrases
+from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.protocol import ACTION_DIM
+from lerobot_memobench.run.card import first_variant_mismatch
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Difficulty
 from lerobot_memobench.tasks.task import STRICT
@@ -93,7 +98,27 @@ def test_evaluations_of_two_difficulties_differ_and_earlier_protocols_are_standa
 
 
 def test_gaps_contain_the_idling_of_the_difficulty() -> None:
-    records = [rollout(HIDING, "spatial", "SUC", [False] * 3, False, 0, seed=seed) for seed in range(20_000, 20_040)]
-    groups = {name: list(success_by_gap(records, name)) for name in (STANDARD, "extreme")}
+    lines = [rollout(HIDING, "spatial", "SUC", [False] * 3, False, 0, seed=seed) for seed in range(20_000, 20_040)]
+    changed = {STANDARD: {}, "extreme": {"difficulty": "extreme"}}
+    groups = {name: list(success_by_gap([line | more for line in lines])) for name, more in changed.items()}
     assert "4096–8191" in groups["extreme"]
     assert "4096–8191" not in groups[STANDARD]
+
+
+def test_a_log_of_a_difficulty_is_checked_and_described_as_such(tmp_path: Path) -> None:
+    settings = EnvSettings(suite=STRICT, difficulty="hard", horizon=2)
+    episode = Episode(get_task(STOVE), settings)
+    lines = []
+    for number in range(5):
+        episode.reset(20_000 + number)
+        episode.step_index = episode._execution_step - 1
+        while not episode.done:
+            episode.step(np.zeros(ACTION_DIM))
+        lines.append(episode_record(episode, number, 0.1))
+    assert max(line["variant"] for line in lines) > 2
+    assert first_variant_mismatch(lines) is None
+    assert first_variant_mismatch(map(outcome, lines)) is None
+    assert "variant" in str(first_variant_mismatch([line | {"difficulty": STANDARD} for line in lines]))
+    write_episodes(tmp_path, lines)
+    (run,) = read_runs([tmp_path])
+    assert "difficulty hard" in protocol_phrases(run)

@@ -36,7 +36,7 @@ from lerobot_memobench.io import (
     write_file,
 )
 from lerobot_memobench.protocol import BY_PAPER
-from lerobot_memobench.tasks.difficulty import STANDARD
+from lerobot_memobench.tasks.difficulty import STANDARD, Difficulty
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.task import MEMOBENCH, PUBLISHED, Task
@@ -133,6 +133,7 @@ class Outcome(TypedDict, total=False):
         chance: evidence episodes: rate of correct choices without memory; None if the instruction names the variant.
         failure: failure class; None for a success.
         suite: ``strict``; absent for published tasks.
+        difficulty: absent for the standard one.
         world: ``libero``; absent for the package's own scenes.
         stand_ins: world ``libero``: classes without scans, replaced by boxes.
         protocol: ``upstream``, the authors' evaluation; absent for the paper's.
@@ -159,6 +160,7 @@ class Outcome(TypedDict, total=False):
     chance: Number | None
     failure: Name | None
     suite: Name
+    difficulty: Difficulty
     world: Name
     stand_ins: list[Name]
     protocol: Name
@@ -233,6 +235,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         "failure": failure if fault is None else fault.failure,
         **({} if fault is None else {"fault": fault.why}),
         **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
+        **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
         **({} if task.world == MEMOBENCH else {"world": task.world, "stand_ins": list(episode.stand_ins)}),
         **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),
         "scene_hash": episode.scene_hash,
@@ -271,6 +274,7 @@ def not_run_record(
         **({} if variants is None else {"variants": variants}),
         "checkpoints": [],
         **({} if task.suite == PUBLISHED else {"suite": task.suite}),
+        **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
         **({} if task.world == MEMOBENCH else {"world": task.world}),
         "not_run": why,
     }

@@ -16,9 +16,8 @@ OUTCOME = (
 
 def outcome(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a log line that a card keeps: its identity and its outcome, without times."""
-    return {
-        key: record[key] for key in ("task", "memory_type", "episode", "seed", "referent", *OUTCOME) if key in record
-    }
+    identity = ("task", "memory_type", "episode", "seed", "referent", "difficulty")
+    return {key: record[key] for key in (*identity, *OUTCOME) if key in record}
 
 
 def disagreement(a: Mapping[str, Any], b: Mapping[str, Any], here: str = "here", there: str = "there") -> str | None:

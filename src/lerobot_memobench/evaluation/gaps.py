@@ -15,13 +15,13 @@ EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
 GROUPS = [f"{low}–{high - 1}" for low, high in pairwise(EDGES)]
 
 
-def success_by_gap(records: Sequence[Record], difficulty: str = STANDARD) -> dict[str, tuple[int, int]]:
+def success_by_gap(records: Sequence[Record]) -> dict[str, tuple[int, int]]:
     """Return for each group of gaps with checkpoints how many were reached, and how many there are.
 
     A checkpoint counts if all earlier ones were reached in order: only then its information had to be remembered.
     """
     found: dict[str, tuple[int, int]] = {}
-    samples = [sample for record in records for sample in _samples(record, degree_of(difficulty).idle_steps)]
+    samples = [sample for record in records for sample in _samples(record)]
     for group, (low, high) in zip(GROUPS, pairwise(EDGES), strict=True):
         reached = [done for gap, done in samples if low <= gap < high]
         if reached:
@@ -29,7 +29,7 @@ def success_by_gap(records: Sequence[Record], difficulty: str = STANDARD) -> dic
     return found
 
 
-def _samples(record: Record, idle_steps: int) -> Iterator[tuple[int, bool]]:
+def _samples(record: Record) -> Iterator[tuple[int, bool]]:
     """Yield gap and success of the checkpoints that an episode came to; none for tasks without measured gaps."""
     if suite_of(record["task"]) is None:
         return
@@ -39,6 +39,7 @@ def _samples(record: Record, idle_steps: int) -> Iterator[tuple[int, bool]]:
     for gap, checkpoint in zip(gaps(task), record["checkpoints"], strict=False):
         steps = 0 if gap is None else gap.median
         if gap is not None and gap.idles and record.get("seed") is not None:
+            idle_steps = degree_of(record.get("difficulty", STANDARD)).idle_steps
             steps += first_execution_step(task, record["seed"], False, idle_steps)
         reached = checkpoint.get("ordered_step") is not None
         yield steps, reached

@@ -48,7 +48,11 @@ def protocol_phrases(run: Run) -> list[str]:
     records = run.records
     return [
         f"{of_all(records, 'suite')} suite",
-        *(f"{key} {value}" for key in ("world", "protocol") if (value := of_all(records, key)) != OMITTED[key]),
+        *(
+            f"{key} {value}"
+            for key in ("world", "difficulty", "protocol")
+            if (value := of_all(records, key)) != OMITTED[key]
+        ),
         *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),
         f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
         *_seeds(run),

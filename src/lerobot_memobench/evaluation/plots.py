@@ -16,7 +16,6 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from lerobot_memobench.envs.episode_log import with_omitted
 from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
 from lerobot_memobench.evaluation.gaps import GROUPS, success_by_gap
 from lerobot_memobench.evaluation.metrics import METRICS, Rate
@@ -126,7 +125,7 @@ def draw_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
     files = save(draw_outcomes(bars(runs)), folder, "outcomes")
     if sweeps(runs):
         files += save(draw_replan(runs), folder, "replan")
-    by_gap = {run.name: success_by_gap(run.records, with_omitted(run.protocol)["difficulty"]) for run in runs}
+    by_gap = {run.name: success_by_gap(run.records) for run in runs}
     if any(by_gap.values()):
         files += save(draw_gaps(by_gap), folder, "gap")
     return files

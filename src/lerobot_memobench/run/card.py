@@ -304,6 +304,7 @@ def first_variant_mismatch(records: Iterable[Mapping[str, Any]]) -> str | None:
     """
     from lerobot_memobench.envs.episode import referent_of
     from lerobot_memobench.tasks.catalogue import get_task, suite_of
+    from lerobot_memobench.tasks.difficulty import STANDARD
     from lerobot_memobench.tasks.evidence import scene_and_variant
 
     for record in records:
@@ -311,10 +312,11 @@ def first_variant_mismatch(records: Iterable[Mapping[str, Any]]) -> str | None:
         drawn = record.get("referent", "fixed") != "fixed" and suite_of(task) is not None
         if not drawn or variant is None or seed is None or seed < 0:
             continue
+        found = get_task(task).at(record.get("difficulty", STANDARD))
         if "choice" in record:  # each scene was run with each variant
-            here = scene_and_variant(get_task(task), record["episode"])[1]
+            here = scene_and_variant(found, record["episode"])[1]
         else:
-            here = referent_of(get_task(task), seed).variant_index
+            here = referent_of(found, seed).variant_index
         if here != variant:
             return f"{task}, episode {record['episode']}: variant {variant} there, {here} by its seed here"
     return None
