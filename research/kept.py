@@ -34,7 +34,7 @@ def keep(root: Path, names: Iterable[str], kept: Path) -> None:
     Args:
         root: folder of the evaluations.
         names: paths below it. ``root/name`` is an evaluation's folder, ``root/name.json`` describes its command; one
-            of them may be missing.
+            of them may be missing. A dataset's folder is not kept.
         kept: folder of the tables; made where it is missing.
     """
     rollouts: Rows = []
@@ -44,7 +44,7 @@ def keep(root: Path, names: Iterable[str], kept: Path) -> None:
         row = dict.fromkeys((FIELDS, CARD, COMMAND)) | {NAME: name}
         if command.exists():
             row[COMMAND] = json.dumps(json.loads(command.read_text()))
-        if folder.is_dir():
+        if folder.is_dir() and not (folder / "meta").is_dir():  # a dataset is kept as its command
             lines = read_log(folder)
             row[FIELDS] = list(dict.fromkeys(key for line in lines for key in line))
             card = {key: value for key, value in read_evaluation(folder).items() if key != "episodes"}
@@ -73,6 +73,8 @@ def restore(kept: Path, root: Path, names: Sequence[str] | None = None) -> list[
     Raises:
         MemobenchError: the tables hold no evaluation of a name.
     """
+    if not (kept / EVALUATIONS).exists():
+        raise MemobenchError(f"{kept} holds no {EVALUATIONS}; give a folder that --keep has written")
     evaluations = {row[NAME]: row for row in _read(kept / EVALUATIONS)}
     wanted = list(evaluations) if names is None else list(names)
     for name in wanted:

@@ -21,6 +21,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import CARD_FILE, protocol_of_log, read_rollouts
 from lerobot_memobench.jobs.threads import PROCESSES
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
+from research.kept import keep, restore
 from research.memory_study import cells, commands
 from research.memory_study import tables as tables_module
 from research.memory_study.__main__ import main, planned, study
@@ -443,3 +444,15 @@ def test_cells_are_kept_and_restored(no_memory: Cell, frames: Cell, tmp_path: Pa
     text = (tmp_path / "again" / "study.md").read_text()
     assert text == tables(frames.grid, tmp_path, "strict") + "\n"
     assert (tmp_path / "again" / "study.png").stat().st_size > 5_000
+
+
+def test_a_dataset_is_kept_as_its_command(no_memory: Cell, tmp_path: Path) -> None:
+    evaluate(no_memory, ROLLOUTS)
+    evaluation = str(no_memory.evaluation(ROLLOUTS).relative_to(tmp_path))
+    (tmp_path / "demonstrations" / "strict" / "meta").mkdir(parents=True)
+    (tmp_path / "demonstrations" / "strict.json").write_text('{"words": []}')
+    keep(tmp_path, [evaluation, "demonstrations/strict"], tmp_path / "kept")
+    assert restore(tmp_path / "kept", tmp_path / "again") == [evaluation, "demonstrations/strict"]
+    assert [path.name for path in (tmp_path / "again" / "demonstrations").iterdir()] == ["strict.json"]
+    with pytest.raises(MemobenchError, match="holds no evaluations"):
+        restore(tmp_path / "again", tmp_path / "third")
