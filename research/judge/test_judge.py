@@ -67,9 +67,9 @@ def test_a_judge_that_accepts_everything_is_killed() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_all_mutants_are_killed() -> None:
-    families = {(variant_of(name).suite, variant_of(name).family): name for name in task_names(suite=None)}
-    batteries = [battery(name) for name in [*FEW, *families.values()]]
+    batteries = [battery(name) for name in task_names(suite=None)]
     tried = [mutant for mutant in mutants() if not is_not_shown(mutant)]
     assert [mutant.name for mutant in tried if killer(mutant, batteries) is None] == []
 
