@@ -23,6 +23,9 @@ from typing import Any, Literal, NotRequired, Union, get_args, get_origin, get_t
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]  # MkDocs runs this file without the checkout on its path
+
+from lerobot_memobench.tasks.task import MEMORY_TYPES, SUITES  # noqa: E402
+
 SOURCE = ROOT / "src" / "lerobot_memobench"
 DOCS = ROOT / "docs"
 NECESSITY = ROOT / "results" / "necessity.parquet"
@@ -428,6 +431,7 @@ def python_page() -> str:
 # --- tasks ---
 
 
+@cache
 def needs(suite: str) -> dict[str, dict[str, tuple[str, str]]]:
     """Return task -> referent -> (rate without a memory in %, verdict); the rate is a ceiling for strict tasks."""
     import pyarrow.parquet as pq
@@ -580,7 +584,6 @@ def scene(number: int) -> bytes:
 
 # --- the site ---
 
-SUITES, MEMORY_TYPES = ("published", "strict"), ("temporal", "spatial", "object", "procedural")
 PAGES: dict[str, Callable[[], str]] = {
     "reference/lerobot.md": lerobot_page,
     "reference/memobench.md": memobench_page,

@@ -120,25 +120,29 @@ def check_submission(submission: Submission, others: Sequence[Submission] = ()) 
 # --- protocol ---
 
 
-def departures(protocol: Mapping[str, Any], **control: Any) -> list[str]:
-    """Return the settings that differ from those of the board, and of a control; raise for unknown values."""
+def _fixed_settings(protocol: Mapping[str, Any], **control: Any) -> dict[str, Any]:
+    """Return the settings that the board, and a control, require with the free ones of a protocol."""
     board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
-    return differences(protocol, board.protocol_block, ignore=MAY_DIFFER)
+    return {key: value for key, value in board.protocol_block.items() if key not in MAY_DIFFER}
+
+
+def departures(protocol: Mapping[str, Any]) -> list[str]:
+    """Return the settings that differ from those of the board; raise for unknown values."""
+    return differences(protocol, _fixed_settings(protocol), ignore=MAY_DIFFER)
 
 
 def _check_protocol(run: Evaluation, **control: Any) -> None:
     """Check that the card's settings are those of the board, and of a control."""
     protocol = run.protocol
     try:
-        expected = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
+        fixed = _fixed_settings(protocol, **control)
     except MemobenchError as error:
         raise MemobenchError(f"{run.place}: {error}") from None
-    fixed = {key: value for key, value in expected.protocol_block.items() if key not in MAY_DIFFER}
     if missing := sorted({*fixed, *MAY_DIFFER} - {*protocol}):
         raise MemobenchError(
             f"{run.place}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
         )
-    if found := departures(protocol, **control):
+    if found := differences(protocol, fixed, ignore=MAY_DIFFER):
         raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
 
 

@@ -13,7 +13,7 @@ function checkpointMarks(episode) {
   );
 }
 
-/** A row of the list; `partner` is the same episode of the run second. */
+/** A row of the list; `partner` is the same episode of the second run. */
 function listRow(episode, partner) {
   return el(
     "li",
@@ -41,7 +41,7 @@ const list = {
   watcher: null,
   current: null,
 
-  /** Show these rollouts from the top; `partners` (by id) stand second them. */
+  /** Show these rollouts from the top; `partners` (by id) are their second rollouts. */
   fill(episodes, partners = null) {
     this.episodes = episodes;
     this.partners = partners;
