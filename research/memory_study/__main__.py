@@ -69,7 +69,7 @@ def study(
         keep_evaluations(out, names, keep)
         say(f"kept in {keep}: {count_of(len(names), 'evaluation')} and trainings")
         return
-    for cell in {(cell.suite, cell.row): cell for cell in reversed(cells)}.values():
+    for cell in {(cell.suite, cell.row): cell for cell in cells}.values():
         cell.check()
     if plan:
         say(planned(data, cells, workers))

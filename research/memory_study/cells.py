@@ -75,7 +75,7 @@ class Cell:
         out: the study's folder.
         sealed: whether the sealed test is run too.
         at_once: cells that run at the same time, this one included.
-        controlled: whether the controls of a row's first training seed are run too.
+        controlled: whether the controls of a row's last training seed are run too.
     """
 
     grid: Grid
@@ -109,8 +109,9 @@ class Cell:
 
     @property
     def parts(self) -> list[str]:
-        """The evaluation, the controls of a row's first training seed, and the sealed test where it is wanted."""
-        controls = self.grid.rows[self.row].controls if self.seed == 0 and self.controlled else ()
+        """The evaluation, the controls of a row's last training seed, and the sealed test where it is wanted."""
+        row = self.grid.rows[self.row]
+        controls = row.controls if self.controlled and self.seed == row.seeds - 1 else ()
         return [ROLLOUTS, *controls, *([SEALED] if self.sealed or has_ended(self.log(SEALED)) else [])]
 
     def evaluation(self, part: str) -> Path:

@@ -49,7 +49,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         ("Rates by memory type and operation", _by_memory_type(rows)),
         ("Success by task", _by_task(rows, grid.suites[suite].ceilings)),
         ("How rollouts ended, all training seeds together", _endings(rows)),
-        ("Other conditions of the rollouts, first training seed", _conditions(rows)),
+        ("Other conditions of the rollouts, last training seed", _conditions(rows)),
         *((f"Minus *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
         (f"Minus *{FOUND_WITHOUT}*", _above_ceiling(rows, grid.suites[suite].ceilings)),
         ("The sealed test", _sealed(rows)),
@@ -184,7 +184,7 @@ def _evidence(cells: Sequence[Cell]) -> list[dict[str, Any]]:
 
 def _summary(rows: Rows, ceilings: Mapping[str, float]) -> str:
     header = ("", "training seeds", "SR", "95 %", "of seeds", *METRICS[1:])
-    more = ("follows evidence, first seed", "chance", "scenes")
+    more = ("follows evidence, last seed", "chance", "scenes")
     lines = [_summary_line(row, cells) for row, cells in rows.items()]
     if ceilings:
         empty = [EMPTY] * (len(header + more) - 3)
@@ -260,13 +260,13 @@ def _endings(rows: Rows) -> str:
 
 def _conditions(rows: Rows) -> str:
     """Return SR in each other control, and its change from the same scenes without the control."""
-    first = {row: cells[0] for row, cells in rows.items() if cells[0].seed == 0}
-    parts = dict.fromkeys(part for cell in first.values() for part in cell.grid.rows[cell.row].controls)
-    there = {row: [part for part in parts if part != EVIDENCE and evaluated(cell, part)] for row, cell in first.items()}
+    last = {row: cells[-1] for row, cells in rows.items()}
+    parts = dict.fromkeys(part for cell in last.values() for part in cell.grid.rows[cell.row].controls)
+    there = {row: [part for part in parts if part != EVIDENCE and evaluated(cell, part)] for row, cell in last.items()}
     wanted = [part for part in parts if any(part in own for own in there.values())]
     lines = [
-        [row, _average([report(first[row], ROLLOUTS)], "SR")]
-        + [_condition(first[row], part, own) if part in own else EMPTY for part in wanted]
+        [row, _average([report(last[row], ROLLOUTS)], "SR")]
+        + [_condition(last[row], part, own) if part in own else EMPTY for part in wanted]
         for row, own in there.items()
         if own
     ]

@@ -77,7 +77,7 @@ def no_memory(grid: Grid, tmp_path: Path) -> Cell:
 
 def test_commands_of_the_study_are_understood(tmp_path: Path) -> None:
     grid = read_grid(GRID_FILE)
-    for place in chosen(grid, ["seed=0"]):
+    for place in chosen(grid, []):
         Cell(grid, tmp_path, *place, sealed=True).check()
 
 
@@ -137,6 +137,12 @@ def test_tasks_alone_are_demonstrated(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(cells, "run_once", lambda words, *_, **__: ran.append(words))
     Demonstrations(grid, "strict", tmp_path).run()
     assert ran[0][:6] == ["memobench", "generate", "--suite", "strict", "--tasks", f"object,{FIND}"]
+
+
+def test_controls_are_of_the_last_training_seed(tmp_path: Path) -> None:
+    grid = grid_of(tmp_path, ("seeds: 1", "seeds: 2"))
+    first, last = (Cell(grid, tmp_path, "strict", "frames, no time", seed) for seed in (0, 1))
+    assert (first.parts, last.parts) == ([ROLLOUTS], [ROLLOUTS, "evidence"])
 
 
 def test_sealed_test_is_run_once_where_wanted(no_memory: Cell) -> None:
