@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -44,6 +45,7 @@ rows:
   no memory: {training: [policy.memory=none], seeds: 2}
   frames, no time: {training: [], seeds: 1, controls: [evidence]}
 """
+KEPT = Path(__file__).parents[2] / "results" / "study"
 COMMAND = {"words": [], "ended": False, "wall_s": 60.0, "cpu_s": 50.0}
 """The file of a command."""
 
@@ -462,3 +464,17 @@ def test_a_dataset_is_kept_as_its_command(no_memory: Cell, tmp_path: Path) -> No
     assert [path.name for path in (tmp_path / "again" / "demonstrations").iterdir()] == ["strict.json"]
     with pytest.raises(MemobenchError, match="holds no evaluations"):
         restore(tmp_path / "again", tmp_path / "third")
+
+
+def test_published_figures_are_those_of_the_kept_cells(tmp_path: Path) -> None:
+    assert main(["--out", str(tmp_path), "--kept", str(KEPT)]) == 0
+    counted = (tmp_path / "study.md").read_text()
+    published = (KEPT.parent / "study.md").read_text().replace("−", "-")
+    rates = re.findall(r"^(\| [^|]+ \| \d \|) (\d+\.\d) \((\S+)\) \| ([^|]+) \|", published, re.MULTILINE)
+    assert len(rates) >= 6
+    for row, solved, interval, of_seeds in rates:
+        assert f"{row} **{solved}** | {interval} | {of_seeds} |" in counted
+    for row, difference, interval in re.findall(
+        r"^(\| .+ minus .+? \|) (\S+) \((.+? to .+?)\)", published, re.MULTILINE
+    ):
+        assert re.search(rf"{re.escape(row)} \d+ \| {re.escape(difference)} \| {re.escape(interval)} \|", counted), row
