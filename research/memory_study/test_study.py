@@ -430,10 +430,10 @@ def test_inconsistent_results_are_refused(no_memory: Cell, frames: Cell, tmp_pat
             evaluate(frames, ROLLOUTS, policy="new")
             evaluate(frames, "evidence", policy="old")
         case "scene":
-            evaluate(frames, ROLLOUTS, scene_hash="another")
-            evaluate(no_memory, ROLLOUTS, scene_hash="this")
+            evaluate(frames, ROLLOUTS, variant=1)
+            evaluate(no_memory, ROLLOUTS, variant=2)
     tables_module._rollouts.cache_clear()
-    with pytest.raises(MemobenchError, match=r"frames_no_time-0|scene_hash"):
+    with pytest.raises(MemobenchError, match=r"frames_no_time-0|variant is"):
         tables(frames.grid, tmp_path, "strict")
 
 
