@@ -183,9 +183,9 @@ def without_a_place_for_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(caching.CompileResultCacheImpl, "_locator_classes", [])
 
 
-def with_another_blas(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_a_function_of_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
     class Library:
-        mj_step1 = mj_step2 = mj_jacSite = mj_fullM = None
+        mj_step1 = mj_step2 = mj_jacSite = None
 
     monkeypatch.setattr(osc_kernel.ctypes, "CDLL", lambda _: Library())
     monkeypatch.setattr(osc_kernel.ctypes, "cast", lambda *_: osc_kernel.ctypes.c_void_p(1))
@@ -198,7 +198,7 @@ def with_a_newer_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("undecided")
-@pytest.mark.parametrize("lacking", [without_a_place_for_the_cache, with_another_blas, with_a_newer_mujoco])
+@pytest.mark.parametrize("lacking", [without_a_place_for_the_cache, without_a_function_of_mujoco, with_a_newer_mujoco])
 def test_falls_back_to_numpy(
     lacking: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.io import cache_folder, draft_of
-from lerobot_memobench.jobs.threads import cpu_model
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import Simulation, Snapshot
@@ -153,12 +152,12 @@ def prompt_file(task: Task, seed: int, scene_hash: str) -> Path | None:
 
 @cache
 def _code() -> tuple[str, ...]:
-    """Return the sources, library versions, Python version and processor that compute a prompt."""
+    """Return the sources, library versions and Python version that compute a prompt."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256((package / "protocol.py").read_bytes())
     for source in sorted(file for part in SOURCES for file in (package / part).rglob("*.py")):
         digest.update(source.relative_to(package).as_posix().encode() + source.read_bytes())
-    return digest.hexdigest(), *(metadata.version(name) for name in PACKAGES), sys.version, cpu_model()
+    return digest.hexdigest(), *(metadata.version(name) for name in PACKAGES), sys.version
 
 
 def _read(file: Path, physics_dim: int) -> Frames | None:

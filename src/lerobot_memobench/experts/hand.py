@@ -136,7 +136,8 @@ class Hand:
         angular = self._turn(rotation, turned) / ROTATION_SCALE
         angular *= min(1.0, ROTATION_SPEED / max(length(angular), 1e-9))
         wanted = np.concatenate([linear, angular])
-        self._last = self._last + np.clip(wanted - self._last, -self.slew, self.slew)
+        # Rounded, because numpy's products differ in the last bit between processors. The sum turns −0 into 0.
+        self._last = np.round(self._last + np.clip(wanted - self._last, -self.slew, self.slew), 6) + 0.0
         return np.append(self._last, gripper).astype(np.float32)
 
     def rest(self, gripper: float) -> NDArray[np.float32]:

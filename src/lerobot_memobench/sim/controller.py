@@ -4,9 +4,12 @@ A control step sets a goal from a 7-D action and holds it over the physics steps
 1.4.1 (tested along a trajectory) without the overhead of the published stack: a second `mj_forward` per physics step,
 string look-ups, full-model Jacobians, mass matrix copies, and pseudo-inverses of matrices that are regular in reach.
 
+Sums are in a fixed order and use no BLAS, whose kernels differ between processors. So recorded actions give the same
+states, to the bit, on all x86-64 processors.
+
 `make_controller` compiles a control step into one call if that reproduces the bits of the numpy controller, because
-Python and numpy take a third of a control step's time. The compiled code calls the same libraries in the same order.
-The first step of a process runs both ways; after a difference or a failure the process uses numpy.
+Python and numpy take most of a control step's time. The first step of a process runs both ways; after a difference or a
+failure the process uses numpy.
 
 Source: robosuite 1.4.1 `controllers/osc.py`, `config/osc_pose.json`; Khatib 1987.
 """
@@ -15,11 +18,11 @@ from __future__ import annotations
 
 import copy
 import logging
+import math
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from lerobot_memobench.sim import robot
 
@@ -91,7 +94,7 @@ class OSCController:
         rotation = delta[3:] * ROTATION_SCALE
         if np.any(np.abs(rotation) > 0.0):
             present = data.site_xmat[self._site].reshape(3, 3)
-            self.goal_rotation = rotation_matrix(rotation) @ present
+            self.goal_rotation = product(rotation_matrix(rotation), present)
 
     def torques(self, data: mujoco.MjData) -> Array:
         """Return the arm's unclipped torques (7,), Nm, for the present state.
@@ -108,19 +111,18 @@ class OSCController:
         mass = self._mass[dofs, dofs]
         velocity = data.qvel[dofs]
         present = data.site_xmat[self._site].reshape(3, 3)
-        twist = jacobian @ velocity
+        twist = product(jacobian, velocity)
         force = KP * (self.goal_position - data.site_xpos[self._site]) - KD * twist[:3]
         torque = KP * orientation_error(self.goal_rotation, present) - KD * twist[3:]
 
-        # All three systems are symmetric and positive definite. Call LAPACK directly: at these sizes numpy's checks
-        # cost five times the solution.
-        mass_inverse_jt = dposv(mass, jacobian.T)[1]
-        inertia_inverse = jacobian @ mass_inverse_jt
-        wrench = np.concatenate([dposv(inertia_inverse[:3, :3], force)[1], dposv(inertia_inverse[3:, 3:], torque)[1]])
-        posture = mass @ (NULLSPACE_KP * (self._home - data.qpos[self._qposs]) - NULLSPACE_KD * velocity)
+        mass_inverse_jt = solution(mass, jacobian.T)
+        inertia_inverse = product(jacobian, mass_inverse_jt)
+        wrench = np.concatenate([solution(inertia_inverse[:3, :3], force), solution(inertia_inverse[3:, 3:], torque)])
+        pull = NULLSPACE_KP * (self._home - data.qpos[self._qposs]) - NULLSPACE_KD * velocity
+        posture = product(mass, pull)
         # Nullspace: (I − Jᵀ Λ J M⁻¹) posture, with Λ the full task-space inertia.
-        wrench -= dposv(inertia_inverse, mass_inverse_jt.T @ posture)[1]
-        return jacobian.T @ wrench + data.qfrc_bias[dofs] + posture
+        wrench -= solution(inertia_inverse, product(mass_inverse_jt.T, posture))
+        return product(jacobian.T, wrench) + data.qfrc_bias[dofs] + posture
 
     def apply(self, data: mujoco.MjData, gripper_action: float) -> None:
         """Write the controls for one physics step into ``data.ctrl``."""
@@ -143,10 +145,36 @@ class OSCController:
             mujoco.mj_step1(self._model, data)
 
 
+def product(a: Array, b: Array) -> Array:
+    """Return ``a @ b`` for a (n, k) and b (k,) or (k, m), summed in order, which BLAS does not guarantee."""
+    columns = b[:, None] if b.ndim == 1 else b
+    total = a[:, :1] * columns[:1]
+    for k in range(1, len(columns)):
+        total = total + a[:, k : k + 1] * columns[k : k + 1]
+    return total.reshape(len(a), *b.shape[1:])
+
+
+def solution(matrix: Array, b: Array) -> Array:
+    """Return matrix⁻¹ b for a positive definite matrix (n, n) and b (n,) or (n, m), by Cholesky; NaN for another."""
+    rest, found = matrix.copy(), np.array(b, dtype=np.float64).reshape(len(b), -1)
+    last = len(matrix) - 1
+    for j in range(last + 1):
+        rest[j, j] = math.sqrt(rest[j, j]) if rest[j, j] > 0 else math.nan
+        rest[j + 1 :, j] /= rest[j, j]
+        rest[j + 1 :, j + 1 :] -= rest[j + 1 :, j : j + 1] * rest[j + 1 :, j]
+    for j in range(last + 1):
+        found[j] /= rest[j, j]
+        found[j + 1 :] -= rest[j + 1 :, j : j + 1] * found[j]
+    for j in range(last, -1, -1):
+        found[j] /= rest[j, j]
+        found[:j] -= rest[j, :j, None] * found[j]
+    return found.reshape(b.shape)
+
+
 def orientation_error(desired: Array, present: Array) -> Array:
     """Return robosuite's small-angle rotation error (3,): half the sum of cross products of the frames' axes."""
-    product = desired @ present.T
-    return 0.5 * np.array([product[2, 1] - product[1, 2], product[0, 2] - product[2, 0], product[1, 0] - product[0, 1]])
+    p = product(desired, present.T)
+    return 0.5 * np.array([p[2, 1] - p[1, 2], p[0, 2] - p[2, 0], p[1, 0] - p[0, 1]])
 
 
 def rotation_matrix(rotation_vector: Array) -> Array:
@@ -155,12 +183,13 @@ def rotation_matrix(rotation_vector: Array) -> Array:
     The computation uses a single-precision quaternion like robosuite; in double precision the torques would differ in
     the sixth digit.
     """
-    angle = float(np.linalg.norm(rotation_vector))
+    x, y, z = map(float, rotation_vector)
+    angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-9:
         return np.eye(3)
-    vector = np.sin(angle / 2) / angle * np.asarray(rotation_vector)
-    quaternion = np.array([np.cos(angle / 2), *vector], dtype=np.float32)
-    scale = np.sqrt(2.0 / float(quaternion @ quaternion))
+    vector = math.sin(angle / 2) / angle * np.asarray(rotation_vector)
+    quaternion = np.array([math.cos(angle / 2), *vector], dtype=np.float32)
+    scale = math.sqrt(2.0 / float(sum(quaternion * quaternion)))
     quaternion = (quaternion.astype(np.float64) * scale).astype(np.float32)
     # Doubled products of the quaternion's components; only the diagonal's sums are in double precision.
     p = np.outer(quaternion, quaternion)

@@ -1,9 +1,7 @@
-"""Compiled loop of `OSCController.advance`: the same operations in the same order by the same libraries.
+"""Compiled loop of `OSCController.advance`: the same operations in the same order, so the result is equal to the bit.
 
-MuJoCo, numpy's BLAS and scipy's LAPACK are called by address, so the result equals the Python loop to the bit. All
-memory passed to them belongs to the caller, because arrays created here may be freed while their address is in use.
-
-The import requires a cache folder for numba; `functions` requires numpy's bundled BLAS.
+MuJoCo is called by address. All memory passed to it belongs to the caller, because arrays created here may be freed
+while their address is in use. The import requires a cache folder for numba.
 """
 
 from __future__ import annotations
@@ -15,14 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
-from numba.extending import get_cython_function_address, intrinsic
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-_BY_ROWS, _AS_IS, _TRANSPOSED = np.int32(101), np.int32(111), np.int32(112)
-"""CBLAS constants for matrix layout and transposition."""
-_DOUBLE = 8
-_INT = 4
 
 
 class Functions(NamedTuple):
@@ -32,9 +26,6 @@ class Functions(NamedTuple):
     step2: int
     site_jacobian: int
     full_mass: int
-    gemv: int
-    gemm: int
-    posv: int
 
 
 class Arm(NamedTuple):
@@ -83,21 +74,16 @@ class Scratch(NamedTuple):
     pull: Array
     posture: Array
     torques: Array
-    sizes: NDArray[np.int32]
-    upper: NDArray[np.uint8]
 
 
 def functions() -> Functions:
-    """Return the addresses of the functions that numpy, scipy and MuJoCo's bindings call.
+    """Return the addresses of the functions that MuJoCo's bindings call.
 
     Raises:
-        AttributeError: numpy was built with another BLAS, or a symbol is missing.
+        AttributeError: a symbol is missing.
     """
     # An extension module resolves symbols of its linked libraries.
-    physics, blas = (
-        ctypes.CDLL(importlib.import_module(name).__file__)
-        for name in ("mujoco._functions", "numpy._core._multiarray_umath")
-    )
+    physics = ctypes.CDLL(importlib.import_module("mujoco._functions").__file__)
 
     def address(function: Any) -> int:
         return int(ctypes.cast(function, ctypes.c_void_p).value or 0)
@@ -107,9 +93,6 @@ def functions() -> Functions:
         address(physics.mj_step2),
         address(physics.mj_jacSite),
         address(physics.mj_fullM),
-        address(blas.scipy_cblas_dgemv64_),
-        address(blas.scipy_cblas_dgemm64_),
-        get_cython_function_address("scipy.linalg.cython_lapack", "dposv"),
     )
 
 
@@ -118,8 +101,7 @@ def scratch(nv: int) -> Scratch:
     empty = np.empty
     return Scratch(
         empty((6, nv)), empty((nv, nv)), (empty((3, 3)), empty((6, 6)), empty((7, 7))), empty(6), empty((3, 3)),
-        empty((6, 7)), empty((6, 6)), empty(6), empty(6), empty(7), empty(7), np.zeros(3, np.int32),
-        np.array([ord("U")], np.uint8),
+        empty((6, 7)), empty((6, 6)), empty(6), empty(6), empty(7), empty(7),
     )  # fmt: skip
 
 
@@ -140,39 +122,50 @@ _call: Any = intrinsic(_call_of)
 
 
 @njit(nogil=True)
-def _times(f, matrix, transposed, vector, out):  # type: ignore[no-untyped-def]
-    """out = matrix @ vector, or matrix.T @ vector."""
+def _times(matrix, vector, out):  # type: ignore[no-untyped-def]
+    """out = matrix @ vector, summed in order."""
     rows, columns = matrix.shape
-    _call(
-        f.gemv,
-        (_BY_ROWS, transposed, rows, columns, 1.0, matrix.ctypes.data, matrix.strides[0] // _DOUBLE,
-         vector.ctypes.data, 1, 0.0, out.ctypes.data, 1),
-    )  # fmt: skip
+    for row in range(rows):
+        total = matrix[row, 0] * vector[0]
+        for k in range(1, columns):
+            total += matrix[row, k] * vector[k]
+        out[row] = total
 
 
 @njit(nogil=True)
-def _times_transposed(f, a, b, out):  # type: ignore[no-untyped-def]
-    """out = a @ b.T."""
-    _call(
-        f.gemm,
-        (_BY_ROWS, _AS_IS, _TRANSPOSED, a.shape[0], b.shape[0], a.shape[1], 1.0, a.ctypes.data,
-         a.strides[0] // _DOUBLE, b.ctypes.data, b.strides[0] // _DOUBLE, 0.0, out.ctypes.data, out.shape[1]),
-    )  # fmt: skip
+def _times_transposed(a, b, out):  # type: ignore[no-untyped-def]
+    """out = a @ b.T, summed in order."""
+    for row in range(b.shape[0]):
+        _times(a, b[row], out[:, row])
 
 
 @njit(nogil=True)
-def _solve(f, s, matrix, factor, b):  # type: ignore[no-untyped-def]
-    """b = matrix⁻¹ b for a positive definite matrix and each row of b; factor is overwritten."""
+def _factorise(matrix, factor):  # type: ignore[no-untyped-def]
+    """factor = lower Cholesky factor of a positive definite matrix."""
     rows = matrix.shape[0]
-    for k in range(rows):
-        for j in range(rows):
-            factor[j, k] = matrix[k, j]  # LAPACK is column-major
-    s.sizes[0], s.sizes[1] = rows, b.size // rows
-    n = s.sizes.ctypes.data
-    _call(
-        f.posv,
-        (s.upper.ctypes.data, n, n + _INT, factor.ctypes.data, n, b.ctypes.data, n, n + 2 * _INT),
-    )  # fmt: skip
+    for j in range(rows):
+        for i in range(j, rows):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= factor[i, k] * factor[j, k]
+            if i > j:
+                factor[i, j] = rest / factor[j, j]
+            else:
+                factor[j, j] = np.sqrt(rest) if rest > 0 else np.nan
+
+
+@njit(nogil=True)
+def _solve(factor, b):  # type: ignore[no-untyped-def]
+    """b = matrix⁻¹ b for the matrix of a Cholesky factor."""
+    rows = b.size
+    for j in range(rows):
+        b[j] /= factor[j, j]
+        for i in range(j + 1, rows):
+            b[i] -= factor[i, j] * b[j]
+    for j in range(rows - 1, -1, -1):
+        b[j] /= factor[j, j]
+        for i in range(j):
+            b[i] -= factor[j, i] * b[j]
 
 
 @njit(nogil=True)
@@ -195,8 +188,8 @@ def _torques(f, model, data, arm, position, rotation, x, s):  # type: ignore[no-
     dofs = slice(arm.dof, arm.dof + 7)
     jacobian, mass, velocity = s.jacobian[:, dofs], s.mass[dofs, dofs], x.qvel[dofs]
     third, sixth, seventh = s.factors
-    _times(f, jacobian, _AS_IS, velocity, s.twist)
-    _times_transposed(f, rotation, x.rotation, s.product)
+    _times(jacobian, velocity, s.twist)
+    _times_transposed(rotation, x.rotation, s.product)
     for k in range(3):
         s.wrench[k] = arm.kp * (position[k] - x.position[k]) - arm.kd * s.twist[k]
         after, last = (k + 1) % 3, (k + 2) % 3
@@ -206,18 +199,22 @@ def _torques(f, model, data, arm, position, rotation, x, s):  # type: ignore[no-
     for k in range(6):
         for j in range(7):
             s.columns[k, j] = jacobian[k, j]
-    _solve(f, s, mass, seventh, s.columns)
-    _times_transposed(f, jacobian, s.columns, s.inverse)
-    _solve(f, s, s.inverse[:3, :3], third, s.wrench[:3])
-    _solve(f, s, s.inverse[3:, 3:], third, s.wrench[3:])
+    _factorise(mass, seventh)
+    for k in range(6):
+        _solve(seventh, s.columns[k])
+    _times_transposed(jacobian, s.columns, s.inverse)
+    for part in (slice(0, 3), slice(3, 6)):
+        _factorise(s.inverse[part, part], third)
+        _solve(third, s.wrench[part])
     for k in range(7):
         s.torques[k] = arm.null_kp * (arm.home[k] - x.qpos[arm.qpos + k]) - arm.null_kd * velocity[k]
-    _times(f, mass, _AS_IS, s.torques, s.posture)
-    _times(f, s.columns, _AS_IS, s.posture, s.pull)
-    _solve(f, s, s.inverse, sixth, s.pull)
+    _times(mass, s.torques, s.posture)
+    _times(s.columns, s.posture, s.pull)
+    _factorise(s.inverse, sixth)
+    _solve(sixth, s.pull)
     for k in range(6):
         s.wrench[k] -= s.pull[k]
-    _times(f, jacobian, _TRANSPOSED, s.wrench, s.torques)
+    _times(jacobian.T, s.wrench, s.torques)
     for k in range(7):
         s.torques[k] = s.torques[k] + x.bias[arm.dof + k] + s.posture[k]
 
