@@ -51,6 +51,7 @@ HAND_MARGIN = 0.006
 HAND_POINTS = np.array(
     [(x, y, -z) for x in (-0.1, -0.05, 0.0, 0.05, 0.1) for y in (-0.032, 0.0, 0.032) for z in (0.05, 0.08, 0.11)]
     + [(x, y, -z) for x in (-0.05, 0.0, 0.05) for y in (-0.05, 0.0, 0.05) for z in (0.14, 0.18)]
+    + [(x, y, -0.105) for x in (-0.02, 0.02) for y in (-0.045, 0.045)]  # rim of the flange
 )
 """Points on palm and wrist in the grip site's frame (N, 3), m."""
 MAX_DRAWER_EXCESS = 0.022
