@@ -32,7 +32,9 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
         for axis in axes[0]
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)  # a suite may lack evidence
     }
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=2 * len(suites), frameon=False, fontsize=9
+    )
     return save(figure, path)
 
 
