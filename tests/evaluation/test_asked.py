@@ -158,7 +158,7 @@ def test_lines_of_other_settings_are_refused(small: Path, tmp_path: Path, name: 
     records = [json.loads(each) for each in log.read_text().splitlines()]
     records[lines] = [{**record, name: other_value(name)} for record in records[lines]]
     log.write_text("".join(json.dumps(each) + "\n" for each in records))
-    for command in (["report", str(folder)], ["compare", str(small), str(folder)]):
+    for command in (["report", str(folder)], ["compare", str(small), str(folder), "--permutations", "100"]):
         status = main([*command, "--out", str(tmp_path / "out")])
         written = "".join(file.read_text() for file in (tmp_path / "out").rglob("*.txt"))
         assert status == 2 or "missing: " in written or "log and card" in written, (command, name)
