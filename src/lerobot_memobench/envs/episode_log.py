@@ -210,7 +210,10 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
     """
     progress, task, fault, choice = episode.progress, episode.task, episode.fault, episode.choice
     failure = classify_failure(
-        task, progress.first_step, episode.success, episode.drifted, lost=episode.lost, cut_off=episode.cut_off
+        *(task, progress.first_step, episode.success, episode.drifted),
+        lost=progress.broken if episode.lost else None,
+        cut_off=episode.cut_off,
+        ordered=progress.ordered,
     )
     steps = zip(task.checkpoints, progress.first_step, progress.ordered_step, strict=True)
     return {
