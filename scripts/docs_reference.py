@@ -332,6 +332,7 @@ def typed_rows(kind: Any) -> list[list[str]]:
 PROTOCOL_ONLY = {
     "idle": "maximum control steps of idling before the execution of a strict task",
     "goals": "revision of the goals of strict tasks",
+    "scene_hash_version": "version of `scene_hash`; hashes of different versions are not compared",
     "inputs": "inputs of the policy",
 }
 """Keys of a protocol in addition to the environment's settings."""

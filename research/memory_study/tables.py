@@ -11,7 +11,7 @@ from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record
-from lerobot_memobench.evaluation.records import read_rollouts, read_runs
+from lerobot_memobench.evaluation.records import read_run, read_runs
 from lerobot_memobench.evaluation.report import evidence_values
 from lerobot_memobench.evaluation.statistics import Estimate
 from lerobot_memobench.io import count_of
@@ -166,7 +166,7 @@ def _percentages(row: Mapping[str, Rate]) -> dict[str, Any]:
 
 @cache
 def _rollouts(folder: Path) -> list[Record]:
-    return list(read_rollouts(folder)[0])
+    return list(read_run(folder).records)
 
 
 def _runs(cells: Sequence[Cell], part: str = ROLLOUTS) -> list[list[Record]]:

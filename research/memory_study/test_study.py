@@ -19,7 +19,7 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import CARD_FILE, protocol_of_log, read_rollouts
+from lerobot_memobench.evaluation.records import CARD_FILE, protocol_of_log, read_run
 from lerobot_memobench.jobs.threads import PROCESSES
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.kept import keep, restore
@@ -313,7 +313,7 @@ def test_a_study_killed_at_ten_random_moments_has_the_same_results(tmp_path: Pat
     )
     assert weights == others
     outcomes, others = (
-        [{k: v for k, v in one.items() if k not in ("wall_s", "run", "policy")} for one in read_rollouts(folder)[0]]
+        [{k: v for k, v in one.items() if k not in ("wall_s", "run", "policy")} for one in read_run(folder).records]
         for folder in (cell.evaluation(ROLLOUTS) for cell in (whole, other))
     )
     assert outcomes == others

@@ -21,7 +21,7 @@ from lerobot_memobench.board.text import PROMISES
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.datasets.generation import task_hash
 from lerobot_memobench.envs.episode import referent_of
-from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_runs
@@ -423,7 +423,7 @@ def test_export_for_lerobot(board: Path, tmp_path: Path) -> None:
         *found["overall"]
     }
     assert found["provenance"] == {
-        **{"policy_revision": "abc", "dataset_revision": "def", "seed": 7, "episodes_per_task": 10},
+        **{"policy_revision": "abc", "dataset_revision": "def", "seed": 7, "episodes_per_task": 10, "missing": None},
         **{"sim_version": "3.9.0", "tool": {"name": "lerobot_policy_memobench", "version": "0.2.0"}},
     }
     compare = pytest.importorskip("lerobot.scripts.lerobot_eval_compare", reason="LeRobot's comparison is in review")
@@ -447,6 +447,7 @@ def test_export_names_other_settings(evaluated: Path, tmp_path: Path, monkeypatc
     folder = shutil.copytree(evaluated, tmp_path / "easy")
     assert json.loads(vla_eval_json(read_runs([folder])[0]))["results"][0]["overall_score"] == pytest.approx(60.0)
     in_card(lambda card: card["protocol"].update(difficulty="easy", idle=900))(folder)
+    write_episodes(folder, [{**each, "difficulty": "easy"} for each in read_episodes(folder)])
     (run,) = read_runs([folder])
     (entry,) = json.loads(vla_eval_json(run))["results"]
     assert entry["overall_score"] is None

@@ -25,7 +25,7 @@ from lerobot_memobench.envs.evaluation_file import (
     write_protocol,
 )
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.settings import GOALS, IDLE, NOT_COMPARED, SETTINGS, EnvSettings
+from lerobot_memobench.envs.settings import GOALS, IDLE, NOT_COMPARED, SCENE_HASHES, SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EVALUATION_SEED, HORIZON, IDLE_STEPS, UPSTREAM_HORIZON
 from lerobot_memobench.tasks.catalogue import get_task
@@ -79,7 +79,7 @@ def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
     config = MemobenchEnvConfig(horizon=5, pause_steps=3, videos=2)
     assert config.gym_kwargs == dataclasses.asdict(config.settings)
     assert (config.horizon, config.pause_steps, config.videos) == (5, 3, 2)
-    assert set(config.settings.protocol_block) == set(SETTINGS)
+    assert set(config.settings.protocol_block) == {*SETTINGS, SCENE_HASHES}
     env = MemobenchEnv(STOVE, config.settings, speed=0.5)
     assert env.settings == config.settings.changed(speed=0.5, prompt_in="steps")
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -147,8 +147,11 @@ def test_folder_keeps_one_protocol_and_one_policy(tmp_path: Path) -> None:
     assert protocol_of(tmp_path) == block
     assert check_protocol(tmp_path, block)
     assert not check_protocol(tmp_path / "new", block)
+    write_protocol(tmp_path / "earlier", {key: value for key, value in block.items() if key != SCENE_HASHES})
     with pytest.raises(MemobenchError, match=r"another protocol .*horizon: 5 and 6"):
         write_protocol(tmp_path, {**block, "horizon": 6})
+    with pytest.raises(MemobenchError, match=r"another protocol .*scene_hash_version: 1 and 2"):
+        check_protocol(tmp_path / "earlier", block)
     write_protocol(tmp_path / "of_a_policy", {**block, "policy": {"identity": "a"}})
     with pytest.raises(MemobenchError, match="another policy"):
         write_protocol(tmp_path / "of_a_policy", {**block, "policy": {"identity": "b"}})
@@ -161,7 +164,8 @@ def test_files_of_earlier_versions_are_merged(tmp_path: Path) -> None:
     found = read_evaluation(tmp_path)
     assert found["policy"] == {"type": "act"}
     assert found["protocol"] == {**card["protocol"], "render_every": 1, "prompt_in": "steps"}
-    assert check_protocol(tmp_path, EnvSettings(horizon=5, prompt_in="steps").protocol_block)
+    earlier = EnvSettings(horizon=5, prompt_in="steps").protocol_block | {SCENE_HASHES: 1}
+    assert check_protocol(tmp_path, earlier)
     (tmp_path / EARLIER_PROTOCOL).write_text(json.dumps({"horizon": 5, "render_every": 8}))
     with pytest.raises(MemobenchError, match="render_every: 8 and 1"):
         check_protocol(tmp_path, EnvSettings(horizon=5).protocol_block)

@@ -150,6 +150,8 @@ def test_settings_beside_the_log_count(tmp_path: Path, setting: str, value: Any)
     settings = {**logs.SETTINGS, "prompt_in": "steps", "replan_steps": 5}
     a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b")
     (a / "protocol.json").write_text(json.dumps(settings))
+    if setting == "seed_base":
+        b = logs.evaluation(tmp_path / "b", first_seed=value)
     (b / "protocol.json").write_text(json.dumps({**settings, setting: value}))
     if setting == "prompt_in":  # the policy's: it may differ, with a note
         assert compared(a, b).notes[0] == "compared although prompt_in: steps and reset"

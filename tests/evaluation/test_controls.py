@@ -10,6 +10,7 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.controls import gap_closed, with_labels_of
 from tests.support.logs import SETTINGS, rollout
@@ -38,6 +39,7 @@ def evaluation(
 ) -> str:
     """One rollout per number: that many of its checkpoints were satisfied; with protocol and card."""
     paused = {"paused_steps": 210} if "pause_steps" in settings else {}
+    paused |= {key: value for key, value in settings.items() if key in MEMORY_CONTROLS}
     records = [
         rollout(task, "temporal", operations, [j < n for j in range(3)], n == 3, k, **paused)
         for k, n in enumerate(reached)

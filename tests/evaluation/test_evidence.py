@@ -126,7 +126,9 @@ def test_scenes_that_were_not_run_with_every_variant_are_left_out() -> None:
 
 def evaluation(folder: Path, policy: Policy) -> str:
     write_episodes(folder, rollouts("bowl", "object", policy) + rollouts("count", "temporal", policy, chance=None))
-    (folder / "protocol.json").write_text(json.dumps({**SETTINGS, "referent": "drawn", "evidence": True}))
+    (folder / "protocol.json").write_text(
+        json.dumps({**SETTINGS, "referent": "drawn", "evidence": True, "replan_steps": 5})
+    )
     return str(folder)
 
 

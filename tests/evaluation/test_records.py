@@ -16,7 +16,7 @@ from lerobot_memobench.evaluation.comparison import compare
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.html.write import write_html
 from lerobot_memobench.evaluation.metrics import failure_counts, summarise
-from lerobot_memobench.evaluation.records import read_protocol, read_rollouts, read_runs, sweeps
+from lerobot_memobench.evaluation.records import read_protocol, read_run, read_runs, sweeps
 from lerobot_memobench.evaluation.report import build, write_report
 from lerobot_memobench.evaluation.report_tables import failures_table
 from lerobot_memobench.evaluation.tables import WRITERS
@@ -123,12 +123,12 @@ def test_rollouts_beyond_the_request_are_left_out(tmp_path: Path) -> None:
     (folder / "card.json").write_text(json.dumps(content))
     (run,) = read_runs([folder])
     assert [row["SR"].n for row in run.summary.tasks.values()] == [3, 3]
-    assert run.notes == ["2 rollouts beyond the 3 of each task that were asked for left out"]
+    assert run.notes == ["2 rollouts beyond those that were asked for left out"]
     assert write_report(folder).summary.tasks["one"]["SR"].n == 3
-    assert read_rollouts(folder)[1] == run.notes, "they stay in the log"
+    assert read_run(folder).notes == run.notes, "they stay in the log"
     (folder / "card.json").write_text(json.dumps({**content, "policy": {"seed": 9}}))
     logs.evaluation(folder)
-    assert len(read_rollouts(folder)[0]) == 8, "episodes 2, 3 and 4 were asked for"
+    assert len(read_run(folder).records) == 4, "episodes 2, 3 and 4 were asked for, and 4 is missing"
 
 
 def test_other_settings_are_noted_in_every_format(tmp_path: Path) -> None:

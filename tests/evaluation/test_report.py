@@ -43,6 +43,7 @@ from lerobot_memobench.evaluation.tables import (
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
 from lerobot_memobench.tasks.task import STRICT_FAILURES
 from tests.support import logs
+from tests.support.logs import MISSING
 
 
 def record(task: str, memory_type: str, episode: int, success: bool, **changes: Any) -> dict[str, Any]:
@@ -68,7 +69,6 @@ def test_files_next_to_the_log(tmp_path: Path) -> None:
     assert "stale memory | 1" in text
     assert not list(tmp_path.glob("*.part"))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    assert write_report(tmp_path, episodes=3).summary.tasks["first"]["SR"].n == 3, "a last batch may hold more"
     write_report(tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
@@ -86,7 +86,7 @@ def test_every_line_of_the_log_stays(tmp_path: Path, workers: bool) -> None:
     notes = [write_report(tmp_path).notes for _ in range(2)]
     assert notes[0] == notes[1]
     assert sum("line" in note for note in notes[0]) == 2
-    assert any(note.startswith(f"{2 + workers} rollouts beyond the 4") for note in notes[0])
+    assert any(note.startswith(f"{2 + workers} rollouts beyond") for note in notes[0])
     kept = merged.read_text().splitlines()
     assert kept[:6] == lines
     assert [json.loads(line)["episode"] for line in kept[6:]] == ([1, 7] if workers else [])
@@ -95,7 +95,7 @@ def test_every_line_of_the_log_stays(tmp_path: Path, workers: bool) -> None:
 @pytest.mark.parametrize("change", ["outcome", "missing", "extra"])
 def test_disagreements_of_log_and_card_are_noted(tmp_path: Path, change: str) -> None:
     lines = [record("first", "object", k, True) for k in range(2)]
-    card = {"protocol": {"episodes": 5}, "episodes": [outcome(each) for each in lines]}
+    card = {"protocol": {"episodes": 2 + (change == "extra")}, "episodes": [outcome(each) for each in lines]}
     (tmp_path / "card.json").write_text(json.dumps(card))
     logged = {
         "outcome": [{**lines[0], "success": False}, lines[1]],
@@ -104,9 +104,10 @@ def test_disagreements_of_log_and_card_are_noted(tmp_path: Path, change: str) ->
     }[change]
     for each in logged:
         EpisodeLog(tmp_path).append(each)
-    (note,) = write_report(tmp_path).notes
+    note, *others = write_report(tmp_path).notes
     assert f"first, episode {2 if change == 'extra' else 0}" in note
-    assert read_runs([tmp_path])[0].notes == [note]
+    assert [other.split(";")[0] for other in others] == [MISSING.format(1, 2, "first", 0)] * (change == "missing")
+    assert read_runs([tmp_path])[0].notes == [note, *others]
 
 
 # --- the first line ---

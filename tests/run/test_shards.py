@@ -25,7 +25,7 @@ from lerobot_memobench.run.card import new_card, policy_facts, run_facts, write_
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.shards import merge, merge_and_report, part_folders, plan_shards, slurm_of
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop
-from tests.support.logs import SETTINGS
+from tests.support.logs import MISSING, SETTINGS
 from tests.support.sbatch import Sbatch
 
 COMMAND = ["eval", "env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "batch_size=2"]
@@ -78,8 +78,9 @@ def with_card(folder: Path, shard: str, policy: str = "act", task_hash: str = "1
 def test_logs_videos_protocol_and_card_are_merged(tmp_path: Path) -> None:
     parts = [with_card(part(tmp_path / f"p{k}", [k, k + 2]), f"{k + 1}/2") for k in range(2)]
     out = tmp_path / "out"
-    assert merge(tmp_path / "half", parts[:1]) == [("a", 1), ("a", 3)]
-    assert merge(out, parts) == []
+    found = merge_and_report(tmp_path / "half", parts[:1])
+    assert MISSING.format(2, 4, "a", 1) in str(found.missing).replace(", in part 1/2 of an evaluation", "")
+    assert merge_and_report(out, parts).missing is None
     assert [record["episode"] for record in read_episodes(out)] == [0, 1, 2, 3]
     assert read_protocol(out) == {**SETTINGS, "tasks": ["a"], "episodes": 4, "policy": policy_facts({"type": "act"}, 7)}
     assert os.path.samefile(out / "videos" / "a.2.mp4", tmp_path / "p0" / "videos" / "a.2.mp4")
@@ -90,10 +91,10 @@ def test_logs_videos_protocol_and_card_are_merged(tmp_path: Path) -> None:
     assert card["shard"] is None
     # Once more, and with a part that came later and has no card.
     before = (out / "evaluation.json").read_bytes(), (out / "episodes.jsonl").read_bytes()
-    assert merge(out, parts) == []
+    merge(out, parts)
     assert before == ((out / "evaluation.json").read_bytes(), (out / "episodes.jsonl").read_bytes())
     settings = {**SETTINGS, "policy": {"type": "act", "identity": "act 1"}}
-    assert merge(out, [part(tmp_path / "later", [0], task="b", settings=settings)]) == []
+    merge(out, [part(tmp_path / "later", [0], task="b", settings=settings)])
     assert len(read_episodes(out)) == 5
     assert set(read_evaluation(out)) == {"format", "protocol"}
 
@@ -104,7 +105,7 @@ def test_an_episode_in_two_parts_counts_once(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(os, "link", no_link)
     parts = [part(tmp_path / "x", [0, 1]), part(tmp_path / "y", [1, 2], wall_s=77.0)]
-    assert merge(tmp_path / "out", parts) == []
+    merge(tmp_path / "out", parts)
     assert [record["episode"] for record in read_episodes(tmp_path / "out")] == [0, 1, 2]
     assert (tmp_path / "out" / "videos" / "a.0.mp4").read_text() == "videos/a.0.mp4 of 0"  # copied
 
@@ -144,10 +145,10 @@ def test_parts_that_disagree_are_refused(tmp_path: Path, x: dict[str, Any], y: d
 
 def test_parts_without_a_policy_are_merged_with_a_note(tmp_path: Path) -> None:
     parts = [part(tmp_path / name, [k], settings=None) for k, name in enumerate("xy")]
-    unnamed = merge_and_report(tmp_path / "out", parts).run
+    unnamed = merge_and_report(tmp_path / "out", parts)
     assert len(unnamed.notes) == 1
     assert headline([unnamed]).startswith("policy not recorded: ")
-    named = merge_and_report(tmp_path / "named", [part(tmp_path / "z", [0], settings=KNOWN)]).run
+    named = merge_and_report(tmp_path / "named", [part(tmp_path / "z", [0], settings=KNOWN)])
     assert (named.notes, headline([named])[:6]) == ([], "act 1:")
 
 
@@ -157,7 +158,7 @@ def test_folders_of_parts_are_found_or_named(fake_loop: FakeLoop, capsys: pytest
     folders = [f"machine{number}/shard-{number}-of-2" for number in (1, 2)]
     assert [str(folder) for folder in part_folders(Path("machine1"))] == folders[:1]
     assert memobench(["merge", "half", folders[0]]) == 1
-    assert f"4 episodes, the first is {DRAWER}, episode 0" in capsys.readouterr().out
+    assert f"4 of 8 episodes, with all of 1 task, the first is {DRAWER}, episode 0" in capsys.readouterr().out
     assert memobench(["merge", "out", *folders]) == 0
     assert len(read_episodes(Path("out"))) == 8
     assert memobench(["merge", "empty"]) == 2

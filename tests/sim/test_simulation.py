@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import platform
 import subprocess
 import sys
 from collections.abc import Callable
 
+import mujoco
 import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, axis_angle
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
@@ -121,3 +124,22 @@ def test_state_is_time_positions_velocities(simulate: Simulate) -> None:
     assert sim.state().dtype == np.float64
     with pytest.raises(MemobenchError, match=r"\(5,\)"):
         sim.set_state(np.zeros(5))
+
+
+@pytest.mark.skipif(
+    (platform.machine(), mujoco.__version__) != ("x86_64", "3.9.0"), reason="other builds of MuJoCo round otherwise"
+)
+@pytest.mark.parametrize(
+    ("name", "seed", "expected"),
+    [
+        ("turn_on_the_stove_and_turn_it_off", 7, "1581082fce82dce9"),
+        ("check_all_three_drawers_of_the_cabinet", 7, "079b17af8c24817e"),
+        ("open_and_close_the_microwave", 8, "94fde71e1dbb2a46"),
+        ("find_the_charger_hidden_in_one_of_the_drawers", 7, "b9d5a616bd982881"),
+    ],
+)
+def test_a_change_of_scene_hashes_raises_their_version(name: str, seed: int, expected: str) -> None:
+    """Earlier results are then compared without them. After a change: raise `SCENE_HASH_VERSION`, renew the hashes."""
+    sim = Simulation(get_task(name))
+    sim.reset(seed)
+    assert (SCENE_HASH_VERSION, sim.scene_hash()) == (2, expected)

@@ -55,11 +55,16 @@ def rollout(
     return record(task, episode, zip(operations, steps, ordered, strict=True), **own | changes)
 
 
-def evaluation(folder: Path, successes: int = 2, episodes: int = 4, **changes: Any) -> Path:
+MISSING = "missing: {} of {} episodes, the first is {}, episode {}"
+"""The beginning of the note on missing episodes: how many, of how many, task and number."""
+
+
+def evaluation(folder: Path, successes: int = 2, episodes: int = 4, first_seed: int = 7, **changes: Any) -> Path:
     """A log of two tasks: the first ``successes`` episodes of each succeed, the others miss their last checkpoint."""
     records = [
         rollout(
-            task, memory_type, operations, [True] * (len(operations) - 1) + [k < successes], k < successes, k, **changes
+            *(task, memory_type, operations, [True] * (len(operations) - 1) + [k < successes], k < successes, k),
+            **{"seed": first_seed + k, **changes},
         )
         for task, memory_type, operations in (("one", "temporal", "SU"), ("two_of_them", "spatial", "SUC"))
         for k in range(episodes)

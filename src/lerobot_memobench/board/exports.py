@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -11,6 +12,7 @@ from typing import Any
 from lerobot_memobench.board.check import MOST, SEEDS, departures
 from lerobot_memobench.board.submission import ABOUT, About
 from lerobot_memobench.envs.episode_log import INPUTS, with_omitted
+from lerobot_memobench.evaluation.headline import extent_phrase
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, Row, by_task, percent, wilson
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.io import checked
@@ -83,11 +85,13 @@ def _provenance(run: Run) -> dict[str, Any]:
     card = run.card
     checkpoint, trained = card.get("checkpoint") or {}, card.get("trained_on") or {}
     versions = card["runs"][-1].get("versions", {}) if card.get("runs") else {}
+    counts = {len(group) for group in by_task(run.records).values()}
     return {
         "policy_revision": checkpoint.get("revision") or card.get("policy", {}).get("sha256"),
         "dataset_revision": trained.get("revision") or trained.get("sha256"),
         "seed": card.get("policy", {}).get("seed"),
-        "episodes_per_task": run.protocol["episodes"],
+        "episodes_per_task": counts.pop() if len(counts) == 1 else None,
+        "missing": run.missing,
         "sim_version": versions.get("mujoco"),
         "tool": {"name": PACKAGES[0], "version": versions.get(PACKAGES[0])},
     }
@@ -127,8 +131,9 @@ def _conditions(run: Run) -> str:
     found = departures(protocol)
     return (
         f"{protocol['suite']} suite, referent {protocol.get('referent')}, inputs: {protocol.get(INPUTS)}, "
-        f"{protocol['episodes']} episodes of each of {len(protocol['tasks'])} tasks, seeds from "
-        f"{protocol.get('seed_base')}{f'; not the settings of the board ({"; ".join(found)})' if found else ''}"
+        f"{extent_phrase(run.records)}, seeds from {protocol.get('seed_base')}"
+        f"{f'; not the settings of the board ({"; ".join(found)})' if found else ''}"
+        f"{f'; {run.missing}' if run.missing else ''}"
     )
 
 
@@ -151,7 +156,9 @@ def vla_eval_json(run: Run) -> str:
     """
     about, protocol, summary = about_of(run), with_omitted(run.protocol), run.summary
     model = model_of(run)
-    whole = sorted(protocol["tasks"]) == sorted(task_names(suite=protocol["suite"])) and protocol["episodes"] == MOST
+    whole = {(record["task"], record["episode"]) for record in run.records} == {
+        *itertools.product(task_names(suite=protocol["suite"]), range(MOST))
+    }
     day = about.date if about else str(run.card.get("written", ""))[:10]
     submitter = about.submitter if about else ""
     scores = {kind: _score(summary.memory_types[kind]) for kind in MEMORY_TYPES if kind in summary.memory_types}

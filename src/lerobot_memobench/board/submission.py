@@ -248,7 +248,7 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
         card = read_evaluation(source, whole=True)
         block = {} if control else {ABOUT: about.model_dump(exclude_none=True)}
         write_card(place, {**card, **block})
-        lines = [json.dumps(record) + "\n" for record in asked_for(source, read_log(source), [])]
+        lines = [json.dumps(record) + "\n" for record in asked_for(source, read_log(source))]
         packed = io.BytesIO()
         with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:
             file.write("".join(lines).encode())

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_memobench.cli.console import WITH_PARENT, console, counting, note, run_command, say
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import as_path, count_of
+from lerobot_memobench.io import as_path
 from lerobot_memobench.jobs.processes import adding_resume_hint
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 from lerobot_memobench.run.arguments import (
@@ -34,9 +34,9 @@ from lerobot_memobench.run.arguments import (
 )
 
 if TYPE_CHECKING:
+    from lerobot_memobench.evaluation.records import Run
     from lerobot_memobench.jobs.processes import Advance
     from lerobot_memobench.run.plan import EvaluationPlan
-    from lerobot_memobench.run.run import EvaluationReport
 
 SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.lerobot", WITH_PARENT)
 """Arguments of Python that start the process of one part."""
@@ -138,7 +138,8 @@ def evaluate_here(plan: EvaluationPlan) -> int:
     if report is None:
         print(f"part {plan.options.shard} holds no episode: there are fewer batches than parts")
         return 0
-    return print_report(report)
+    print_report(report)
+    return 0
 
 
 def evaluate_in_parts(plan: EvaluationPlan) -> int:
@@ -168,28 +169,21 @@ def merge_and_print(out: Path, folders: Sequence[Path]) -> int:
     return print_report(merge_and_report(out, folders))
 
 
-def print_report(report: EvaluationReport) -> int:
+def print_report(run: Run) -> int:
     """Print a report; return 1 when episodes that were asked for are missing."""
     from lerobot_memobench.evaluation.headline import headline
-    from lerobot_memobench.evaluation.report import table
+    from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, table
     from lerobot_memobench.evaluation.report_tables import failure_line
 
-    screen, run = console(), report.run
+    screen = console()
     screen.print()
     screen.print(headline([run]), style="bold")
     screen.print(table(run.summary), crop=False)
     screen.print(failure_line(run.summary))
     for line in run.notes:
         screen.print(f"note: {line}")
-    print(f"report: {report.page}")
-    if not report.absent:
-        return 0
-    task, episode = report.absent[0]
-    say(
-        f"note: missing: {count_of(len(report.absent), 'episode')}, the first is {task}, episode {episode}; run their "
-        "parts with resume=true and merge again"
-    )
-    return 1
+    print(f"report: {run.folder / REPORT_MARKDOWN}")
+    return int(run.missing is not None)
 
 
 # --- the process of one part ---

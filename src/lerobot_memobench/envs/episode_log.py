@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDic
 
 from annotated_types import Ge, Le
 
-from lerobot_memobench.envs.settings import GOALS, IDLE, MEMORY_CONTROLS
+from lerobot_memobench.envs.settings import GOALS, IDLE, MEMORY_CONTROLS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -210,7 +210,10 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
     """
     progress, task, fault, choice = episode.progress, episode.task, episode.fault, episode.choice
     failure = classify_failure(
-        task, progress.first_step, episode.success, episode.drifted, lost=episode.lost, cut_off=episode.cut_off
+        *(task, progress.first_step, episode.success, episode.drifted),
+        lost=progress.broken if episode.lost else None,
+        cut_off=episode.cut_off,
+        ordered=progress.ordered,
     )
     steps = zip(task.checkpoints, progress.first_step, progress.ordered_step, strict=True)
     return {
@@ -487,7 +490,7 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 
 OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, "world": MEMOBENCH, "difficulty": STANDARD, "protocol": BY_PAPER},
-    **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, "render_every": 1},
+    **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
     **MEMORY_CONTROLS,
 }
 """Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
@@ -520,12 +523,15 @@ def differences(
 
     Args:
         extent: whether tasks and number of episodes are compared.
-        policy: whether the policy's identity is compared.
+        policy: whether the policy's identity and the version of scene hashes are compared, as between parts of one
+            evaluation.
         ignore: settings that may differ.
     """
-    left_out = {*ignore, POLICY, *(() if extent else EXTENT)}
+    left_out = {*ignore, POLICY, *(() if extent else EXTENT), *(() if policy else (SCENE_HASHES,))}
     first = {k: v for k, v in with_omitted(a).items() if k not in left_out}
     found = _differing(first, with_omitted(b))
+    earlier = " (an earlier version hashed scenes otherwise)"
+    found = [f"{each}{earlier if each.startswith(SCENE_HASHES) else ''}" for each in found]
     if policy:
         found += _differing(a.get(POLICY) or {}, b.get(POLICY) or {}, f"{POLICY}.")
     return found

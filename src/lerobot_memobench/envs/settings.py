@@ -22,6 +22,7 @@ from lerobot_memobench.protocol import (
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
+from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
 from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS, STRICT, SUITES, WORLDS, check_world
@@ -54,6 +55,8 @@ MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "res
 IDLE, GOALS, STRICT_GOALS = "idle", "goals", 2
 """Protocol keys of strict tasks: maximum idle steps before the execution, and revision of the goals. Goals of revision
 1 could be reached without memory, by marks in the scene and a clock."""
+SCENE_HASHES = "scene_hash_version"
+"""Protocol key: version of the hash of scenes (`sim.scene_hash`)."""
 UPSTREAM_ONLY = {
     **{"suite": PUBLISHED, "referent": REFERENTS[0], "oracle_memory": False},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False},
@@ -213,7 +216,7 @@ class EnvSettings:
     def protocol_block(self) -> dict[str, Any]:
         """Settings that must agree to join or compare two evaluations."""
         agreed = {name: value for name, value in asdict(self).items() if name not in NOT_COMPARED}
-        return {**agreed, **revision(self.suite, self.difficulty)}
+        return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
 
 
 NOT_COMPARED = ("expert_action", "blind_action", "videos")

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import key_of
 
+SCENES = "scene_hash"
 OUTCOME = (
     *("success", "steps", "prompt_steps", "variant", "choice", "checkpoints", "failure", "fault", "not_run"),
-    *("stand_ins", "scene_hash"),
+    *("stand_ins", SCENES),
 )
 """Fields in which two runs of the same episode must agree."""
 
@@ -20,15 +21,21 @@ def outcome(record: Mapping[str, Any]) -> dict[str, Any]:
     return {key: record[key] for key in (*identity, *OUTCOME) if key in record}
 
 
-def disagreement(a: Mapping[str, Any], b: Mapping[str, Any], here: str = "here", there: str = "there") -> str | None:
+def disagreement(
+    a: Mapping[str, Any],
+    b: Mapping[str, Any],
+    here: str = "here",
+    there: str = "there",
+    ignore: Collection[str] = (),
+) -> str | None:
     """Return a phrase for the first difference of two records of the same episode, None where they agree.
 
-    Times, and fields that one of them lacks, do not count.
+    Times, fields to ``ignore``, and fields that one of them lacks, do not count.
     """
     if ("not_run" in a) != ("not_run" in b):
         return f"{_name(a)} was not run {here if 'not_run' in a else there}"
-    for name in ("seed", "replan_steps", "scene_hash", *OUTCOME):
-        if name not in a or name not in b or a[name] == b[name]:
+    for name in ("seed", "replan_steps", *OUTCOME):
+        if name in ignore or name not in a or name not in b or a[name] == b[name]:
             continue
         if name == "checkpoints" and len(a[name]) == len(b[name]):
             found = _first_checkpoint(a[name], b[name])
@@ -50,7 +57,10 @@ def _first_checkpoint(a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, A
 
 
 def disagreements(
-    card: Sequence[Mapping[str, Any]], records: Sequence[Mapping[str, Any]], there: str = "in the log"
+    card: Sequence[Mapping[str, Any]],
+    records: Sequence[Mapping[str, Any]],
+    there: str = "in the log",
+    ignore: Collection[str] = (),
 ) -> list[str]:
     """Return a phrase for each episode that differs between a card and a log, or that one of them lacks."""
     logged, named = ({key_of(each): each for each in some} for some in (records, card))
@@ -60,7 +70,7 @@ def disagreements(
             found.append(f"{_name(named[key])} is on the card and not {there}")
         elif key not in named:
             found.append(f"{_name(logged[key])} is {there} and not on the card")
-        elif (problem := disagreement(named[key], logged[key], "on the card", there)) is not None:
+        elif (problem := disagreement(named[key], logged[key], "on the card", there, ignore)) is not None:
             found.append(problem)
     return found
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.episode_log import OF_THE_POLICY, differences
 from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.evaluation.agreement import SCENES
 from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed, published_table
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
@@ -30,7 +31,7 @@ from lerobot_memobench.evaluation.metrics import (
     satisfied,
     value_of,
 )
-from lerobot_memobench.evaluation.records import APART, Run, other_physics
+from lerobot_memobench.evaluation.records import APART, Run, other_hashes, other_physics
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
 from lerobot_memobench.evaluation.statistics import (
     DRAWS,
@@ -61,7 +62,6 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
-SCENES = "scene_hash"
 ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
 """Settings that may differ when `allow` names them."""
 
@@ -108,7 +108,7 @@ def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str
     """
     for field, name, noun in (
         ("seed", "seed_base", "seeds"),
-        ("scene_hash", SCENES, "initial scenes"),
+        (SCENES, SCENES, "initial scenes"),
         ("variant", "referent", "variants"),
     ):
         different = [(x, y) for x, y in pairs if None not in (x.get(field), y.get(field)) and x[field] != y[field]]
@@ -216,6 +216,8 @@ def compare(
     """
     control = control_between(a, b)
     allowed = {*allow, *([] if control is None or control.of_policy else [control.setting, *control.also])}
+    if other_hashes(a.protocol, b.protocol):
+        allowed.add(SCENES)
     pairs = _like_pairs(a, b, allowed)
     notes = tuple(_notes(a, b, pairs, control))
     a, b = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
@@ -268,7 +270,7 @@ def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> li
     """Return warnings for the reader: differing settings, episodes left out, gaps of the logs."""
     meant = () if control is None else (control.setting, *control.also)
     notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol, ignore=meant)]
-    notes += other_physics(a, b)
+    notes += other_physics(a, b) + other_hashes(a.protocol, b.protocol)
     left = {run.name: len(run.records) - len(pairs) for run in (a, b)}
     notes += [f"{count_of(count, 'episode')} only in {name} left out" for name, count in left.items() if count]
     if paused := [record["paused_steps"] for _, record in pairs if "paused_steps" in record]:

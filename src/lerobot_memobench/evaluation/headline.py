@@ -56,7 +56,8 @@ def protocol_phrases(run: Run) -> list[str]:
         *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),
         f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
         *_seeds(run),
-        _extent(records),
+        extent_phrase(records),
+        *([] if run.missing is None else ["incomplete"]),
         *_replan(records),
         *(
             f"{name}={str(run.protocol[name]).lower()}"
@@ -80,7 +81,7 @@ def _seeds(run: Run) -> list[str]:
     return [f"{seeds} ({name}{f', run {number} of this policy' if number else ''})"]
 
 
-def _extent(records: Sequence[Record]) -> str:
+def extent_phrase(records: Sequence[Record]) -> str:
     """Return how many episodes there are of how many tasks, of a single one by its name."""
     counts: dict[str, int] = {}
     for record in records:

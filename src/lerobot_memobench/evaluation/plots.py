@@ -41,6 +41,7 @@ OUTCOMES = {
     "cut_off": ("#bdbdbd", "--"),
     "miscount": ("#cc79a7", "++++"),
     "wrong_place": ("#8a8a8a", "oooo"),
+    "hand": ("#e6a176", "xx"),
     "invalid_action": ("#b39ddb", "OO"),
     "unstable_physics": ("#b39ddb", "**"),
 }

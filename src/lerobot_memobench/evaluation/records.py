@@ -22,11 +22,13 @@ from lerobot_memobench.envs.episode_log import (
     notes_on_not_run,
     read_episodes,
     read_log,
+    with_omitted,
 )
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
-from lerobot_memobench.envs.settings import SETTINGS
+from lerobot_memobench.envs.settings import SCENE_HASHES, SETTINGS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreements
+from lerobot_memobench.evaluation.asked import check_lines, extent_of
 from lerobot_memobench.evaluation.evidence import FoundEvidence, evidence_of, ran_evidence
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import count_of
@@ -106,6 +108,7 @@ class Run:
     Attributes:
         name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
         notes: warnings for the reader, such as unreadable lines.
+        missing: a sentence on the episodes that its file asks for and its log lacks; None without such episodes.
     """
 
     name: str
@@ -114,6 +117,7 @@ class Run:
     records: Sequence[Record]
     protocol: Mapping[str, Any]
     notes: Sequence[str] = field(default_factory=tuple)
+    missing: str | None = None
 
     @cached_property
     def summary(self) -> Summary:
@@ -153,10 +157,7 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     if not given:
         raise MemobenchError("no evaluation was given; expected folders that evaluations have written")
     names = folder_names([folder for _, folder in given])
-    runs = []
-    for (label, folder), name in zip(given, names, strict=True):
-        records, notes = read_rollouts(folder)
-        runs.append(Run(name, label or "", folder, records, read_protocol(folder), notes))
+    runs = [read_run(folder, name, label or "") for (label, folder), name in zip(given, names, strict=True)]
     for key in APART:
         values = [of_all(run.records, key) for run in runs]
         for run, value in zip(runs, values, strict=True):
@@ -181,8 +182,16 @@ def unlike(runs: Sequence[Run]) -> list[str]:
                 f"{first} and {run.name} have different protocols ({'; '.join(found)}; the first value is that of "
                 f"{first}): do not compare their rates; `memobench compare` compares common episodes"
             )
-        notes += other_physics(runs[0], run)
+        notes += other_physics(runs[0], run) + other_hashes(runs[0].protocol, run.protocol)
     return notes
+
+
+def other_hashes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
+    """Return a sentence where the versions of scene hashes differ between two protocols."""
+    mine, other = (with_omitted(protocol)[SCENE_HASHES] for protocol in (a, b))
+    if mine == other:
+        return []
+    return [f"an earlier version hashed scenes otherwise ({SCENE_HASHES} {mine} and {other}): hashes are not compared"]
 
 
 def other_physics(a: Run, b: Run) -> list[str]:
@@ -195,42 +204,43 @@ def other_physics(a: Run, b: Run) -> list[str]:
     return [f"{a.name} ran under MuJoCo {here} and {b.name} under {there}: scenes start and move slightly otherwise"]
 
 
-def read_rollouts(folder: str | Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the rollouts of an evaluation and warnings: unreadable lines, episodes that were not run or were
-    broken off, mixed protocols.
+def read_run(folder: str | Path, name: str | None = None, method: str = "") -> Run:
+    """Return an evaluation with warnings: unreadable lines, episodes that are missing, were not run or were broken
+    off, disagreements of log and card, mixed protocols.
 
     Raises:
-        MemobenchError: there are none.
+        MemobenchError: it has no rollouts, or a line contradicts the settings in its file.
     """
-    notes: list[str] = []
-    logged = asked_for(Path(folder), read_log(folder, notes), notes)
-    records = [record for record in logged if "not_run" not in record]
+    folder, notes = Path(folder), list[str]()
+    logged = read_log(folder, notes)
+    lines = asked_for(folder, logged)
+    card = read_evaluation(folder)
+    if len(lines) < len(logged):
+        notes.append(f"{count_of(len(logged) - len(lines), 'rollout')} beyond those that were asked for left out")
+    if card.get("episodes") and (found := disagreements(card["episodes"], lines)):
+        notes.append(f"log and card disagree about {count_of(len(found), 'episode')}, the first: {found[0]}")
+    extent = extent_of(card, logged)
+    missing = None if extent is None else extent.missing(lines)
+    notes += [*([] if missing is None else [missing]), *notes_on_not_run(lines)]
+    records = [record for record in lines if "not_run" not in record]
     if not records:
         reasons = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{reasons}; run an evaluation first")
-    return records, notes + notes_on(records)
+    return Run(
+        name or folder.name, method, folder, records, read_protocol(folder), [*notes, *notes_on(records)], missing
+    )
 
 
-def asked_for(folder: Path, lines: list[dict[str, Any]], notes: list[str]) -> list[dict[str, Any]]:
-    """Return the lines of a log to report: without episodes beyond those that the card's protocol asks for.
+def asked_for(folder: Path, lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the lines of a log to report: without episodes that the evaluation's file does not ask for.
 
-    ``notes`` gets a sentence for those that are left out, for disagreements of log and card, and for episodes that
-    were not run.
+    Raises:
+        MemobenchError: a line contradicts the settings in the file.
     """
     card = read_evaluation(folder)
-    count, base = (card.get("protocol", {}).get(key) for key in ("episodes", "seed_base"))
-    kept = lines
-    if count is not None:
-        seed = (card.get(POLICY) or {}).get("seed")
-        first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
-        kept = [record for record in lines if record["episode"] < first + count]
-    if len(kept) < len(lines):
-        beyond = count_of(len(lines) - len(kept), "rollout")
-        notes.append(f"{beyond} beyond the {count} of each task that were asked for left out")
-    if card.get("episodes") and (found := disagreements(card["episodes"], kept)):
-        notes.append(f"log and card disagree about {count_of(len(found), 'episode')}, the first: {found[0]}")
-    notes += notes_on_not_run(kept)
-    return kept
+    check_lines(folder, card, lines)
+    extent = extent_of(card, lines)
+    return lines if extent is None else [record for record in lines if extent.asks(record)]
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:

@@ -16,7 +16,6 @@ from typing import Any
 from rich.console import RenderableType
 
 from lerobot_memobench.envs.episode_log import POLICY, not_run, read_log, write_episodes
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import Comparison, comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.controls import granularity_data, granularity_section
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
@@ -26,11 +25,10 @@ from lerobot_memobench.evaluation.metrics import (
     Rate,
     Row,
     Summary,
-    notes_on,
     percent,
     report_values,
 )
-from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, asked_for, read_run, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     best_interval,
     check_paper_rows,
@@ -58,36 +56,26 @@ REPORT_MARKDOWN = "report.md"
 # --- in the folder of the log ---
 
 
-def write_report(directory: str | Path, episodes: int | None = None) -> Run:
+def write_report(directory: str | Path) -> Run:
     """Read the log under ``directory`` and write ``report.json`` and ``report.md`` into it.
 
     ``episodes.jsonl`` gets the lines of the workers' files that it lacks. The caller holds the folder (`locked`) where
     another process may write to it.
 
-    Args:
-        episodes: report episodes 0 to ``episodes`` − 1 of each task; None for all. LeRobot runs whole batches, so its
-            last one may hold more than were asked for.
-
     Returns:
-        The evaluation with warnings: unreadable lines, episodes that were not run, mixed protocols.
+        The evaluation with warnings, see `read_run`.
 
     Raises:
-        MemobenchError: there is no rollout.
+        MemobenchError: see `read_run`.
     """
     directory = Path(directory)
-    notes: list[str] = []
-    lines = read_log(directory, notes)
+    run = read_run(directory)
+    lines = read_log(directory, [])  # `read_run` has named the problems
     write_episodes(directory, lines)
-    logged = asked_for(directory, lines, notes)
-    if episodes is not None:
-        logged = [record for record in logged if record["episode"] < episodes]
-    records = [record for record in logged if "not_run" not in record]
-    if logged and not records:
-        raise MemobenchError(f"no episode in {directory} could be run; {'; '.join(notes)}")
-    notes += notes_on(records)
-    run = Run(directory.name, "", directory, records, read_protocol(directory), notes)
-    unrun = {task: len(lines) for task, lines in not_run(logged).items()}
+    unrun = {task: len(group) for task, group in not_run(asked_for(directory, lines)).items()}
     figures = {**report_values(run.summary), **evidence_values(run), **({"not_run": unrun} if unrun else {})}
+    if run.missing is not None:
+        figures["missing"] = run.missing
     write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")
     write_file(directory / REPORT_MARKDOWN, evaluation_markdown(run))
     return run
@@ -204,6 +192,7 @@ def run_data(run: Run) -> dict[str, Any]:
             **{metric: _pooled(rate) for metric, rate in summary.pooled.items()},
         },
         "failures_by_task": {name: dict(counts) for name, counts in summary.failures_of.items()},
+        "missing": run.missing,
         "notes": list(run.notes),
     }
 

@@ -137,10 +137,11 @@ def prefix_table(summary: Summary) -> Table:
 
 
 FURTHER_NOTES = {
-    "wrong_order": " Wrong order: the steps of a procedure were done in another order than its prompt's.",
+    "wrong_order": " Wrong order: steps or events were done in another order than asked for.",
     "cut_off": " Cut off: the horizon is shorter than the protocol's, so the memory may have worked.",
     "miscount": " Miscount: the event was done too seldom or too often.",
     "wrong_place": " Wrong place: the thing was looked for where it is not.",
+    "hand": " Hand: events, order and place were right as far as they had to be remembered; the motion failed.",
     "invalid_action": " Invalid action: one of another shape, or not finite, broke the rollout off.",
     "unstable_physics": " Unstable physics: MuJoCo warned of its own state, which broke the rollout off.",
 }

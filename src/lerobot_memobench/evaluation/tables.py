@@ -245,6 +245,7 @@ def latex(report: Report) -> str:
     for number, section in enumerate(report.sections, start=1):
         if section.title:
             lines += ["", f"% {' '.join(section.title.split())}"]
+        lines += [f"% note: {' '.join(note.split())}" for note in section.notes]
         for table in section.tables:
             if keys[table.key] > 1:  # of several evaluations
                 table = replace(table, key=f"{table.key}-{number}", title=f"{table.title}: {section.title}")

@@ -26,7 +26,8 @@ from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import EnvSettings, revision
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import disagreements
+from lerobot_memobench.evaluation.agreement import SCENES, disagreements
+from lerobot_memobench.evaluation.records import other_hashes
 from lerobot_memobench.io import Malformed, checked, count_of, parsed
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
@@ -106,8 +107,11 @@ def repeat(
     check_extent(card, plan)
     if status := evaluate(plan):
         return status
-    problems = differences(card["protocol"], protocol_of(plan.log))
-    problems += disagreements(card["episodes"], read_log(plan.log), "here")
+    here = protocol_of(plan.log)
+    for note in (hashed := other_hashes(card["protocol"], here)):
+        say(f"note: {note}")
+    problems = differences(card["protocol"], here)
+    problems += disagreements(card["episodes"], read_log(plan.log), "here", [SCENES] if hashed else [])
     if not problems:
         say(f"repeated: {count_of(len(card['episodes']), 'episode')}, as on the card")
         return 0

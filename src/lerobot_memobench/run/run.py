@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_log
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
+from lerobot_memobench.envs.settings import SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import Run, read_protocol
-from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, write_report
+from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol
+from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import count_of, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
@@ -37,27 +37,9 @@ Note = Callable[[str], None]
 """Called with a message for the user; the run continues."""
 
 
-@dataclass(frozen=True)
-class EvaluationReport:
-    """The report of an evaluation.
-
-    Attributes:
-        run: its rollouts, figures and notes; its folder holds the log, and the report's files.
-        absent: (task, episode) of those that were asked for and are missing.
-    """
-
-    run: Run
-    absent: Sequence[tuple[str, int]] = ()
-
-    @property
-    def page(self) -> Path:
-        """The report as a file to read."""
-        return self.run.folder / REPORT_MARKDOWN
-
-
 def run_evaluation(
     plan: EvaluationPlan, note: Note, begin: Note = lambda text: None, advance: Advance = lambda *news: None
-) -> EvaluationReport | None:
+) -> Run | None:
     """Run the missing episodes, write report and card; return None for a part that holds no episode.
 
     Args:
@@ -90,9 +72,7 @@ def _summary(plan: EvaluationPlan) -> str:
     return f"evaluating {policy} on {tasks}, {count_of(plan.grid.runs, 'episode')} each, into {plan.output}"
 
 
-def _run(
-    plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note: Note, advance: Advance
-) -> EvaluationReport:
+def _run(plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note: Note, advance: Advance) -> Run:
     """Run the batches that are left."""
     ended = False
 
@@ -114,13 +94,11 @@ def _run(
             )
 
 
-def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> EvaluationReport:
+def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> Run:
     """Write the report of the log, and the outcomes onto the card."""
-    # A log of plain lerobot-eval holds whole batches: episodes beyond those asked for are left out of the report.
-    limit = plan.grid.first + max(plan.grid.runs, card["protocol"]["episodes"])
-    records = [record for record in read_log(plan.log) if record["episode"] < limit]
+    records = asked_for(plan.log, read_log(plan.log))
     write_card(plan.log, with_episodes(with_checkpoint(card, plan.policy_path), records))
-    return EvaluationReport(write_report(plan.log, limit))
+    return write_report(plan.log)
 
 
 # --- resuming: whether it is the same evaluation, and which episodes are left ---
@@ -137,7 +115,8 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
     check_folder(folder)
     if not has_log(folder):
         return card
-    found = differences(read_protocol(folder), {**card["protocol"], POLICY: card[POLICY]}, policy=True)
+    unknown = () if read_evaluation(folder) else (SCENE_HASHES,)  # a log alone
+    found = differences(read_protocol(folder), {**card["protocol"], POLICY: card[POLICY]}, policy=True, ignore=unknown)
     if found:
         raise MemobenchError(
             f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "

@@ -21,7 +21,8 @@ from lerobot_memobench.envs.episode_log import EXTENT, POLICY, differences, has_
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of, read_evaluation, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreement
-from lerobot_memobench.evaluation.records import read_protocol
+from lerobot_memobench.evaluation.asked import check_lines, extent_of
+from lerobot_memobench.evaluation.records import Run, read_protocol
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.jobs.processes import ProgressCallback
@@ -34,7 +35,6 @@ from lerobot_memobench.run.card import card_of, extended, first_variant_mismatch
 from lerobot_memobench.run.plan import EvaluationPlan, Shard, with_changes
 from lerobot_memobench.run.run import (
     VIDEOS,
-    EvaluationReport,
     Note,
     check_folder,
     check_new,
@@ -195,7 +195,7 @@ def run_shards(
     jobs: Sequence[ShardJob],
     progress: ProgressCallback,
     finish: Callable[[Path, Sequence[Path]], Any],
-) -> EvaluationReport | None:
+) -> Run | None:
     """Run all parts, at once or some at a time, and merge them; return None where they were submitted to Slurm.
 
     Args:
@@ -221,7 +221,7 @@ def part_folders(out: Path) -> list[Path]:
     return sorted(folder for folder in out.glob(SHARDS) if folder.is_dir() and has_log(folder))
 
 
-def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
+def merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
     """Merge parts into the folder ``out`` and report the whole; see `merge`.
 
     Raises:
@@ -231,39 +231,38 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
         return _merge_and_report(out, folders)
 
 
-def _merge_and_report(out: Path, folders: Sequence[Path]) -> EvaluationReport:
-    absent = merge(out, folders)
-    report = EvaluationReport(write_report(out), absent)
+def _merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
+    merge(out, folders)
+    run = write_report(out)
     if _names_policy(read_protocol(out), read_log(out)):
-        return report
+        return run
     note = f"{out} does not name the policy of its episodes: no part did"
-    return replace(report, run=replace(report.run, notes=[*report.run.notes, note]))
+    return replace(run, notes=[*run.notes, note])
 
 
-def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
+def merge(out: Path, folders: Sequence[Path]) -> None:
     """Merge the logs, cards and videos of evaluations of one protocol into the folder ``out``.
 
     Episodes of ``out`` are kept. Videos and memory reads are hard links where the disk allows it, else copies;
     LeRobot's own files are not merged. All checks are made before the first file is written.
 
-    Returns:
-        (task, episode) of those that the cards ask for and no part holds.
-
     Raises:
-        MemobenchError: there are no parts, protocols or policies differ, a part does not name its policy where
-            another does, variants were drawn by two rules, or an episode ended differently in two parts.
+        MemobenchError: there are no parts, protocols or policies differ, a line contradicts them, a part does not name
+            its policy where another does, variants were drawn by two rules, or an episode ended differently in two
+            parts.
     """
     sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
         raise MemobenchError(f"{out} holds no parts ({SHARDS}); name the folders to merge")
     records = {source: read_log(source) for source in sources}
     protocols = {source: read_protocol(source) for source in sources}
+    for source, lines in records.items():
+        check_lines(source, read_evaluation(source), lines)
     _check_protocols(protocols)
     _check_policies(protocols, records)
     _check_draws(records)
     joined = join(records)
     card = _joined_card(sources)
-    wanted = [] if card is None else _wanted(card)
     stored = [*map(protocol_of, sources)]
 
     out.mkdir(parents=True, exist_ok=True)
@@ -274,21 +273,11 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     write_episodes(out, joined)
     (out / EVALUATION_FILE).unlink(missing_ok=True)
     if card is not None:
-        asked = set(wanted)
-        write_card(out, with_episodes(card, [each for each in joined if (each["task"], each["episode"]) in asked]))
+        extent = extent_of(card, joined)
+        write_card(out, with_episodes(card, [each for each in joined if extent is None or extent.asks(each)]))
     elif all(stored):  # the first protocol that has a setting counts
         settings = functools.reduce(lambda first, other: {**other, **first}, [*stored, *protocols.values()])
         write_protocol(out, {key: value for key, value in settings.items() if key not in EXTENT})
-    present = {(record["task"], record["episode"]) for record in joined}
-    return [cell for cell in wanted if cell not in present]
-
-
-def _wanted(card: Mapping[str, Any]) -> list[tuple[str, int]]:
-    """Return (task, episode) of all episodes that a card's evaluation was asked for."""
-    asked, policy = card["protocol"], card["policy"]
-    base = asked.get("seed_base")
-    first = (policy.get("seed") or 0) - base if policy and isinstance(base, int) else 0
-    return [(task, first + run) for task in asked["tasks"] for run in range(asked["episodes"])]
 
 
 def _check_protocols(protocols: Mapping[Path, Mapping[str, Any]]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from lerobot_memobench.sim.raster.drawlist import DrawList, Image
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
+from lerobot_memobench.sim.scene_hash import scene_hash
 from lerobot_memobench.sim.world import StartState
 from lerobot_memobench.sim.worlds import WORLDS, get_scene
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
@@ -296,10 +296,7 @@ class Simulation:
 
     def scene_hash(self) -> str:
         """Return a short hash of the present state and the fixtures' poses."""
-        digest = hashlib.sha256(self.state().tobytes())
-        for name, pose in sorted(self.fixture_poses().items()):
-            digest.update(name.encode() + pose.tobytes())
-        return digest.hexdigest()[:16]
+        return scene_hash(self.state(), self.fixture_poses())
 
     # --- observation ----------------------------------------------------------------------------------------
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from lerobot_memobench.tasks.formula import Formula, Round, Then, When, children
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.formula import Formula, Never, Round, Then, When, atoms, children
+from lerobot_memobench.tasks.task import HAND, MISCOUNT, STRICT, Task
 
 REFERENCE_DRIFT = "reference_drift"
 """The policy acted on a wrong referent."""
 WRONG_ORDER = "wrong_order"
-"""The steps of a procedure were done in another order than in the prompt."""
+"""The steps of a procedure, or the events of an ordering task, were done in another order than asked for."""
 CUT_OFF = "cut_off"
 """A horizon below the protocol's ended the rollout; its memory is not assessed."""
 
@@ -41,8 +41,9 @@ def classify_failure(
     first_steps: Sequence[int | None],
     success: bool,
     drift: bool = False,
-    lost: bool = False,
+    lost: Formula | None = None,
     cut_off: bool = False,
+    ordered: bool = False,
 ) -> str | None:
     """Return the failure class of an execution of ``task``, None for a success.
 
@@ -50,17 +51,48 @@ def classify_failure(
         first_steps: (K,) first execution step at which each checkpoint's predicate held; None for never.
         success: whether the goal held at the end.
         drift: whether a wrong answer was given (object and procedural tasks).
-        lost: whether the goal became unreachable (strict tasks).
+        lost: the part of the goal that made it unreachable (strict tasks), see `Progress.broken`.
         cut_off: whether a horizon below the protocol's ended the episode.
+        ordered: see `Progress.ordered`.
     """
-    if lost and task.spoilt_as is not None:
-        return task.spoilt_as
+    if lost and (spoilt := _spoilt(task, first_steps, lost)) is not None:
+        return spoilt
     found = classify(task.operations, first_steps, success, drift)
     if found in (None, REFERENCE_DRIFT):
         return found
     if task.memory_type == "procedural" and asks_order(task.goal) and _out_of_order(first_steps):
         return WRONG_ORDER
-    return CUT_OFF if cut_off and None in first_steps else found
+    if cut_off and None in first_steps:
+        return CUT_OFF
+    return HAND if None in first_steps and _memory_served(task, first_steps, ordered) else found
+
+
+def _spoilt(task: Task, first_steps: Sequence[int | None], lost: Formula) -> str | None:
+    """Return the class of a strict rollout by the part of the goal that it broke; None: by its checkpoints."""
+    if isinstance(lost, Never) and any(atom.predicate == "handhome" for atom in atoms(lost)):
+        return HAND  # came home and left something ajar
+    if task.spoilt_as is not None or task.memory_type != "temporal":
+        return task.spoilt_as
+    if not isinstance(lost, When):
+        return MISCOUNT
+    # The earlier event was complete, and only the hand's return was missing.
+    before = [part for part in _parts(lost) if isinstance(part, Round)]
+    complete = [
+        step is not None and any(isinstance(part, Round) and part.children == each.children[:-1] for each in before)
+        for checkpoint, step in zip(task.checkpoints, first_steps, strict=True)
+        for part in _parts(checkpoint.goal)
+    ]
+    return HAND if any(complete) else WRONG_ORDER
+
+
+def _memory_served(task: Task, first_steps: Sequence[int | None], ordered: bool) -> bool:
+    """Return whether a strict rollout did all that it had to remember, so that what is missing is the hand's.
+
+    Before the first event of an instruction there is nothing to remember; a hidden thing is where its drawer is opened.
+    """
+    if task.suite != STRICT or task.memory_type not in ("temporal", "spatial"):
+        return False
+    return ordered or (first_steps[0] is None) == (task.memory_type == "temporal")
 
 
 def classify(

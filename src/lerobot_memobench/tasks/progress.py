@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from lerobot_memobench.tasks.formula import LATCHES, Atom, Formula, atoms
+from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, When, atoms, children
 from lerobot_memobench.tasks.nodes import build
 from lerobot_memobench.tasks.task import Task
 
@@ -55,6 +55,13 @@ class Evaluator:
     def settled(self) -> tuple[bool | None, ...]:
         """Per formula its value at all later steps, whatever happens; None while undecided."""
         return tuple(node.settled for node in self._nodes)
+
+    def parts(self, k: int) -> list[tuple[Formula, bool | None]]:
+        """Return the parts of formula ``k``, if it is a conjunction, else itself, each with its settled value."""
+        formula, node = self.formulas[k], self._nodes[k]
+        if not isinstance(formula, And):
+            return [(formula, node.settled)]
+        return [(part, each.settled) for part, each in zip(children(formula), node.parts, strict=True)]
 
     def step(self, holds: Callable[[Atom], bool]) -> tuple[bool, ...]:
         """Evaluate one control step and return the value of each formula; ``holds`` evaluates atoms."""
@@ -107,6 +114,17 @@ class Progress:
         self.first_step: list[int | None] = [None] * count
         self.ordered_step: list[int | None] = [None] * count
         self.index = 0
+
+    @property
+    def broken(self) -> Formula | None:
+        """The part of the goal that made it unreachable; None while it is reachable."""
+        return next((part for part, settled in self._evaluator.parts(0) if settled is False), None)
+
+    @property
+    def ordered(self) -> bool:
+        """Whether the goal asks for an order of events, and each event has begun in this order."""
+        found = [settled for part, settled in self._evaluator.parts(0) if isinstance(part, When)]
+        return bool(found) and all(found)
 
     @property
     def lost(self) -> bool:

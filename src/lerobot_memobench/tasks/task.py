@@ -36,8 +36,8 @@ DRAWN = "drawn"
 #: used five sixths of them; the scene rests for the remainder.
 STRICT_PROMPT_STEPS: dict[PromptKind, int] = {"highlight": 100, "point": 300, "pick": 300, "routine": 300, "hide": 600}
 #: Failure classes of strict tasks only (`Task.spoilt_as`): an event was repeated too rarely or too often; the object
-#: was searched in a wrong place.
-STRICT_FAILURES = ("miscount", "wrong_place")
+#: was searched in a wrong place; the events or the place were right, and the hand failed.
+MISCOUNT, WRONG_PLACE, HAND = STRICT_FAILURES = ("miscount", "wrong_place", "hand")
 LEVELS = ("coarse", "intermediate", "fine")
 #: Level of the evaluated operation labels (paper: intermediate).
 DEFAULT_LEVEL = 1

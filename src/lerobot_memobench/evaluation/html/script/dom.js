@@ -76,7 +76,7 @@ const OUTCOMES = {
     letter: "X",
     why: "Every checkpoint held at some step, the goal did not at the end.",
   },
-  wrong_order: { words: "wrong order", letter: "O", why: "The steps were done in another order than the prompt's." },
+  wrong_order: { words: "wrong order", letter: "O", why: "Steps or events were done in another order than asked for." },
   cut_off: {
     words: "cut off",
     letter: "H",
@@ -84,6 +84,7 @@ const OUTCOMES = {
   },
   miscount: { words: "miscount", letter: "N", why: "The event was done too seldom or too often." },
   wrong_place: { words: "wrong place", letter: "P", why: "The thing was looked for where it is not." },
+  hand: { words: "hand", letter: "M", why: "All that had to be remembered was right; the motion failed." },
   invalid_action: { words: "invalid action", letter: "I", why: "An action of another shape, or not finite, ended it." },
   unstable_physics: { words: "unstable physics", letter: "B", why: "The physics broke down and ended it." },
 };

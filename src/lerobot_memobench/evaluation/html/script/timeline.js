@@ -15,7 +15,7 @@ function situation(episode, frame) {
 
 /** The checkpoint that names the failure; null for a success, and where none is missing. */
 function missingCheckpoint(episode) {
-  if (["success", "execution_failure", "invalid_action", "unstable_physics"].includes(episode.outcome)) return null;
+  if (["success", "execution_failure", "hand", "invalid_action", "unstable_physics"].includes(episode.outcome)) return null;
   const missing = episode.checkpoints.findIndex(([, first]) => first === null);
   return missing < 0 ? null : missing;
 }
