@@ -22,6 +22,7 @@ from lerobot_memobench.protocol import (
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
 from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS, STRICT, SUITES, WORLDS, check_world
@@ -87,6 +88,10 @@ class EnvSettings:
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
     obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
+    convention: str = setting(UPRIGHT, "pictures upright, or mirrored and named as in LIBERO's data", [*CONVENTIONS])
+    control_mode: str = setting(
+        "relative", "actions are displacements; LIBERO's absolute ones do not exist", ("relative",)
+    )
     referent: str = setting(
         "fixed", "published goals, or goals drawn by the seed; strict tasks always draw", REFERENT_VALUES
     )
@@ -116,6 +121,10 @@ class EnvSettings:
             raise MemobenchError(
                 f"speed is {self.speed!r}; expected 1, 0.5, 0.33, 0.25 and so on down to {1 / SLOWEST}, so that an "
                 "action takes a whole number of control steps"
+            )
+        if self.convention != UPRIGHT and self.obs_type == OBJECTS:
+            raise MemobenchError(
+                f"convention={self.convention} is of pictures, and obs_type={self.obs_type} has none; leave one out"
             )
         if self.suite == STRICT:
             check_world(self.world, self.suite)
@@ -216,7 +225,7 @@ class EnvSettings:
         return {**agreed, **revision(self.suite, self.difficulty)}
 
 
-NOT_COMPARED = ("expert_action", "blind_action", "videos")
+NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
 """Settings without effect on rollouts."""
 SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED)
 """Settings with an effect on rollouts."""

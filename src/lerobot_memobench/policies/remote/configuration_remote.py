@@ -87,7 +87,6 @@ class RemoteConfig(UntrainedConfig):
         keys: observations to send, ``theirs=ours,…`` with ours one of image, wrist_image, state, task or another
             observation of the environment; replaces the dialect's.
         image_size: side of sent images, padded to a square, pixels; 0: as rendered.
-        mirror: send images mirrored left to right, for checkpoints trained on LIBERO's images as openpi rotates them.
         gripper: meaning of the last number of an action, one of `GRIPPERS`.
         send_prompt: send the demonstration prompt; set to false to save time with a policy without memory.
         history_every: steps between sent frames of the prompt; default ``n_action_steps``, for ``vla_eval`` 1. A
@@ -106,7 +105,6 @@ class RemoteConfig(UntrainedConfig):
     n_action_steps: int = BY_DIALECT
     keys: str | None = None
     image_size: int | None = None
-    mirror: bool = False
     gripper: str = LIBERO
     send_prompt: bool = True
     history_every: int | None = None
