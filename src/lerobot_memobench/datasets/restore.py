@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -22,14 +22,16 @@ from pathlib import Path, PurePosixPath
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
 from lerobot_memobench.datasets.hdf5 import SUFFIX, PublishedDemo, PublishedFile, Unusable, first_line
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name
-from lerobot_memobench.protocol import UPSTREAM_EVALUATIONS
+from lerobot_memobench.protocol import CAMERAS, UPSTREAM_EVALUATIONS
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
@@ -249,6 +251,45 @@ def _simulation(task: Task) -> Simulation:
     sim = Simulation(task)
     sim.reset(0)
     return sim
+
+
+# --- the orientation of stored pictures ---
+
+ORIENTATIONS = {
+    UPRIGHT: (1, 1),
+    "mirrored left to right": (1, -1),
+    "upside down": (-1, 1),
+    "turned by 180 degrees": (-1, -1),
+}
+"""How pictures are stored -> steps over their rows and columns that make them upright."""
+NEAR, APART = 12.0, 2.0
+"""Largest mean difference of pictures of one frame, of 255 levels, and the least ratio to the next orientation's."""
+SIDE = 32
+"""Side at which pictures are compared, pixels: edges and textures of other renderers do not count."""
+
+
+def orientation_of(task: Task, demo: PublishedDemo, stored: Mapping[str, NDArray[np.uint8]]) -> str | None:
+    """Return which of `ORIENTATIONS` a group's first pictures have, by pictures drawn of its first state.
+
+    None if none is near, or two are. Arguments: see `restore`; ``stored`` has a picture of each camera.
+
+    Raises:
+        Unusable: the group is of another scene than the task's.
+    """
+    sim = _simulation(task)
+    states, fixture_poses = _placed(sim, demo)
+    sim.set_state(states[0], fixture_poses)
+    pairs = [(_small(sim.render(CAMERAS[camera])), _small(picture)) for camera, picture in stored.items()]
+    far = {
+        name: float(np.mean([np.abs(drawn - given[::rows, ::columns]) for drawn, given in pairs]))
+        for name, (rows, columns) in ORIENTATIONS.items()
+    }
+    best, second = sorted(far, key=lambda name: far[name])[:2]
+    return best if far[best] <= NEAR and far[second] >= APART * far[best] else None
+
+
+def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
 
 
 # --- the scene of a model file ---

@@ -31,12 +31,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, digest, labels, persistent_rows
-from lerobot_memobench.datasets.lerobot_format.layout import STAGING, check_whole, is_dataset, read_manifest
+from lerobot_memobench.datasets.lerobot_format.layout import STAGING, check_whole, image_key, is_dataset, read_manifest
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, read_json, remove_drafts, short, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.sim.convention import UPRIGHT, turned
 from lerobot_memobench.tasks.task import MEMOBENCH
 
 TEMPORARY = ".tmp-"
@@ -45,7 +46,10 @@ RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
 FINISHED_EARLY = "finished_early"
 """Key of a dataset's request: whether episodes of it were left out."""
-DEFAULTS: dict[str, Any] = {"perturb": False, "prompted_episodes": None, FINISHED_EARLY: False, "world": MEMOBENCH}
+DEFAULTS: dict[str, Any] = {
+    **{"perturb": False, "prompted_episodes": None, FINISHED_EARLY: False, "world": MEMOBENCH, "convention": UPRIGHT},
+    "upside_down": False,  # an option of earlier versions of `memobench convert`
+}
 """Values of keys that a request may lack."""
 ADVICE = "it is damaged; delete its folder and run the command again"
 
@@ -62,6 +66,7 @@ class Record(BaseModel):
         language_persistent: LeRobot's persistent language rows (see ``persistent_rows``).
         image_stats: camera to the statistics of its pixels (see ``ImageHistograms``).
         files: name to sha256 of the other files.
+        convention: of the videos.
     """
 
     failure: str | None
@@ -69,6 +74,7 @@ class Record(BaseModel):
     language_persistent: list[LanguageRow]
     image_stats: dict[str, dict[str, Any]]
     files: dict[str, str]
+    convention: str = UPRIGHT
 
 
 @dataclass(frozen=True)
@@ -92,6 +98,10 @@ class StagedEpisode:
     def has_images(self) -> bool:
         """Whether its cameras were recorded."""
         return bool(self.record.image_stats)
+
+    def image_key(self, camera: str) -> str:
+        """Return the column of a camera in a dataset."""
+        return image_key(camera, self.record.convention)
 
     def video(self, camera: str) -> Path:
         """Return the file of a camera's video."""
@@ -158,10 +168,11 @@ class EpisodeStage:
 
     Args:
         folder: folder of the finished episode; an equal one that exists already is kept.
+        convention: in which the pictures are written.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, convention: str = UPRIGHT) -> None:
+        self._folder, self._convention = folder, convention
         self._temporary = temporary_folder(folder)
         self._videos = {camera: VideoWriter(self._temporary / f"{camera}.mp4") for camera in CAMERAS}
         self._histograms = {camera: ImageHistograms() for camera in CAMERAS}
@@ -179,11 +190,12 @@ class EpisodeStage:
         shutil.rmtree(self._temporary, ignore_errors=True)
 
     def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
-        """Add the next frame of both cameras, (H, W, 3) uint8 each."""
+        """Add the next frame of both cameras, (H, W, 3) uint8 each, upright."""
         self._frames += 1
         for camera, video in self._videos.items():
-            video.add(images[camera])
-            self._histograms[camera].add(images[camera])
+            image = turned(images[camera], self._convention)
+            video.add(image)
+            self._histograms[camera].add(image)
 
     def publish(self, demo: Demonstration) -> StagedEpisode:
         """Write everything except the images, which were added before, and give the folder its name."""
@@ -209,7 +221,7 @@ class EpisodeStage:
             **found.columns(),
         }
         np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
-        return _publish(self._temporary, self._folder, None, info, persistent_rows(found), stats)
+        return _publish(self._temporary, self._folder, None, info, persistent_rows(found), stats, self._convention)
 
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:
@@ -248,9 +260,9 @@ def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None
         ) from None
 
 
-def stage_demonstration(demo: Demonstration, folder: Path) -> StagedEpisode:
+def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPRIGHT) -> StagedEpisode:
     """Write a demonstration in memory, with its images, to ``folder``; an equal one that exists already is kept."""
-    with EpisodeStage(folder) as stage:
+    with EpisodeStage(folder, convention) as stage:
         for frame in range(len(demo) if demo.images is not None else 0):
             assert demo.images is not None
             stage.add_images({camera: demo.images[camera][frame] for camera in CAMERAS})
@@ -273,10 +285,18 @@ def _publish(
     info: dict[str, Any],
     language_rows: list[LanguageRow],
     image_stats: dict[str, Any],
+    convention: str = UPRIGHT,
 ) -> StagedEpisode:
     """Add the record, flush everything to the disk, then give the folder its name."""
     files = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
-    record = Record(failure=failure, info=info, language_persistent=language_rows, image_stats=image_stats, files=files)
+    record = Record(
+        failure=failure,
+        info=info,
+        language_persistent=language_rows,
+        image_stats=image_stats,
+        files=files,
+        convention=convention,
+    )
     (temporary / RECORD_FILE).write_text(record.model_dump_json())
     flush_to_disk([*temporary.iterdir(), temporary])
     try:

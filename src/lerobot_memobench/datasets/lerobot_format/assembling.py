@@ -30,7 +30,6 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     check_destination,
     dataset_features,
     dataset_files,
-    image_key,
     objects_column,
 )
 from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
@@ -45,6 +44,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.protocol import CAMERAS, CLOCK, CONTROL_HZ
+from lerobot_memobench.sim.convention import UPRIGHT
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -63,10 +63,11 @@ def write_dataset(
     *,
     repo_id: str = DEFAULT_REPO_ID,
     made_by: str = "",
+    convention: str = UPRIGHT,
 ) -> Path:
     """Write demonstrations, in their order, as a dataset in ``out`` (absent or empty); one is in memory at a time.
 
-    Either all of them have images or none. ``made_by`` is a sentence for the card.
+    Either all of them have images or none. ``made_by`` is a sentence for the card, ``convention`` that of the images.
     """
     out = Path(out)
     check_destination(out)
@@ -77,7 +78,8 @@ def write_dataset(
         try:
             shutil.rmtree(episodes, ignore_errors=True)
             staged = [
-                stage_demonstration(demo, episodes / f"{number:06d}") for number, demo in enumerate(demonstrations)
+                stage_demonstration(demo, episodes / f"{number:06d}", convention)
+                for number, demo in enumerate(demonstrations)
             ]
             return assemble(staged, out, repo_id=repo_id, made_by=made_by)
         finally:
@@ -138,7 +140,7 @@ def _write_lerobot(
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=CONTROL_HZ,
-        features=dataset_features(_image_size(written[0])),
+        features=dataset_features(_image_size(written[0]), written[0].record.convention),
         root=build,
         robot_type=ROBOT_TYPE,
         use_videos=written[0].has_images,
@@ -281,7 +283,7 @@ def _stats_of(flat: NDArray[np.float64]) -> Stats:
 
 
 def _camera_statistics(episode: StagedEpisode) -> dict[str, Stats]:
-    return {image_key(camera): episode.image_stats(camera) for camera in CAMERAS} if episode.has_images else {}
+    return {episode.image_key(camera): episode.image_stats(camera) for camera in CAMERAS} if episode.has_images else {}
 
 
 def _image_statistics(episodes: Sequence[StagedEpisode]) -> dict[str, Stats]:
@@ -406,7 +408,7 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
     places: list[dict[str, Any]] = [{} for _ in episodes]
     limit = meta.video_files_size_in_mb * 1024**2
     for camera in CAMERAS if meta.video_keys else ():
-        key, chunk, file = image_key(camera), 0, 0
+        key, chunk, file = episodes[0].image_key(camera), 0, 0
         videos = [(episode.video(camera), int(episode.info["frames"])) for episode in episodes]
         for group in _grouped([video.stat().st_size for video, _ in videos], limit):
             assert meta.video_path is not None
