@@ -259,7 +259,7 @@ ORIENTATIONS = {
     UPRIGHT: (1, 1),
     "mirrored left to right": (1, -1),
     "upside down": (-1, 1),
-    "turned by 180 degrees": (-1, -1),
+    "rotated by 180 degrees": (-1, -1),
 }
 """How pictures are stored -> steps over their rows and columns that make them upright."""
 NEAR, APART = 12.0, 2.0

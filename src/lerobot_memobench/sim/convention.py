@@ -30,11 +30,11 @@ def shown(pictures: Mapping[str, NDArray[np.uint8]], convention: str) -> dict[st
 
 
 def convention_of(features: Mapping[str, Any]) -> str | None:
-    """Return the convention of a dataset's pictures by LeRobot's description of its columns; None if they do not tell.
+    """Return the convention of a dataset's pictures by LeRobot's description of its columns; None if it is unknown.
 
     Datasets of this package without a convention have upright pictures.
     """
-    stated = {str(feature["convention"]) for feature in features.values() if "convention" in feature}
-    if stated or f"observation.images.{CONVENTIONS[MIRRORED]['wrist_image']}" in features:
-        return next(iter(stated), MIRRORED)
-    return UPRIGHT if "checkpoint.index" in features else None
+    pictures = {name: one for name, one in features.items() if one.get("dtype") in ("video", "image")}
+    if "observation.images.image2" in pictures or any(one.get("convention") == MIRRORED for one in pictures.values()):
+        return MIRRORED
+    return UPRIGHT if pictures and "checkpoint.index" in features else None

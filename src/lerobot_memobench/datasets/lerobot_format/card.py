@@ -261,8 +261,8 @@ def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
 def _convention(features: Mapping[str, Any]) -> list[str]:
     """Return a paragraph on the convention of the images, none without images."""
     orientation = {UPRIGHT: "upright", MIRRORED: "mirrored left to right, as LIBERO's"}
-    found = convention_of(features) if any("images" in name for name in features) else None
-    return [f"Images are {orientation[found]} (`convention={found}`)."] if found in orientation else []
+    found = convention_of(features)
+    return [] if found is None else [f"Images are {orientation[found]} (`convention={found}`)."]
 
 
 def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
