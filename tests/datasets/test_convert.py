@@ -17,6 +17,7 @@ import pytest
 
 from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
+from lerobot_memobench.datasets import restore as restore_module
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.frames import frame_reader
@@ -190,6 +191,17 @@ def test_pictures_unlike_the_scene_are_noted(short, tmp_path):
         assert "is not clear" in summary.notes[0].reason
         direct = write_dataset([replace(short, images=images)], tmp_path / name / "direct", repo_id="local/test")
         assert hashes(direct / "videos") == hashes(tmp_path / name / "ds" / "videos")
+
+
+def test_a_scene_that_cannot_be_built_is_left_out(written, tmp_path, monkeypatch):
+    def fail(task):
+        raise MemobenchError(f"no scene of {task.name}")
+
+    restore_module._simulation.cache_clear()
+    monkeypatch.setattr(restore_module, "Simulation", fail)
+    summary = convert(written, tmp_path / "ds")
+    assert (summary.episodes, summary.folder, len(summary.problems)) == (0, None, 4)
+    assert "no scene of" in summary.problems[0].reason
 
 
 def test_a_dataset_states_its_convention(short, tmp_path):

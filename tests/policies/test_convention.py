@@ -16,6 +16,7 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.convention import check_convention
 from lerobot_memobench.run.plan import plan_line
+from lerobot_memobench.sim.convention import CONVENTIONS
 from tests.support.fake_loop import make_checkpoint
 
 OURS, THEIRS, NUMBERED = ("image", "wrist_image"), ("image", "image2"), ("camera1", "camera2")
@@ -84,8 +85,9 @@ def test_the_dataset_on_this_machine_decides(tmp_path: Path, convention: str) ->
     """Also under LIBERO's name, and with a policy that reads one camera."""
     from lerobot_memobench.datasets.lerobot_format.layout import dataset_features
 
+    described = dataset_features((256, 256), CONVENTIONS[convention].values())
     (tmp_path / "libero_scenes" / "meta").mkdir(parents=True)
-    info = {"codebase_version": "v3.0", "total_episodes": 1, "features": dataset_features((256, 256), convention)}
+    info = {"codebase_version": "v3.0", "total_episodes": 1, "features": described}
     (tmp_path / "libero_scenes" / "meta" / "info.json").write_text(json.dumps(info))
     path = saved(tmp_path, ("image",), repo_id="local/libero_scenes", root=str(tmp_path / "libero_scenes"))
     assert not outcome(path, convention)

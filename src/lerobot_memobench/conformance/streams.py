@@ -30,11 +30,7 @@ THINGS = 4
 
 
 def write_streams(
-    folder: Path,
-    pictures: bool = True,
-    frames: int = EXECUTION_FRAMES,
-    task: str = TASK,
-    convention: str = UPRIGHT,
+    folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK, convention: str = UPRIGHT
 ) -> Path:
     """Write a dataset of three short episodes with the real columns and shapes and with synthetic values.
 

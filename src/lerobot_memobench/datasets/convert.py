@@ -320,13 +320,12 @@ def inspect(file: SourceFile, world: World | None) -> Findings:
                 try:
                     demo = opened.read(group)
                     found.world = _checked_world(demo, found.world)
+                    found.orientation = found.orientation or orientation_of(opened, demo)
                 except Unusable as error:
                     leave_out(f"data/{group}", error)
                     continue
                 height, width = demo.image_size
                 found.demonstrations.append(Sound(group=group, height=height, width=width))
-                if found.orientation is None:
-                    found.orientation = _orientation(opened, demo)
                 notes = [Problem(file=file.name, group="", reason=note) for note in _notes(opened, demo)]
                 found.notes += [note for note in notes if note not in found.notes]
     except Unusable as error:
@@ -336,14 +335,6 @@ def inspect(file: SourceFile, world: World | None) -> Findings:
         turned = f"its images are {found.orientation}: they are turned"
         found.notes.append(Problem(file=file.name, group="", reason=turned if found.orientation else unclear))
     return found
-
-
-def _orientation(file: PublishedFile, demo: PublishedDemo) -> str | None:
-    """Return how a demonstration's images are stored; None if it is not clear, or its conversion will report why."""
-    try:
-        return orientation_of(task_of(file, demo), demo, next(file.images(demo.group)))
-    except MemobenchError:
-        return None
 
 
 def _checked_world(demo: PublishedDemo, others: World | None) -> World:

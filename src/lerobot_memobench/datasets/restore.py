@@ -14,9 +14,10 @@ from __future__ import annotations
 import json
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path, PurePosixPath
 
 import mujoco
@@ -248,19 +249,18 @@ def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
 @lru_cache(maxsize=1)
 def _simulation(task: Task) -> Simulation:
     """Return a task's simulation; the last one is cached, because a file's demonstrations follow each other."""
-    sim = Simulation(task)
+    try:
+        sim = Simulation(task)
+    except MemobenchError as error:
+        raise Unusable(str(error)) from None
     sim.reset(0)
     return sim
 
 
 # --- the orientation of stored pictures ---
 
-ORIENTATIONS = {
-    UPRIGHT: (1, 1),
-    "mirrored left to right": (1, -1),
-    "upside down": (-1, 1),
-    "rotated by 180 degrees": (-1, -1),
-}
+STORED = (UPRIGHT, "mirrored left to right", "upside down", "rotated by 180 degrees")
+ORIENTATIONS = {name: (rows, columns) for name, (rows, columns) in zip(STORED, product((1, -1), repeat=2), strict=True)}
 """How pictures are stored -> steps over their rows and columns that make them upright."""
 NEAR, APART = 12.0, 2.0
 """Largest mean difference of pictures of one frame, of 255 levels, and the least ratio to the next orientation's."""
@@ -268,18 +268,19 @@ SIDE = 32
 """Side at which pictures are compared, pixels: edges and textures of other renderers do not count."""
 
 
-def orientation_of(task: Task, demo: PublishedDemo, stored: Mapping[str, NDArray[np.uint8]]) -> str | None:
-    """Return which of `ORIENTATIONS` a group's first pictures have, by pictures drawn of its first state.
+def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
+    """Return which of `ORIENTATIONS` the first pictures of a checked group have, by those drawn of its first state.
 
-    None if none is near, or two are. Arguments: see `restore`; ``stored`` has a picture of each camera.
+    None if none is near, or two are.
 
     Raises:
-        Unusable: the group is of another scene than the task's.
+        Unusable: the group has no task, or is of another scene than the task's.
     """
-    sim = _simulation(task)
+    sim = _simulation(task_of(file, demo))
     states, fixture_poses = _placed(sim, demo)
     sim.set_state(states[0], fixture_poses)
-    pairs = [(_small(sim.render(CAMERAS[camera])), _small(picture)) for camera, picture in stored.items()]
+    stored = next(file.images(demo.group)).items()
+    pairs = [(_small(sim.render(CAMERAS[camera])), _small(picture)) for camera, picture in stored]
     far = {
         name: float(np.mean([np.abs(drawn - given[::rows, ::columns]) for drawn, given in pairs]))
         for name, (rows, columns) in ORIENTATIONS.items()

@@ -31,13 +31,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, digest, labels, persistent_rows
-from lerobot_memobench.datasets.lerobot_format.layout import STAGING, check_whole, image_key, is_dataset, read_manifest
+from lerobot_memobench.datasets.lerobot_format.layout import STAGING, check_whole, is_dataset, read_manifest
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, read_json, remove_drafts, short, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
-from lerobot_memobench.sim.convention import UPRIGHT, turned
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
 from lerobot_memobench.tasks.task import MEMOBENCH
 
 TEMPORARY = ".tmp-"
@@ -46,10 +46,8 @@ RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
 FINISHED_EARLY = "finished_early"
 """Key of a dataset's request: whether episodes of it were left out."""
-DEFAULTS: dict[str, Any] = {
-    **{"perturb": False, "prompted_episodes": None, FINISHED_EARLY: False, "world": MEMOBENCH, "convention": UPRIGHT},
-    "upside_down": False,  # an option of earlier versions of `memobench convert`
-}
+DEFAULTS: dict[str, Any] = {"perturb": False, "prompted_episodes": None, FINISHED_EARLY: False, "world": MEMOBENCH}
+DEFAULTS |= {"convention": UPRIGHT, "upside_down": False}  # the latter was an option of `memobench convert`
 """Values of keys that a request may lack."""
 ADVICE = "it is damaged; delete its folder and run the command again"
 
@@ -64,9 +62,8 @@ class Record(BaseModel):
         failure: why there is no demonstration of this seed, or None.
         info: see `episode_info`; of a failed episode at least its task's name and seed.
         language_persistent: LeRobot's persistent language rows (see ``persistent_rows``).
-        image_stats: camera to the statistics of its pixels (see ``ImageHistograms``).
+        image_stats: name of a camera's video to the statistics of its pixels (see ``ImageHistograms``).
         files: name to sha256 of the other files.
-        convention: of the videos.
     """
 
     failure: str | None
@@ -74,7 +71,6 @@ class Record(BaseModel):
     language_persistent: list[LanguageRow]
     image_stats: dict[str, dict[str, Any]]
     files: dict[str, str]
-    convention: str = UPRIGHT
 
 
 @dataclass(frozen=True)
@@ -98,10 +94,6 @@ class StagedEpisode:
     def has_images(self) -> bool:
         """Whether its cameras were recorded."""
         return bool(self.record.image_stats)
-
-    def image_key(self, camera: str) -> str:
-        """Return the column of a camera in a dataset."""
-        return image_key(camera, self.record.convention)
 
     def video(self, camera: str) -> Path:
         """Return the file of a camera's video."""
@@ -168,14 +160,15 @@ class EpisodeStage:
 
     Args:
         folder: folder of the finished episode; an equal one that exists already is kept.
-        convention: in which the pictures are written.
+        convention: of the videos (`sim.convention`).
     """
 
     def __init__(self, folder: Path, convention: str = UPRIGHT) -> None:
         self._folder, self._convention = folder, convention
         self._temporary = temporary_folder(folder)
-        self._videos = {camera: VideoWriter(self._temporary / f"{camera}.mp4") for camera in CAMERAS}
-        self._histograms = {camera: ImageHistograms() for camera in CAMERAS}
+        names = CONVENTIONS[convention].values()
+        self._videos = {name: VideoWriter(self._temporary / f"{name}.mp4") for name in names}
+        self._histograms = {name: ImageHistograms() for name in names}
         self._frames = 0
 
     def __enter__(self) -> EpisodeStage:
@@ -192,10 +185,9 @@ class EpisodeStage:
     def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
         """Add the next frame of both cameras, (H, W, 3) uint8 each, upright."""
         self._frames += 1
-        for camera, video in self._videos.items():
-            image = turned(images[camera], self._convention)
-            video.add(image)
-            self._histograms[camera].add(image)
+        for name, image in shown(images, self._convention).items():
+            self._videos[name].add(image)
+            self._histograms[name].add(image)
 
     def publish(self, demo: Demonstration) -> StagedEpisode:
         """Write everything except the images, which were added before, and give the folder its name."""
@@ -221,7 +213,7 @@ class EpisodeStage:
             **found.columns(),
         }
         np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
-        return _publish(self._temporary, self._folder, None, info, persistent_rows(found), stats, self._convention)
+        return _publish(self._temporary, self._folder, None, info, persistent_rows(found), stats)
 
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:
@@ -285,18 +277,10 @@ def _publish(
     info: dict[str, Any],
     language_rows: list[LanguageRow],
     image_stats: dict[str, Any],
-    convention: str = UPRIGHT,
 ) -> StagedEpisode:
     """Add the record, flush everything to the disk, then give the folder its name."""
     files = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
-    record = Record(
-        failure=failure,
-        info=info,
-        language_persistent=language_rows,
-        image_stats=image_stats,
-        files=files,
-        convention=convention,
-    )
+    record = Record(failure=failure, info=info, language_persistent=language_rows, image_stats=image_stats, files=files)
     (temporary / RECORD_FILE).write_text(record.model_dump_json())
     flush_to_disk([*temporary.iterdir(), temporary])
     try:

@@ -123,9 +123,7 @@ class EnvSettings:
                 "action takes a whole number of control steps"
             )
         if self.convention != UPRIGHT and self.obs_type == OBJECTS:
-            raise MemobenchError(
-                f"convention={self.convention} is of pictures, and obs_type={self.obs_type} has none; leave one out"
-            )
+            raise MemobenchError(f"convention={self.convention} is of pictures, and obs_type={OBJECTS} has none")
         if self.suite == STRICT:
             check_world(self.world, self.suite)
             self._set(referent=DRAWN, horizon=self.degree.horizon if self.horizon == HORIZON else self.horizon)

@@ -15,7 +15,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodeP
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.paper import raw_tables
-from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, convention_of
+from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES
 
@@ -52,8 +52,7 @@ LIMITATIONS = """\
 - Frames of demonstration prompts show the information to remember, not the actions to take."""
 COLUMNS = {
     "observation.images.image": "third-person camera",
-    "observation.images.wrist_image": "wrist camera",
-    "observation.images.image2": "wrist camera",
+    **{f"observation.images.{name}": "wrist camera" for name in ("wrist_image", "image2")},
     "observation.state": "end-effector position 3, axis-angle 3, gripper joints 2",
     "action": "OSC pose delta 6 (±1 is ±0.05 m, ±0.5 rad), gripper (−1 opens, +1 closes)",
     "observation.environment_state": "objects visible to the cameras, 16 slots: see `memobench objects`",
@@ -205,7 +204,7 @@ def _card(
     parts = [
         f"---\n{data.to_yaml()}\n---",
         "# MEMOBench demonstrations",
-        *_introduction(infos, features, loading),
+        *_introduction(infos, loading),
         MADE_BY,
         *made,
         *_statistics(infos, failed, size),
@@ -232,7 +231,7 @@ execution = Subset(dataset, [i for i, phase in enumerate(dataset.hf_dataset["obs
 ```"""
 
 
-def _introduction(infos: Sequence[Mapping[str, Any]], features: Mapping[str, Any], loading: str) -> list[str]:
+def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]:
     tasks = {info["task_name"] for info in infos}
     return [
         f"{len(infos)} demonstrations of {len(tasks)} robot manipulation tasks that need memory "
@@ -241,7 +240,6 @@ def _introduction(infos: Sequence[Mapping[str, Any]], features: Mapping[str, Any
         "labels each frame with the completed ones. Benchmark and metrics: MEMOBench; generator, environment and "
         "policies: `lerobot_memobench`.",
         *_world(infos),
-        *_convention(features),
         loading,
         "`execution` leaves out the frames of demonstration prompts, in which the policy does not act, as `lerobot "
         "train` of `lerobot_memobench` does. To load one memory type, use `episode_filter=lambda episode: "
@@ -258,15 +256,14 @@ def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
     return [f"The scenes are the paper's, of LIBERO's assets (`world={LIBERO}`).{stand_ins}"] if found else []
 
 
-def _convention(features: Mapping[str, Any]) -> list[str]:
-    """Return a paragraph on the convention of the images, none without images."""
-    orientation = {UPRIGHT: "upright", MIRRORED: "mirrored left to right, as LIBERO's"}
-    found = convention_of(features)
-    return [] if found is None else [f"Images are {orientation[found]} (`convention={found}`)."]
-
-
 def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
+    convention = convention_of(features)
     return [
+        *(
+            [f"Images have `convention={convention}`; with `libero` they are mirrored left to right."]
+            if convention
+            else []
+        ),
         markdown(
             ["column", "type", "meaning"],
             [[f"`{key}`", _type(ft), COLUMNS[key]] for key, ft in features.items() if key in COLUMNS],

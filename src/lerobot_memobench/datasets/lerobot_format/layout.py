@@ -27,7 +27,7 @@ from lerobot_memobench.io import (
     refusing,
 )
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
-from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
+from lerobot_memobench.sim.convention import MIRRORED
 
 STAGING = ".staging"
 """Folder of an unfinished run within its destination."""
@@ -87,9 +87,9 @@ def dataset_files(folder: Path) -> list[str]:
 # --- columns ---
 
 
-def image_key(camera: str, convention: str = UPRIGHT) -> str:
+def image_key(camera: str) -> str:
     """Return the column name of a camera, which is also the name of its observation."""
-    return f"observation.images.{CONVENTIONS[convention].get(camera, camera)}"
+    return f"observation.images.{camera}"
 
 
 def objects_column(names: Collection[str]) -> str:
@@ -114,7 +114,9 @@ def check_clock(names: Collection[str], where: Path | str) -> None:
         )
 
 
-def dataset_features(image_size: tuple[int, int] | None, convention: str = UPRIGHT) -> dict[str, dict[str, Any]]:
+def dataset_features(
+    image_size: tuple[int, int] | None, cameras: Collection[str] = tuple(CAMERAS)
+) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns; ``image_size`` is (height, width), None without images."""
     from lerobot_memobench.sim.object_layout import SIZE
 
@@ -122,12 +124,10 @@ def dataset_features(image_size: tuple[int, int] | None, convention: str = UPRIG
         return {"dtype": dtype, "shape": shape, "names": names}
 
     features: dict[str, dict[str, Any]] = {}
+    stated = {} if {*cameras} == {*CAMERAS} else {"convention": MIRRORED}  # LeRobot merges equal descriptions alone
     if image_size is not None:
-        for camera in CAMERAS:
-            found = feature("video", (*image_size, 3), ["height", "width", "channels"])
-            # Absent for upright pictures, as in earlier datasets: LeRobot merges datasets of equal descriptions alone.
-            found |= {} if convention == UPRIGHT else {"convention": convention}
-            features[image_key(camera, convention)] = found
+        for camera in cameras:
+            features[image_key(camera)] = feature("video", (*image_size, 3), ["height", "width", "channels"]) | stated
     features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,))
     completed = [f"checkpoint_{k}" for k in range(MAX_CHECKPOINTS)]
     return features | {
