@@ -110,6 +110,8 @@ def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:
         renamed = {f"observation.images.{old}": f"observation.images.{new}" for old, new in names.items()}
         with pytest.raises(MemobenchError, match="expects pictures of convention=libero"):
             plan_line([*line, f"rename_map={json.dumps(renamed)}"])
+    with pytest.raises(MemobenchError, match="did you mean 'libero'"):
+        plan_line([*line, "convention=liberu"])
     ours = saved(tmp_path / "ours", OURS)
     back = json.dumps({"observation.images.image2": "observation.images.wrist_image"})
     with pytest.raises(MemobenchError, match="expects pictures of convention=upright"):

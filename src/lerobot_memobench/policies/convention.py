@@ -16,7 +16,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_info
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import TrainConfig, checkpoint_file, read_json, statistics_shapes
 from lerobot_memobench.policies.compatibility import cameras_read
 from lerobot_memobench.policies.lerobot_config import quiet
@@ -59,6 +59,7 @@ def check_convention(path: str | None, policy: Any, asked: str | None) -> None:
     Raises:
         MemobenchError: naming the commands that run it.
     """
+    check_choice("convention", asked or UPRIGHT, [*WRIST])
     found: str | None = UPRIGHT
     if getattr(policy, "uses_detector", False):
         why = "its detector reads them"
