@@ -54,6 +54,7 @@ DECIDED = {
     "replan_steps": STEPS_KEY,
     "prompt_in": "send_video_history",
     "obs_type": "send_state and send_wrist_image",
+    "mirror": "convention to libero",  # an argument of earlier versions
 }
 """Setting of `EnvSettings` -> the argument that determines it."""
 

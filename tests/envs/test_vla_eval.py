@@ -183,6 +183,7 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
         ({"history_every": 0}, "history_every"),
         ({"seed": 100_007}, "test-sealed"),
         ({"obs_type": "both"}, "send_state"),
+        ({"mirror": True}, "convention to libero"),
         ({"evidence": True}, "referent"),
     ],
 )

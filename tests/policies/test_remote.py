@@ -166,6 +166,7 @@ def test_vla_eval_episode_with_a_prompt() -> None:
         ({"n_action_steps": 0}, "policy.n_action_steps"),
         ({"timeout": 0.0}, "policy.timeout"),
         ({"image_size": -1}, "policy.image_size"),
+        ({"mirror": True}, "convention=libero"),
     ],
 )
 def test_wrong_settings_are_named(settings: dict[str, Any], named: str) -> None:
