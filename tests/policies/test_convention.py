@@ -123,8 +123,8 @@ def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:
 def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     theirs, unclear = saved(tmp_path, THEIRS), saved(tmp_path / "unclear", NUMBERED)
 
-    def envs(path: Path, *flags: str, **settings: Any) -> Any:
-        monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--env.type=memobench", f"--policy.path={path}", *flags])
+    def envs(path: Path, *flags: str, command: str = "lerobot-eval", **settings: Any) -> Any:
+        monkeypatch.setattr(sys, "argv", [command, "--env.type=memobench", f"--policy.path={path}", *flags])
         return MemobenchEnvConfig(tasks=STOVE, log_dir=str(tmp_path / "log"), **settings).create_envs(1)
 
     with pytest.raises(MemobenchError, match=r"--policy\.path=.*--env\.convention=libero"):
@@ -133,4 +133,4 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
         envs(unclear)
     assert envs(theirs, "--env.convention=libero", convention="libero")
     assert envs(unclear, "--env.convention=upright")
-    assert envs(theirs, "--dataset.repo_id=me/demos"), "a training may continue from any checkpoint"
+    assert envs(theirs, command="lerobot-train"), "a training may continue from any checkpoint"

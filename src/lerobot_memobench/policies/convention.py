@@ -84,7 +84,7 @@ def check_convention(path: str | None, policy: Any, asked: str | None) -> None:
 def check_lerobots_command(environment: Any) -> None:
     """Check the checkpoint that the command line of ``lerobot-eval`` names; a training may begin with any."""
     path = parser.get_path_arg("policy")
-    if path is not None and not any(word.startswith("--dataset.") for word in sys.argv):
+    if path is not None and "eval" in Path(sys.argv[0]).name:
         with quiet():
             policy = PreTrainedConfig.from_pretrained(path, cli_overrides=parser.get_cli_overrides("policy") or [])
         named = parser.parse_arg("env.convention") is not None or environment.convention != UPRIGHT
