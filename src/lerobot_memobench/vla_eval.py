@@ -25,6 +25,7 @@ from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
+from lerobot_memobench.sim.convention import CONVENTIONS
 
 try:
     from vla_eval.benchmarks.base import StepBenchmark, StepResult
@@ -53,6 +54,7 @@ DECIDED = {
     "replan_steps": STEPS_KEY,
     "prompt_in": "send_video_history",
     "obs_type": "send_state and send_wrist_image",
+    "mirror": "convention to libero",  # an argument of earlier versions
 }
 """Setting of `EnvSettings` -> the argument that determines it."""
 
@@ -60,7 +62,7 @@ DECIDED = {
 class MEMOBench(StepBenchmark):
     """The tasks of one suite; episode i of each task has the scene of seed ``seed`` + i.
 
-    Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3) upright; ``states`` float32 (8,):
+    Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3); ``states`` float32 (8,):
     end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) of
     `MemobenchEnv`. The first observation of an episode with a demonstration prompt also contains ``video_history`` and
     ``wrist_video_history``, lists of pictures, ``state_history``, a list of states, and ``episode_restart``. Frames of
@@ -80,11 +82,11 @@ class MEMOBench(StepBenchmark):
             hello message of a model server.
         send_state: whether the arm's state is sent.
         send_video_history: whether the demonstration prompt is sent.
-        mirror: mirror pictures left to right, as the harness does for LIBERO.
         log_dir: folder of the episode log for ``memobench report``; None for no log.
         label: name of the model server's policy in the log.
-        settings: other fields of `EnvSettings`, such as ``suite``, ``referent``, ``horizon`` or ``evidence``. If the
-            harness's ``max_steps`` is lower than the horizon, it ends episodes without a log line.
+        settings: other fields of `EnvSettings`, such as ``suite``, ``referent``, ``horizon``, ``evidence`` or
+            ``convention`` (``libero``: mirrored as the harness does for LIBERO). If the harness's ``max_steps`` is
+            lower than the horizon, it ends episodes without a log line.
     """
 
     _ALL_RECORD_FIELDS = frozenset({"reward", SUCCESS, "checkpoints_completed", "action", "state"})
@@ -105,7 +107,6 @@ class MEMOBench(StepBenchmark):
         send_wrist_image: bool = True,
         send_state: bool = True,
         send_video_history: bool = True,
-        mirror: bool = False,
         log_dir: str | None = None,
         label: str | None = None,
         **settings: Any,
@@ -134,7 +135,7 @@ class MEMOBench(StepBenchmark):
         selected = MemobenchEnvConfig(tasks=chosen, **asdict(self._settings)).selected()
         self._tasks = {folder.name: (memory_type, folder) for memory_type, _, folder in selected}
         self._cameras = [name for name in CAMERAS if send_wrist_image or name != "wrist_image"]
-        self._send_state, self._mirror = send_state, mirror
+        self._send_state = send_state
         self._history_every, self._n_action_steps = history_every, n_action_steps
         self._log_dir = log_dir
         policy = {} if label is None else {"type": "vla_eval", "identity": f"vla_eval {label}"}
@@ -224,8 +225,8 @@ class MEMOBench(StepBenchmark):
         return found
 
     def _picture(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
-        picture: NDArray[np.uint8] = observation["pixels"][name]
-        return np.ascontiguousarray(picture[:, ::-1]) if self._mirror else picture
+        picture: NDArray[np.uint8] = observation["pixels"][CONVENTIONS[self._settings.convention][name]]
+        return picture
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         """Return success and the episode's MSR, MUR and MCR; see the class."""
@@ -300,4 +301,4 @@ def _actions(answer: dict[str, Any]) -> NDArray[np.float32]:
 
 def _video_frame(observation: dict[str, Any]) -> NDArray[np.uint8]:
     """Return both cameras side by side."""
-    return np.concatenate([observation["pixels"][name] for name in CAMERAS], axis=1)
+    return np.concatenate([*observation["pixels"].values()], axis=1)

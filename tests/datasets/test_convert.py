@@ -17,16 +17,19 @@ import pytest
 
 from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
+from lerobot_memobench.datasets import restore as restore_module
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import digest, labels
+from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.datasets.hdf5 import Extras, PublishedFile, Unusable
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset, read_info, read_manifest
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.restore import restore, task_of
-from lerobot_memobench.datasets.validate import replay
+from lerobot_memobench.datasets.restore import ORIENTATIONS, restore, task_of
+from lerobot_memobench.datasets.validate import images_of, replay
 from lerobot_memobench.datasets.video import VideoWriter
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.sim.convention import CONVENTIONS, convention_of
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.datasets.conftest import BUTTER, STOVE
 from tests.support.kills import hashes, killed_at
@@ -77,11 +80,11 @@ def path(make_demo, tmp_path):
     return write_published(tmp_path / "hdf5" / "synthetic_task_demo.hdf5", demos, scene="<mujoco/>")
 
 
-def test_images_may_be_upside_down(path):
+def test_images_may_be_turned(path):
     with PublishedFile(path) as file:
-        plain, flipped = next(file.images("demo_1")), next(file.images("demo_1", upside_down=True))
+        plain, flipped = next(file.images("demo_1")), next(file.images("demo_1", -1, -1))
     for camera, image in plain.items():
-        np.testing.assert_array_equal(flipped[camera][::-1], image)
+        np.testing.assert_array_equal(flipped[camera][::-1, ::-1], image)
 
 
 def delete(name):
@@ -157,6 +160,74 @@ def test_files_that_cannot_be_opened(path, tmp_path):
         fcntl.flock(writer, fcntl.LOCK_EX)  # as HDF5 locks files that it writes
         with pytest.raises(Unusable, match="is locked"):
             PublishedFile(path)
+
+
+# --- conventions of pictures ---
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+@pytest.mark.parametrize("stored", ORIENTATIONS)
+def test_the_first_picture_decides_the_orientation(short, tmp_path, stored, convention):
+    rows, columns = ORIENTATIONS[stored]
+    turned = replace(short, images={name: images[:, ::rows, ::columns] for name, images in short.images.items()})
+    path = write_published(tmp_path / "short_demo.hdf5", [turned])
+    summary = convert(path, tmp_path / "ds", repo_id="local/test", convention=convention)
+    direct = write_dataset([short], tmp_path / "direct", repo_id="local/test", convention=convention)
+    for folder in ("data", "videos", "meta"):
+        assert hashes(direct / folder) == hashes(tmp_path / "ds" / folder)
+    assert [note.reason for note in summary.notes] == (
+        [] if stored == "upright" else [f"its images are {stored}: they are turned"]
+    )
+
+
+def test_pictures_unlike_the_scene_are_noted(short, tmp_path):
+    """Without a near picture, nothing is turned."""
+    grey = {name: np.full_like(images, 128) for name, images in short.images.items()}
+    mixed = {**short.images, "wrist_image": short.images["wrist_image"][:, ::-1]}
+    for name, images in (("grey", grey), ("mixed", mixed)):
+        path = write_published(tmp_path / name / "short_demo.hdf5", [replace(short, images=images)])
+        summary = convert(path, tmp_path / name / "ds", repo_id="local/test")
+        assert summary.episodes == 1
+        assert "is not clear" in summary.notes[0].reason
+        direct = write_dataset([replace(short, images=images)], tmp_path / name / "direct", repo_id="local/test")
+        assert hashes(direct / "videos") == hashes(tmp_path / name / "ds" / "videos")
+
+
+def test_a_scene_that_cannot_be_built_is_left_out(written, tmp_path, monkeypatch):
+    def fail(task):
+        raise MemobenchError(f"no scene of {task.name}")
+
+    restore_module._simulation.cache_clear()
+    monkeypatch.setattr(restore_module, "Simulation", fail)
+    summary = convert(written, tmp_path / "ds")
+    assert (summary.episodes, summary.folder, len(summary.problems)) == (0, None, 4)
+    assert "no scene of" in summary.problems[0].reason
+
+
+def test_a_dataset_states_its_convention(short, tmp_path):
+    """By the names of its columns, in their description, its manifest and its card; replay agrees with its pictures."""
+    path = write_published(tmp_path / "short_demo.hdf5", [short])
+    for convention, wrist in (("upright", "wrist_image"), ("libero", "image2")):
+        folder = tmp_path / convention
+        convert(path, folder, convention=convention)
+        info = read_info(folder)
+        cameras = [f"observation.images.{name}" for name in ("image", wrist)]
+        assert [name for name in info["features"] if "images" in name] == cameras
+        assert convention_of(info["features"]) == convention
+        assert read_manifest(folder)["request"]["convention"] == convention
+        assert f"convention={convention}" in (folder / "README.md").read_text()
+        images = images_of(folder, 0)
+        shown = images([3])
+        assert np.abs(shown["image"][0] - short.images["image"][3].astype(float)).mean() < 8
+        frames = {name: frame_reader(folder, name)(0, [3])[0].permute(1, 2, 0).numpy() * 255 for name in cameras}
+        for camera, frame in zip(("image", "wrist_image"), frames.values(), strict=True):
+            true = short.images[camera][3].astype(float)
+            apart = [np.abs(frame - picture).mean() for picture in (true, true[:, ::-1])]
+            assert min(apart) < 8 < max(apart)
+            assert (apart[0] < apart[1]) == (convention == "upright")
+        assert replay(read_episode(folder, 0), images=images) is None
+    with pytest.raises(MemobenchError, match="did you mean 'libero'"):
+        convert(path, tmp_path / "ds", convention="liberro")
 
 
 # --- restoring a demonstration ---
@@ -334,8 +405,8 @@ def test_killed_conversion_continues(written, tmp_path, monkeypatch, holder, nam
     source, unpacked, inner = packed(written, tmp_path / "a.zip"), [], convert_module.unpack
     killed_at(holder, name, call, lambda: convert(source, tmp_path / "ds"))
     assert not is_dataset(tmp_path / "ds")
-    with pytest.raises(MemobenchError, match="upside_down=False"):
-        convert(source, tmp_path / "ds", upside_down=True)
+    with pytest.raises(MemobenchError, match="convention='upright'"):
+        convert(source, tmp_path / "ds", convention="libero")
     monkeypatch.setattr(convert_module, "unpack", lambda *args: unpacked.append(args) or inner(*args))
     assert convert(source, tmp_path / "ds").episodes == 4
     assert len(unpacked) == unpacked_again, "finished files are not unpacked again"

@@ -14,8 +14,9 @@ from types import SimpleNamespace
 import pytest
 
 from lerobot_memobench.datasets import recording
+from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.datasets.generation import generate, slurm_of
-from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_dataset
+from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_dataset, read_info
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.slurm import run_part
@@ -140,11 +141,26 @@ def tree_hash_of_run(tasks, out):
     return tree_hash(out)
 
 
+def test_convention_of_the_images(tasks, recorded, tmp_path):
+    """Both datasets differ in the names of a camera and in the orientation; a run is not continued in another one."""
+    folders = {name: run(tasks[:1], tmp_path / name, 1, convention=name).folder for name in ("upright", "libero")}
+    frames = {
+        name: {key: frame_reader(folder, key)(0, [9])[0] for key in read_info(folder)["features"] if "images" in key}
+        for name, folder in folders.items()
+    }
+    assert [key.rpartition(".")[2] for key in frames["libero"]] == ["image", "image2"]
+    for mirrored, upright in zip(frames["libero"].values(), frames["upright"].values(), strict=True):
+        assert (mirrored - upright.flip(-1)).abs().mean() < 0.02 < (mirrored - upright).abs().mean()
+    with pytest.raises(MemobenchError, match="with convention='libero', now 'upright'"):
+        run(tasks[:1], tmp_path / "libero", 1)
+
+
 @pytest.mark.parametrize(
     ("asked", "named"),
     [
         ({"episodes": 0}, "at least 1"),
         ({"seed_base": 7}, "split"),
+        ({"convention": "liber"}, "did you mean 'libero'"),
         ({"tasks": []}, "0 tasks"),
         ({"tasks": "twice"}, "named twice"),
         ({"tasks": "two worlds"}, "two worlds"),

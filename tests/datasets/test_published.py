@@ -20,7 +20,7 @@ from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.task import LIBERO
 from tests.support import libero_layout
 from tests.support.libero import needs_assets
-from tests.support.short_demonstrations import drawn_steps
+from tests.support.short_demonstrations import drawn_steps, with_pictures
 
 pytestmark = needs_assets
 
@@ -44,7 +44,8 @@ def drawer() -> Demonstration:
         proprio.append(sim.proprio())
         objects.append(look.observe())
     satisfied = np.arange(20)[:, None] >= SHUT
-    return grey(replace(demo, states=states, proprio=np.array(proprio), objects=np.array(objects), satisfied=satisfied))
+    whole = replace(demo, states=states, proprio=np.array(proprio), objects=np.array(objects), satisfied=satisfied)
+    return with_pictures(whole, 16)
 
 
 def grey(demo: Demonstration) -> Demonstration:

@@ -149,7 +149,7 @@ def test_idling_frames_are_not_sent(benchmarks: Make) -> None:
 
 
 def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
-    less = benchmarks(UNPROMPTED, horizon=1, send_state=False, send_wrist_image=False, mirror=True)
+    less = benchmarks(UNPROMPTED, horizon=1, send_state=False, convention="libero")
     plain = benchmarks(UNPROMPTED, horizon=1)
     assert less.get_tasks() == [{"name": UNPROMPTED, "suite": "temporal"}]
     (first, _), (whole, _) = played(less), played(plain)
@@ -157,11 +157,17 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
     assert set(whole) == {"images", "task_description", "states", "step"}
     assert whole["step"].tolist() == [0]
     assert list(whole["images"]) == ["agentview", "wrist"]
-    assert np.array_equal(first["images"]["agentview"], whole["images"]["agentview"][:, ::-1])
+    for camera in whole["images"]:
+        assert np.array_equal(first["images"][camera], whole["images"][camera][:, ::-1])
     declared = plain.get_observation_spec()
     assert check_specs(plain.get_action_spec(), plain.get_action_spec(), declared, declared) == []
     assert set(declared) == {"agentview", "wrist", "language", "state"}
-    assert set(less.get_observation_spec()) == {"agentview", "language"}
+    assert set(less.get_observation_spec()) == {"agentview", "wrist", "language"}
+    assert list(benchmarks(UNPROMPTED, send_wrist_image=False).get_observation_spec()) == [
+        "agentview",
+        "language",
+        "state",
+    ]
     held = plain.get_hold_action({"actions": np.full((2, 7), 0.5)})["actions"]
     assert held.tolist() == [0] * 6 + [0.5]
     assert len(MEMOBench().get_tasks()) == 30
@@ -177,6 +183,7 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
         ({"history_every": 0}, "history_every"),
         ({"seed": 100_007}, "test-sealed"),
         ({"obs_type": "both"}, "send_state"),
+        ({"mirror": True}, "convention to libero"),
         ({"evidence": True}, "referent"),
     ],
 )

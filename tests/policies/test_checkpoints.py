@@ -147,9 +147,9 @@ def test_shipped_policies_are_accepted() -> None:
 
 def test_evaluation_refuses_unfit_checkpoints(copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = saved(tmp_path / "it", config(cameras=("front", "wrist"), state=7))
-    assert "--rename_map=" in refused(other, capsys)
+    assert "--rename_map=" in refused(other, capsys, "convention=upright")
     renamed = json.dumps({IMAGES + "image": IMAGES + "front", IMAGES + "wrist_image": IMAGES + "wrist"})
-    assert "of 7 numbers" in refused(other, capsys, f"--rename_map={renamed}")
+    assert "of 7 numbers" in refused(other, capsys, "convention=upright", f"--rename_map={renamed}")
     rewrite(copied, lambda weights: weights.pop("model.action_head.weight"))
     assert "model.action_head.weight" in refused(copied, capsys)
 

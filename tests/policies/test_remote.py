@@ -17,6 +17,7 @@ import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
+from lerobot.utils.constants import OBS_IMAGES
 from vla_eval import serve_background
 
 from lerobot_memobench.cli.lerobot import main
@@ -42,7 +43,9 @@ def steps_of(questions: list[dict[str, Any]]) -> list[int]:
 def test_openpi_questions_hold_the_inputs_of_its_libero_servers() -> None:
     with PolicyServer() as server:
         make(server).select_action(batch(0, task="open the drawer"))
-        make(server, image_size=0, mirror=True).select_action(batch(7))
+        libero = batch(7)
+        libero[f"{OBS_IMAGES}.image2"] = libero.pop(f"{OBS_IMAGES}.wrist_image")  # with convention=libero
+        make(server, image_size=0).select_action(libero)
         make(server, keys="video.front=image, t=step,language = task", image_size=0).select_action(batch(4))
         with pytest.raises(MemobenchError, match=r"'gaze'.*image, phase, state, step, task, wrist_image"):
             make(server, keys="x=gaze").select_action(batch(0))
@@ -54,8 +57,8 @@ def test_openpi_questions_hold_the_inputs_of_its_libero_servers() -> None:
     assert first["observation/state"].dtype == np.float32
     assert np.array_equal(first["observation/state"], np.arange(8) + 1)
     # As rendered: every pixel survives LeRobot's division by 255.
-    assert np.array_equal(second["observation/image"], pictures(7)[:, ::-1])
-    assert np.array_equal(second["observation/wrist_image"], pictures(7))
+    assert np.array_equal(second["observation/image"], pictures(7))
+    assert np.array_equal(second["observation/wrist_image"], pictures(7)[:, ::-1])
     assert (third["t"], third["language"]) == ([4], "do it")
     assert np.array_equal(third["video.front"], pictures(4))
 
@@ -163,6 +166,7 @@ def test_vla_eval_episode_with_a_prompt() -> None:
         ({"n_action_steps": 0}, "policy.n_action_steps"),
         ({"timeout": 0.0}, "policy.timeout"),
         ({"image_size": -1}, "policy.image_size"),
+        ({"mirror": True}, "convention=libero"),
     ],
 )
 def test_wrong_settings_are_named(settings: dict[str, Any], named: str) -> None:

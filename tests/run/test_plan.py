@@ -176,7 +176,7 @@ def test_without_the_arm_nothing_begins(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 FEATURES = {
-    "pictures": {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}},
+    "pictures": {"observation.images.wrist_image": {"type": "VISUAL", "shape": [3, 256, 256]}},
     "objects": {"observation.environment_state": {"type": "ENV", "shape": [208]}},
 }
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
@@ -98,6 +99,45 @@ def test_axis_angle_keeps_the_quaternions_sign() -> None:
     np.testing.assert_allclose(axis_angle(quarter), [np.pi / 2, 0, 0])
     np.testing.assert_allclose(axis_angle(-quarter), [-3 * np.pi / 2, 0, 0])
     np.testing.assert_array_equal(axis_angle(np.array([1.0, 0, 0, 0])), np.zeros(3))
+
+
+def test_the_state_vector_is_liberos(simulate: Simulate) -> None:
+    """LeRobot's own processor of LIBERO's observations gives the same numbers, at random poses of the arm."""
+    import torch
+    from lerobot.processor.env_processor import LiberoProcessorStep
+
+    sim, rng = simulate(), np.random.default_rng(79)
+    arm = [sim.model.joint(f"robot0_joint{k}").qposadr[0] for k in range(1, 8)]
+    fingers = [sim.model.joint(f"gripper0_finger_joint{k}").qposadr[0] for k in (1, 2)]
+    signs = set()
+    for _ in range(200):
+        sim.data.qpos[arm] = rng.uniform(-2.8, 2.8, 7)
+        sim.data.qpos[fingers] = rng.uniform([0, -0.04], [0.04, 0])
+        mujoco.mj_kinematics(sim.model, sim.data)
+        x, y, z, w = np.roll(sim.data.body("robot0_right_hand").xquat, -1)
+        signs.add(w > 0)
+        eef = {"pos": sim.data.site("gripper0_grip_site").xpos, "quat": np.array([x, y, z, w])}
+        robot = {"eef": eef, "gripper": {"qpos": sim.data.qpos[fingers]}}
+        batch = {
+            part: {name: torch.tensor(value)[None] for name, value in held.items()} for part, held in robot.items()
+        }
+        theirs = LiberoProcessorStep().observation({"observation.robot_state": batch})["observation.state"]
+        ours = sim.proprio()
+        assert (ours.dtype, ours.shape) == (np.float32, (8,))
+        np.testing.assert_allclose(ours, theirs[0].numpy(), atol=2e-6)
+    assert signs == {True, False}, "the quaternion's sign is kept"
+
+
+def test_axis_angle_of_random_quaternions() -> None:
+    """The axis is that of SciPy's rotation; the angle is 2 acos(w), above a half turn where w is negative."""
+    quaternions = np.random.default_rng(79).normal(size=(2000, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    found = np.array([axis_angle(each) for each in quaternions])
+    short = Rotation.from_quat(quaternions, scalar_first=True).as_rotvec()
+    angle = np.linalg.norm(short, axis=1, keepdims=True)
+    long = short * (1 - 2 * np.pi / angle)
+    np.testing.assert_allclose(found, np.where(quaternions[:, :1] < 0, long, short), atol=1e-7)
+    assert np.array_equal(axis_angle(np.array([1 + 1e-12, 0, 0, 0])), np.zeros(3)), "w is clamped"
 
 
 @pytest.mark.parametrize(

@@ -225,7 +225,8 @@ def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
     """Check one line: settings as on the card, seed, and an outcome that this task can have."""
     protocol, named = run.protocol, (run.records[0].get(POLICY), str(run.card[POLICY].get("type")))
     where = f"{run.place}: {record['task']}, episode {record['episode']}"
-    for key in ("suite", "world", "difficulty", "protocol", "referent", "replan_steps", INPUTS, *MEMORY_CONTROLS):
+    settings = ("suite", "world", "difficulty", "protocol", "convention", "referent", "replan_steps", INPUTS)
+    for key in (*settings, *MEMORY_CONTROLS):
         value = record.get(key, OMITTED.get(key))
         expected = protocol.get(key)
         if value != expected:

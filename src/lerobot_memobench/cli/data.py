@@ -16,12 +16,16 @@ from lerobot_memobench.errors import check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.slurm import read_options
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.generation import GenerationSummary
     from lerobot_memobench.datasets.validate import Verdict
     from lerobot_memobench.jobs.processes import Advance
+
+
+Convention = Annotated[str, typer.Option(help="Images upright, or libero: mirrored and named as in LIBERO's data.")]
 
 
 class Referent(StrEnum):
@@ -50,6 +54,7 @@ def generate(
     perturb: Annotated[
         bool, typer.Option("--perturb", help="Disturb the arm at random; actions are the expert's corrections.")
     ] = False,
+    convention: Convention = UPRIGHT,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
     finish: Annotated[
@@ -87,6 +92,7 @@ def generate(
             image_size=image_size,
             demonstration_prompt=demonstration_prompt,
             perturb=perturb,
+            convention=convention,
             workers=workers,
             slurm=cluster,
             finish=finish,
@@ -129,9 +135,7 @@ def convert(
         Path, typer.Argument(help="HDF5 file in the published layout, or a folder or a zip archive of them.")
     ],
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
-    upside_down: Annotated[
-        bool, typer.Option("--upside-down", help="The images are stored bottom row first: turn them up.")
-    ] = False,
+    convention: Convention = UPRIGHT,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
 ) -> int:
@@ -150,7 +154,7 @@ def convert(
         summary = run(
             source,
             out,
-            upside_down=upside_down,
+            convention=convention,
             workers=workers,
             progress=advance,
             notify=partial(screen.print, soft_wrap=True),

@@ -15,6 +15,7 @@ from torch import Tensor
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import Task
@@ -28,15 +29,16 @@ THINGS = 4
 """Objects of a synthetic scene."""
 
 
-def write_streams(folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK) -> Path:
+def write_streams(
+    folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK, convention: str = UPRIGHT
+) -> Path:
     """Write a dataset of three short episodes with the real columns and shapes and with synthetic values.
 
     Args:
-        frames: of each execution. task: gives instruction and checkpoints.
+        frames: of each execution. task: gives instruction and checkpoints. convention: of the pictures.
     """
-    return write_dataset(
-        (_episode(get_task(task), seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS)), folder
-    )
+    episodes = (_episode(get_task(task), seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS))
+    return write_dataset(episodes, folder, convention=convention)
 
 
 def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:

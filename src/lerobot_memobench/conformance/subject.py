@@ -22,10 +22,12 @@ from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
+from lerobot_memobench.policies.convention import check_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import SHORT_FORMS, policy_config, read_arguments, split_arguments
 from lerobot_memobench.run.rollout import has_planned_action, needs_observation
+from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 
 REPLAN = 3
@@ -149,8 +151,11 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
         if key.partition(".")[0] not in KEYS and key not in short:
             raise MemobenchError(f"memobench conformance has no setting {key!r}, {nearest(key, [*KEYS, *short])}")
     if given.value("dataset") is None:
-        known = getattr(policy_config(read_arguments("train", given)), "subgoals", None)
-        made = write_streams(folder / "streams", task=task_of_texts(known or {}))
+        begun = read_arguments("train", given)
+        policy, path = policy_config(begun), begun.get("policy.path")
+        convention = None if path is None or policy is None else trained_convention(path, policy)[0]
+        task = task_of_texts(getattr(policy, "subgoals", None) or {})
+        made = write_streams(folder / "streams", task=task, convention=convention or UPRIGHT)
         given = type(given)([*given.pairs, ("dataset", str(made))], given.flags)
     arguments = read_arguments("train", given)
     if not torch.cuda.is_available():
@@ -182,6 +187,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
         raise MemobenchError(f"{raw.root} has no {CLOCK[0]}; name a dataset of `memobench generate`, or none")
     path = config.pretrained_path
     if path is not None:
+        check_convention(str(path), config, convention_of(raw.meta.features))
         check_weights(path, config)
     whole, numbers = TrainPipelineConfig(DatasetConfig(repository, root=root), policy=config), np.arange(raw.num_frames)
     torch.manual_seed(0)

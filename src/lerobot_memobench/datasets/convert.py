@@ -37,7 +37,14 @@ from lerobot_memobench.datasets.hdf5 import (
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING, Problem, check_destination
 from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
-from lerobot_memobench.datasets.restore import restore, task_of, unlike_the_catalogue, world_of
+from lerobot_memobench.datasets.restore import (
+    ORIENTATIONS,
+    orientation_of,
+    restore,
+    task_of,
+    unlike_the_catalogue,
+    world_of,
+)
 from lerobot_memobench.datasets.staging import (
     EpisodeStage,
     StagedJob,
@@ -47,7 +54,7 @@ from lerobot_memobench.datasets.staging import (
     stage_failure,
     staged,
 )
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import (
     Count,
     check_fetched,
@@ -63,6 +70,7 @@ from lerobot_memobench.io import (
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.worlds import WORLDS
 from lerobot_memobench.tasks.task import World
 
@@ -100,18 +108,20 @@ def convert(
     out: Path | str,
     *,
     repo_id: str = DEFAULT_REPO_ID,
-    upside_down: bool = False,
+    convention: str = UPRIGHT,
     workers: int = 1,
     progress: ProgressCallback | None = None,
     notify: Callable[[str], None] = lambda _: None,
 ) -> ConversionSummary:
     """Convert a file in the published layout, or all in a folder or a zip archive, to a LeRobotDataset in ``out``.
 
+    The first pictures of each file, compared with those drawn of their state, show how all of them are stored.
+
     Args:
         source: the file, folder or archive.
         out: absent, empty, or an unfinished conversion of the same files.
         repo_id: name of the dataset.
-        upside_down: the images are stored bottom row first, as robosuite renders them; flip them.
+        convention: of the images in the dataset (`sim.convention`).
         workers: number of processes.
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number,
             and its ``total`` is estimated from the files so far.
@@ -121,10 +131,11 @@ def convert(
         MemobenchError: there is no file to convert, ``out`` holds something else, its disk has no room (finished
             episodes stay), or LIBERO's assets, which files of its scenes need, are not installed.
     """
+    check_choice("convention", convention, [*CONVENTIONS])
     source, out = Path(source).absolute(), Path(out)
     staging = out / STAGING
     files, refused = find_files(source, staging.absolute() / "unpacked")
-    request = {"files": [file.identity for file in files], "upside_down": upside_down}
+    request = {"files": [file.identity for file in files], "convention": convention}
     manifest = finished_manifest(out, request, "left_out")
     if manifest is not None:
         left_out, noted = (tuple(map(Problem.model_validate, manifest.get(key, []))) for key in ("left_out", "notes"))
@@ -135,7 +146,7 @@ def convert(
         episodes_folder(out, request) as folder,
     ):
         _report_size(files, folder, out, notify)
-        conversion = _Conversion(source, staging, folder, upside_down, workers, progress, files)
+        conversion = _Conversion(source, staging, folder, convention, workers, progress, files)
         for number, file in enumerate(files, 1):
             conversion.add(number, file, notify)
         problems, notes = [*conversion.problems, *refused], conversion.notes
@@ -278,12 +289,13 @@ class Sound(BaseModel):
 
 
 class Findings(BaseModel):
-    """Demonstrations, problems and notes of a file, and the world of its scenes."""
+    """Demonstrations, problems and notes of a file, the world of its scenes, and how its images are stored."""
 
     demonstrations: list[Sound] = []
     problems: list[Problem] = []
     notes: list[Problem] = []
     world: World | None = None
+    orientation: str | None = None
 
 
 def inspect(file: SourceFile, world: World | None) -> Findings:
@@ -308,6 +320,7 @@ def inspect(file: SourceFile, world: World | None) -> Findings:
                 try:
                     demo = opened.read(group)
                     found.world = _checked_world(demo, found.world)
+                    found.orientation = found.orientation or orientation_of(opened, demo)
                 except Unusable as error:
                     leave_out(f"data/{group}", error)
                     continue
@@ -317,6 +330,10 @@ def inspect(file: SourceFile, world: World | None) -> Findings:
                 found.notes += [note for note in notes if note not in found.notes]
     except Unusable as error:
         leave_out("", error)
+    if found.demonstrations and found.orientation != UPRIGHT:
+        unclear = "whether its images are upright is not clear, as its state shows none like them: they are not turned"
+        turned = f"its images are {found.orientation}: they are turned"
+        found.notes.append(Problem(file=file.name, group="", reason=turned if found.orientation else unclear))
     return found
 
 
@@ -356,7 +373,7 @@ class _Conversion:
         source: Path,
         staging: Path,
         folder: Path,
-        upside_down: bool,
+        convention: str,
         workers: int,
         progress: ProgressCallback | None,
         files: Sequence[SourceFile],
@@ -364,7 +381,7 @@ class _Conversion:
         self.jobs: list[ConversionJob] = []
         self.problems: list[Problem] = []
         self.notes: list[Problem] = []
-        self._source, self._staging, self._folder, self._upside_down = source, staging, folder, upside_down
+        self._source, self._staging, self._folder, self._convention = source, staging, folder, convention
         self._workers, self._progress, self._files = workers, progress, files
         self._resumed = 0
         self._world: World | None = None
@@ -415,7 +432,8 @@ class _Conversion:
         first, jobs = len(self.jobs), list[ConversionJob]()
         for number, demo in enumerate(findings.demonstrations, first):
             size = next((job.image_size for job in (*self.jobs[:1], *jobs[:1])), (demo.height, demo.width))
-            jobs.append(ConversionJob(file.path, demo.group, self._folder / f"{number:06d}", size, self._upside_down))
+            turn, folder = ORIENTATIONS[findings.orientation or UPRIGHT], self._folder / f"{number:06d}"
+            jobs.append(ConversionJob(file.path, demo.group, folder, size, turn, self._convention))
         return jobs
 
     def _counting(self, number: int, jobs: int) -> ProgressCallback:
@@ -448,7 +466,8 @@ class ConversionJob(StagedJob):
     group: str
     folder: Path
     image_size: tuple[int, int]
-    upside_down: bool = False
+    turn: tuple[int, int] = ORIENTATIONS[UPRIGHT]
+    convention: str = UPRIGHT
 
     @property
     def task_name(self) -> str:
@@ -465,8 +484,8 @@ class ConversionJob(StagedJob):
         try:
             with PublishedFile(self.file) as file:
                 demo = self._restored(file)
-                with EpisodeStage(self.folder) as stage:
-                    for images in file.images(self.group, upside_down=self.upside_down):
+                with EpisodeStage(self.folder, self.convention) as stage:
+                    for images in file.images(self.group, *self.turn):
                         stage.add_images(images)
                     stage.publish(demo)
         except MemobenchError as error:

@@ -22,13 +22,14 @@ from lerobot_memobench.datasets.lerobot_format.card import SCRIPTED
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING, check_destination, is_dataset
 from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
 from lerobot_memobench.datasets.staging import FINISHED_EARLY, episodes_folder, finished_manifest, staged
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.worlds import WORLDS
 from lerobot_memobench.tasks.task import MEMOBENCH, Task, referent_text
 
@@ -58,6 +59,7 @@ def generate(
     image_size: int = IMAGE_SIZE,
     demonstration_prompt: bool = True,
     perturb: bool = False,
+    convention: str = UPRIGHT,
     workers: int = 1,
     slurm: Slurm | None = None,
     repo_id: str = DEFAULT_REPO_ID,
@@ -80,7 +82,7 @@ def generate(
             dataset.
         finish: assemble the dataset of an unfinished run's episodes, and make no further episode.
         notify: called before the first episode with the approximate size and duration.
-        referent, images, image_size, demonstration_prompt, perturb: see `recording.RecordingSettings`.
+        referent, images, image_size, demonstration_prompt, perturb, convention: see `recording.RecordingSettings`.
 
     Raises:
         MemobenchError: invalid arguments, seeds of a guarded split, ``out`` holds something else or a damaged dataset,
@@ -102,7 +104,8 @@ def generate(
             "to find; leave out --no-demonstration-prompt"
         )
     referent = referent_text(referent, drawn=all(task.drawn for task in tasks))
-    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb)
+    check_choice("convention", convention, [*CONVENTIONS])
+    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb, convention)
     plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, repo_id)
     if finish:
         return _finish_early(plan, Path(out))

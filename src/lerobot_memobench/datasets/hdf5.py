@@ -207,12 +207,12 @@ class PublishedFile:
             image_size=sizes.pop(),
         )
 
-    def images(self, group: str, *, upside_down: bool = False) -> Iterator[dict[str, NDArray[np.uint8]]]:
+    def images(self, group: str, rows: int = 1, columns: int = 1) -> Iterator[dict[str, NDArray[np.uint8]]]:
         """Yield both cameras' frames, (H, W, 3) uint8, in order; ``FRAMES_PER_READ`` are in memory at a time.
 
         Args:
             group: a name of ``groups()``.
-            upside_down: the images are stored bottom row first, as robosuite renders them; flip them.
+            rows, columns: -1 turns the images upside down, or mirrors them left to right.
         """
         obs = self._data[group]["obs"]
         names = image_names(obs)
@@ -223,7 +223,7 @@ class PublishedFile:
                 raise Unusable(f"its images cannot be read from frame {start} on ({first_line(error)})") from None
             for offset in range(len(block["image"])):
                 frame = {camera: frames[offset] for camera, frames in block.items()}
-                yield {c: np.ascontiguousarray(image[::-1]) for c, image in frame.items()} if upside_down else frame
+                yield {c: np.ascontiguousarray(image[::rows, ::columns]) for c, image in frame.items()}
 
 
 # --- parts of a file, each checked ---

@@ -16,6 +16,7 @@ from lerobot_memobench.datasets.staging import EpisodeStage, StagedJob, stage_fa
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, IMAGE_SIZE
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.task import Task
 
@@ -42,6 +43,7 @@ class RecordingSettings:
         image_size: height and width of their images, pixels.
         demonstration_prompt: whether the episode begins with the task's prompt, if it has one.
         perturb: whether the arm is moved off its way at random (`Perturbation`).
+        convention: in which the images are written (`sim.convention`).
     """
 
     referent: str = "fixed"
@@ -49,6 +51,7 @@ class RecordingSettings:
     image_size: int = IMAGE_SIZE
     demonstration_prompt: bool = True
     perturb: bool = False
+    convention: str = UPRIGHT
 
 
 @lru_cache(maxsize=1)
@@ -150,7 +153,7 @@ class RecordingJob(StagedJob):
         where = f"{self.task.name}, seed {self.seed}"
         try:
             episode = compiled_episode(self.task, self.settings)
-            with EpisodeStage(self.folder) as stage:
+            with EpisodeStage(self.folder, self.settings.convention) as stage:
                 demo = record(episode, self.seed, self.settings, stage.add_images)
                 reason = _failure_reason(demo, episode)
                 if reason is None:

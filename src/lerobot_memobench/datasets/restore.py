@@ -17,19 +17,22 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path, PurePosixPath
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
 from lerobot_memobench.datasets.hdf5 import SUFFIX, PublishedDemo, PublishedFile, Unusable, first_line
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name
-from lerobot_memobench.protocol import UPSTREAM_EVALUATIONS
+from lerobot_memobench.protocol import CAMERAS, UPSTREAM_EVALUATIONS
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
@@ -246,9 +249,48 @@ def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
 @lru_cache(maxsize=1)
 def _simulation(task: Task) -> Simulation:
     """Return a task's simulation; the last one is cached, because a file's demonstrations follow each other."""
-    sim = Simulation(task)
+    try:
+        sim = Simulation(task)
+    except MemobenchError as error:
+        raise Unusable(str(error)) from None
     sim.reset(0)
     return sim
+
+
+# --- the orientation of stored pictures ---
+
+STORED = (UPRIGHT, "mirrored left to right", "upside down", "rotated by 180 degrees")
+ORIENTATIONS = {name: (rows, columns) for name, (rows, columns) in zip(STORED, product((1, -1), repeat=2), strict=True)}
+"""How pictures are stored -> steps over their rows and columns that make them upright."""
+NEAR, APART = 12.0, 2.0
+"""Largest mean difference of pictures of one frame, of 255 levels, and the least ratio to the next orientation's."""
+SIDE = 32
+"""Side at which pictures are compared, pixels: edges and textures of other renderers do not count."""
+
+
+def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
+    """Return which of `ORIENTATIONS` the first pictures of a checked group have, by those drawn of its first state.
+
+    None if none is near, or two are.
+
+    Raises:
+        Unusable: the group has no task, or is of another scene than the task's.
+    """
+    sim = _simulation(task_of(file, demo))
+    states, fixture_poses = _placed(sim, demo)
+    sim.set_state(states[0], fixture_poses)
+    stored = next(file.images(demo.group)).items()
+    pairs = [(_small(sim.render(CAMERAS[camera])), _small(picture)) for camera, picture in stored]
+    far = {
+        name: float(np.mean([np.abs(drawn - given[::rows, ::columns]) for drawn, given in pairs]))
+        for name, (rows, columns) in ORIENTATIONS.items()
+    }
+    best, second = sorted(far, key=lambda name: far[name])[:2]
+    return best if far[best] <= NEAR and far[second] >= APART * far[best] else None
+
+
+def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
 
 
 # --- the scene of a model file ---

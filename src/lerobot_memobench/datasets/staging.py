@@ -37,6 +37,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, read_json, remove_drafts, short, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
 from lerobot_memobench.tasks.task import MEMOBENCH
 
 TEMPORARY = ".tmp-"
@@ -46,6 +47,7 @@ ARRAYS_FILE = "arrays.npz"
 FINISHED_EARLY = "finished_early"
 """Key of a dataset's request: whether episodes of it were left out."""
 DEFAULTS: dict[str, Any] = {"perturb": False, "prompted_episodes": None, FINISHED_EARLY: False, "world": MEMOBENCH}
+DEFAULTS |= {"convention": UPRIGHT, "upside_down": False}  # the latter was an option of `memobench convert`
 """Values of keys that a request may lack."""
 ADVICE = "it is damaged; delete its folder and run the command again"
 
@@ -60,7 +62,7 @@ class Record(BaseModel):
         failure: why there is no demonstration of this seed, or None.
         info: see `episode_info`; of a failed episode at least its task's name and seed.
         language_persistent: LeRobot's persistent language rows (see ``persistent_rows``).
-        image_stats: camera to the statistics of its pixels (see ``ImageHistograms``).
+        image_stats: name of a camera's video to the statistics of its pixels (see ``ImageHistograms``).
         files: name to sha256 of the other files.
     """
 
@@ -158,13 +160,15 @@ class EpisodeStage:
 
     Args:
         folder: folder of the finished episode; an equal one that exists already is kept.
+        convention: of the videos (`sim.convention`).
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, convention: str = UPRIGHT) -> None:
+        self._folder, self._convention = folder, convention
         self._temporary = temporary_folder(folder)
-        self._videos = {camera: VideoWriter(self._temporary / f"{camera}.mp4") for camera in CAMERAS}
-        self._histograms = {camera: ImageHistograms() for camera in CAMERAS}
+        names = CONVENTIONS[convention].values()
+        self._videos = {name: VideoWriter(self._temporary / f"{name}.mp4") for name in names}
+        self._histograms = {name: ImageHistograms() for name in names}
         self._frames = 0
 
     def __enter__(self) -> EpisodeStage:
@@ -179,11 +183,11 @@ class EpisodeStage:
         shutil.rmtree(self._temporary, ignore_errors=True)
 
     def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
-        """Add the next frame of both cameras, (H, W, 3) uint8 each."""
+        """Add the next frame of both cameras, (H, W, 3) uint8 each, upright."""
         self._frames += 1
-        for camera, video in self._videos.items():
-            video.add(images[camera])
-            self._histograms[camera].add(images[camera])
+        for name, image in shown(images, self._convention).items():
+            self._videos[name].add(image)
+            self._histograms[name].add(image)
 
     def publish(self, demo: Demonstration) -> StagedEpisode:
         """Write everything except the images, which were added before, and give the folder its name."""
@@ -248,9 +252,9 @@ def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None
         ) from None
 
 
-def stage_demonstration(demo: Demonstration, folder: Path) -> StagedEpisode:
+def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPRIGHT) -> StagedEpisode:
     """Write a demonstration in memory, with its images, to ``folder``; an equal one that exists already is kept."""
-    with EpisodeStage(folder) as stage:
+    with EpisodeStage(folder, convention) as stage:
         for frame in range(len(demo) if demo.images is not None else 0):
             assert demo.images is not None
             stage.add_images({camera: demo.images[camera][frame] for camera in CAMERAS})

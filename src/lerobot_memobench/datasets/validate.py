@@ -53,6 +53,7 @@ from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import check_fetched, cut, file_hash, refusing
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
+from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
@@ -160,13 +161,16 @@ def validate(
 
 
 def images_of(folder: Path, episode: int) -> Images | None:
-    """Return the reader of an episode's images; None if the dataset has none of our cameras."""
-    cameras = [camera for camera in CAMERAS if image_key(camera) in read_info(folder)["features"]]
+    """Return the reader of an episode's images, upright; None if the dataset has none of our cameras."""
+    features = read_info(folder)["features"]
+    convention = convention_of(features) or UPRIGHT
+    step = -1 if convention == MIRRORED else 1
+    cameras = {camera: key for camera, name in CONVENTIONS[convention].items() if (key := image_key(name)) in features}
 
     def read(frames: Sequence[int]) -> dict[str, NDArray[np.uint8]]:
-        found = {camera: _reader(folder, image_key(camera))(episode, list(frames)) for camera in cameras}
+        found = {camera: _reader(folder, key)(episode, list(frames)) for camera, key in cameras.items()}
         return {
-            camera: (shown * 255).round().clamp(0, 255).byte().permute(0, 2, 3, 1).numpy()
+            camera: (shown * 255).round().clamp(0, 255).byte().permute(0, 2, 3, 1).numpy()[:, :, ::step]
             for camera, shown in found.items()
         }
 

@@ -14,7 +14,7 @@ from functools import partial
 from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 from lerobot.configs import PipelineFeatureType, PolicyFeature
@@ -35,6 +35,7 @@ from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import AUTO, INTACT, PIXELS, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
+from lerobot_memobench.sim.convention import UPRIGHT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
 """Called with a task's folder, the number of rows, and whether each row runs in its own process."""
@@ -70,6 +71,8 @@ class MemobenchEnvConfig(_WithSettings):
     log_dir: str | None = None
     resume: bool = False
     fps: int = CONTROL_HZ
+    check_policy: ClassVar[Callable[[MemobenchEnvConfig], None]] = lambda config: None
+    """Checks the policy of LeRobot's own commands; set by `registration`, because policies depend on environments."""
     features: dict[str, PolicyFeature] = field(default_factory=policy_features)
     features_map: dict[str, str] = field(default_factory=policy_names)
 
@@ -87,8 +90,8 @@ class MemobenchEnvConfig(_WithSettings):
                 f"env.task_dir={self.task_dir} runs every task of that folder and excludes tasks={self.tasks}; remove "
                 "tasks=, or set env.task_dir= to the folder of one task"
             )
-        if self.obs_type != PIXELS:
-            self.features, self.features_map = policy_features(self.obs_type), policy_names(self.obs_type)
+        if (pictures := (self.obs_type, self.convention)) != (PIXELS, UPRIGHT):
+            self.features, self.features_map = policy_features(*pictures), policy_names(*pictures)
 
     @property
     def settings(self) -> EnvSettings:
@@ -147,6 +150,7 @@ class MemobenchEnvConfig(_WithSettings):
         """
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
+        type(self).check_policy(self)
         opened = self.opener(None, UNKNOWN_POLICY, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:

@@ -36,6 +36,7 @@ from lerobot_memobench.io import (
     write_file,
 )
 from lerobot_memobench.protocol import BY_PAPER
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.difficulty import STANDARD, Difficulty
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
@@ -137,6 +138,7 @@ class Outcome(TypedDict, total=False):
         world: ``libero``; absent for the package's own scenes.
         stand_ins: world ``libero``: classes without scans, replaced by boxes.
         protocol: ``upstream``, the authors' evaluation; absent for the paper's.
+        convention: of the pictures; absent for upright ones.
         lost: strict tasks: whether the goal became unreachable.
         fault: reason why the episode was aborted: an invalid action or unstable physics.
         scene_hash: hash of the initial scene.
@@ -164,6 +166,7 @@ class Outcome(TypedDict, total=False):
     world: Name
     stand_ins: list[Name]
     protocol: Name
+    convention: Name
     lost: bool
     fault: str
     scene_hash: Name | None
@@ -490,6 +493,7 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 
 OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, "world": MEMOBENCH, "difficulty": STANDARD, "protocol": BY_PAPER},
+    "convention": UPRIGHT,
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
     **MEMORY_CONTROLS,
 }

@@ -51,6 +51,7 @@ from lerobot_memobench.protocol import (
     SPLITS,
     UNSEEDED,
 )
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
 from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import scene_and_variant
@@ -63,8 +64,9 @@ logger = logging.getLogger(__name__)
 class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     """One task of the benchmark.
 
-    Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, or ``environment_state``
-    float32 (208,): the visible objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
+    Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, with ``convention=libero``
+    ``pixels/image`` and ``pixels/image2`` mirrored left to right, or ``environment_state`` float32 (208,): the visible
+    objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and
     actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began, in the execution of a
     strict task `NO_CLOCK` or `ENDED`; optionally ``expert_action`` (7,) and ``blind_action`` (7,). The robot of a
@@ -128,7 +130,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._log_dir = Path(log_dir) if log_dir is not None else None
         self._log = self._opened_log(log_dir) if log_dir is not None else None
         self._video: VideoRecorder | None = None
-        self._observer = Observer(settings.obs_type)
+        self._observer = Observer(settings.obs_type, settings.convention)
         self._others: Interference | None = None
         self._began = self._closed = False
         self._not_run: str | None = None
@@ -327,7 +329,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             variants = len(self._task.random_variants) if self.settings.evidence else None
             referent = self.settings.referent
             found = not_run_record(self._task, self._number, self._scene_seed, referent, self._not_run, variants)
-        return found | self._acting.line
+        convention = self.settings.convention
+        return found | self._acting.line | ({} if convention == UPRIGHT else {"convention": convention})
 
     def _observation(self) -> dict[str, Any]:
         if self._not_run is not None:

@@ -22,6 +22,7 @@ from lerobot_memobench.protocol import (
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
@@ -90,6 +91,10 @@ class EnvSettings:
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
     obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
+    convention: str = setting(UPRIGHT, "pictures upright, or mirrored and named as in LIBERO's data", [*CONVENTIONS])
+    control_mode: str = setting(
+        "relative", "actions are displacements; LIBERO's absolute ones do not exist", ("relative",)
+    )
     referent: str = setting(
         "fixed", "published goals, or goals drawn by the seed; strict tasks always draw", REFERENT_VALUES
     )
@@ -120,6 +125,8 @@ class EnvSettings:
                 f"speed is {self.speed!r}; expected 1, 0.5, 0.33, 0.25 and so on down to {1 / SLOWEST}, so that an "
                 "action takes a whole number of control steps"
             )
+        if self.convention != UPRIGHT and self.obs_type == OBJECTS:
+            raise MemobenchError(f"convention={self.convention} is of pictures, and obs_type={OBJECTS} has none")
         if self.suite == STRICT:
             check_world(self.world, self.suite)
             self._set(referent=DRAWN, horizon=self.degree.horizon if self.horizon == HORIZON else self.horizon)
@@ -219,7 +226,7 @@ class EnvSettings:
         return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
 
 
-NOT_COMPARED = ("expert_action", "blind_action", "videos")
+NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
 """Settings without effect on rollouts."""
 SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED)
 """Settings with an effect on rollouts."""

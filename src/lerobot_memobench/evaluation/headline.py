@@ -50,7 +50,7 @@ def protocol_phrases(run: Run) -> list[str]:
         f"{of_all(records, 'suite')} suite",
         *(
             f"{key} {value}"
-            for key in ("world", "difficulty", "protocol")
+            for key in ("world", "difficulty", "protocol", "convention")
             if (value := of_all(records, key)) != OMITTED[key]
         ),
         *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),

@@ -68,7 +68,7 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     seeded = all(record.get("seed") is not None for record in records)
     values: dict[str, set[Any]] = {
         "seed_base": {seed_base(record) for record in records if seeded},
-        **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", "world", "protocol")},
+        **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", "world", "protocol", "convention")},
         **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
     }
     for key, distinct in values.items():
@@ -82,7 +82,7 @@ APART = ("suite", "world")
 
 
 def of_all(records: Iterable[Mapping[str, Any]], key: str) -> str:
-    """Return the suite, the world or the protocol (``key``) of an evaluation's rollouts.
+    """Return the suite, the world, the protocol or the convention (``key``) of an evaluation's rollouts.
 
     Raises:
         MemobenchError: they are of several.

@@ -22,6 +22,7 @@ from lerobot_memobench.evaluation.tables import (
 from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
 from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES, PUBLISHED
 
 
@@ -322,7 +323,7 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
 
 PAPER_PROTOCOL = {
     **{"world": LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True, "horizon": HORIZON},
-    "seed_base": EVALUATION_SEED,
+    **{"seed_base": EVALUATION_SEED, "convention": UPRIGHT},
 }
 PAPER_INPUTS = "pixels"
 PAPER_TASKS, PAPER_EPISODES = 30, 50

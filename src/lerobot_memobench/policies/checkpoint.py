@@ -7,10 +7,10 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import LONGEST_NAME, check_fetched, file_name, refusing
+from lerobot_memobench.io import LONGEST_NAME, Count, check_fetched, file_name, refusing
 from lerobot_memobench.io import read_json as read_json_file
 from lerobot_memobench.protocol import CLOCK
 
@@ -61,6 +61,23 @@ class Processor(TypedDict, total=False):
     """A processor's file."""
 
     steps: list[Step]
+
+
+class TrainedOn(TypedDict, total=False):
+    """LeRobot's settings of the dataset of a training run."""
+
+    repo_id: str | None
+    revision: str | None
+    root: str | None
+    episodes: list[int] | None
+
+
+class TrainConfig(TypedDict):
+    """The parts of a checkpoint's ``train_config.json`` that are read."""
+
+    dataset: TrainedOn
+    steps: NotRequired[Count | None]
+    rename_map: NotRequired[dict[str, str] | None]
 
 
 def looks_local(text: str) -> bool:

@@ -71,7 +71,7 @@ def check_features(
     trained = statistics_shapes(path)
     there = {renamed.get(name, name): feature for name, feature in shown.items()}
     original = {renamed.get(name, name): name for name in shown}
-    _check_cameras(path, _cameras(policy, trained), there, original)
+    _check_cameras(path, cameras_read(policy, trained), there, original)
     features = {
         OBS_STATE: policy.robot_state_feature,
         OBS_ENV_STATE: policy.env_state_feature if OBS_ENV_STATE in there else None,  # else see `check_obs_type`
@@ -92,7 +92,7 @@ def check_features(
     _check_sizes(path, policy, there)
 
 
-def _cameras(policy: Any, trained: Mapping[str, Any]) -> list[str]:
+def cameras_read(policy: Any, trained: Mapping[str, Any]) -> list[str]:
     """Return the cameras that a policy needs.
 
     A policy that fills missing pictures may list cameras of the checkpoint that its training began with; it needs those

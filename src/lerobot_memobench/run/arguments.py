@@ -54,7 +54,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         **{
             key: (f"env.{key}",)
             for key in (
-                *("difficulty", "protocol", "demonstration_prompt", "prompt_in", "horizon"),
+                *("convention", "difficulty", "protocol", "demonstration_prompt", "prompt_in", "horizon"),
                 *("pause_steps", "speed", "evidence", "videos"),
                 *("corrupt", "corrupt_step", "reshow", "interference"),
             )

@@ -14,16 +14,16 @@ import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
 from lerobot_memobench.envs.episode_log import INPUTS, key_of
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, FORMAT
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
-from lerobot_memobench.io import Count, file_hash, read_json, write_file
+from lerobot_memobench.io import file_hash, read_json, write_file
 from lerobot_memobench.jobs.threads import cores, cpu_model
-from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, local_folder, portable_path
+from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, TrainConfig, local_folder, portable_path
 from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.run.plan import EvaluationPlan
 
@@ -105,22 +105,6 @@ def with_checkpoint(card: dict[str, Any], path: str | None) -> dict[str, Any]:
 
 
 # --- facts of the policy: settings, seed, hash of its detector, its dataset ---
-
-
-class TrainedOn(TypedDict, total=False):
-    """LeRobot's settings of the dataset of a training run."""
-
-    repo_id: str | None
-    revision: str | None
-    root: str | None
-    episodes: list[int] | None
-
-
-class TrainConfig(TypedDict):
-    """The parts of a checkpoint's ``train_config.json`` that the card repeats."""
-
-    dataset: TrainedOn
-    steps: NotRequired[Count | None]
 
 
 def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:

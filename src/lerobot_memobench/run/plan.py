@@ -22,6 +22,7 @@ from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.compatibility import check_features
+from lerobot_memobench.policies.convention import check_convention
 from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.protocol import (
     EVALUATION_EPISODES,
@@ -154,6 +155,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
         check_choice("split", options.split, EVALUATED)
     asked = with_device(with_policy(asked), options)
     policy = policy_of(asked)
+    check_convention(asked.policy_path, policy, asked.env.get("convention"))
     output = _output(asked, options, policy)
     log = Path(asked.env.get("log_dir") or output)
     asked = with_batch_size(with_protocol(asked, options, policy), options, log, policy)

@@ -45,6 +45,7 @@ from lerobot_memobench.run.arguments import (
 from lerobot_memobench.run.card import PACKAGES, detector_hash, drawn_with, first_variant_mismatch, versions
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
+from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.difficulty import STANDARD
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -140,7 +141,8 @@ def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> Evaluation
     out = out or Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_rerun"
     shard = None if card["shard"] is None else Shard.parse(card["shard"])
     options = RunOptions(split=SEALED if "sealed" in card else None, shard=shard)
-    return make_plan(replace(card["asked"], output_dir=str(out)), options, ("memobench", "rerun"))
+    asked = card["asked"].env_default(convention=UPRIGHT)  # earlier cards do not name it
+    return make_plan(replace(asked, output_dir=str(out)), options, ("memobench", "rerun"))
 
 
 # --- whether this machine and version can repeat it ---

@@ -15,9 +15,11 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
+from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.policies.lerobot_config import overrides
+from lerobot_memobench.sim.convention import convention_of
 
 CHOICES = ["policy", "reward_model"]
 """Fields for which LeRobot's parser takes a ``path``."""
@@ -106,13 +108,16 @@ def check_settings(config: TrainPipelineConfig) -> None:
 
 
 def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
-    """Refuse evaluations on the benchmark during a training on other cameras or sizes.
+    """Refuse evaluations on the benchmark during a training on other cameras, sizes or conventions of pictures.
 
     Args:
         features: of the dataset.
     """
     if config.policy is None or getattr(config.env, "type", None) != "memobench":
         return
+    env: Any = config.env
+    if (stated := convention_of(features)) not in (None, env.convention) and env.obs_type != OBJECTS:
+        raise MemobenchError(f"{meta.root} has pictures of convention={stated}; set env.convention={stated}")
     unused = None if getattr(config.policy, "uses_pictures", True) else FeatureType.VISUAL
     known = dataset_to_policy_features(features)
     policy = copy.copy(config.policy)

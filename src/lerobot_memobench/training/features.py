@@ -47,6 +47,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
 )
 from lerobot_memobench.policies.memobench_mem.losses import rank_of_world
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS, ObjectsFromPictures
+from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_layout import SIZE
 
 logger = logging.getLogger(__name__)
@@ -287,6 +288,8 @@ def detections(
         cameras: the policy's name of each camera -> the dataset's. state: the dataset's name of the state.
         how: of `make_features`.
     """
+    if convention_of(read_info(root)["features"]) == MIRRORED:
+        raise MemobenchError(f"{root} has pictures of convention={MIRRORED}, and a detector reads {UPRIGHT} ones")
     readers = {name: frame_reader(root, of) for name, of in cameras.items()}
     recorded = functools.cache(lambda: read_recorded(root, [state]))  # not needed if the features are complete
 

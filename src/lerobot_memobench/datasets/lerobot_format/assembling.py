@@ -44,7 +44,8 @@ from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, vide
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.jobs.processes import locked
-from lerobot_memobench.protocol import CAMERAS, CLOCK, CONTROL_HZ
+from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
+from lerobot_memobench.sim.convention import UPRIGHT
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -63,10 +64,11 @@ def write_dataset(
     *,
     repo_id: str = DEFAULT_REPO_ID,
     made_by: str = "",
+    convention: str = UPRIGHT,
 ) -> Path:
     """Write demonstrations, in their order, as a dataset in ``out`` (absent or empty); one is in memory at a time.
 
-    Either all of them have images or none. ``made_by`` is a sentence for the card.
+    Either all of them have images or none. ``made_by`` is a sentence for the card, ``convention`` that of the images.
     """
     out = Path(out)
     check_destination(out)
@@ -77,7 +79,7 @@ def write_dataset(
         try:
             shutil.rmtree(episodes, ignore_errors=True)
             staged = [
-                stage_demonstration(demo, episodes / f"{number:06d}") for number, demo in enumerate(demonstrations)
+                stage_demonstration(demo, episodes / f"{k:06d}", convention) for k, demo in enumerate(demonstrations)
             ]
             return assemble(staged, out, repo_id=repo_id, made_by=made_by)
         finally:
@@ -111,9 +113,9 @@ def assemble(
     written = [episode for episode in episodes if episode.failure is None]
     if not written:
         raise MemobenchError(f"there is no successful demonstration to write to {out}; see the failures reported")
-    if len({episode.has_images for episode in written}) > 1:
+    if len({tuple(episode.record.image_stats) for episode in written}) > 1:
         raise MemobenchError(
-            f"some episodes for {out} have images and some have none; record all of them with equal settings"
+            f"some episodes for {out} have images and some have none, or others; record all of them with equal settings"
         )
     for episode in written:
         episode.check()
@@ -138,7 +140,7 @@ def _write_lerobot(
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=CONTROL_HZ,
-        features=dataset_features(_image_size(written[0])),
+        features=dataset_features(_image_size(written[0]), written[0].record.image_stats),
         root=build,
         robot_type=ROBOT_TYPE,
         use_videos=written[0].has_images,
@@ -155,7 +157,7 @@ def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
         return None
     import av
 
-    with av.open(str(episode.video(next(iter(CAMERAS))))) as container:
+    with av.open(str(episode.video(next(iter(episode.record.image_stats))))) as container:
         stream = container.streams.video[0]
         return stream.height, stream.width
 
@@ -281,7 +283,7 @@ def _stats_of(flat: NDArray[np.float64]) -> Stats:
 
 
 def _camera_statistics(episode: StagedEpisode) -> dict[str, Stats]:
-    return {image_key(camera): episode.image_stats(camera) for camera in CAMERAS} if episode.has_images else {}
+    return {image_key(camera): episode.image_stats(camera) for camera in episode.record.image_stats}
 
 
 def _image_statistics(episodes: Sequence[StagedEpisode]) -> dict[str, Stats]:
@@ -405,7 +407,7 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
 
     places: list[dict[str, Any]] = [{} for _ in episodes]
     limit = meta.video_files_size_in_mb * 1024**2
-    for camera in CAMERAS if meta.video_keys else ():
+    for camera in episodes[0].record.image_stats:
         key, chunk, file = image_key(camera), 0, 0
         videos = [(episode.video(camera), int(episode.info["frames"])) for episode in episodes]
         for group in _grouped([video.stat().st_size for video, _ in videos], limit):

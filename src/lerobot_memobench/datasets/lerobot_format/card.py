@@ -15,6 +15,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodeP
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.paper import raw_tables
+from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES
 
@@ -51,7 +52,7 @@ LIMITATIONS = """\
 - Frames of demonstration prompts show the information to remember, not the actions to take."""
 COLUMNS = {
     "observation.images.image": "third-person camera",
-    "observation.images.wrist_image": "wrist camera",
+    **{f"observation.images.{name}": "wrist camera" for name in ("wrist_image", "image2")},
     "observation.state": "end-effector position 3, axis-angle 3, gripper joints 2",
     "action": "OSC pose delta 6 (±1 is ±0.05 m, ±0.5 rad), gripper (−1 opens, +1 closes)",
     "observation.environment_state": "objects visible to the cameras, 16 slots: see `memobench objects`",
@@ -256,7 +257,13 @@ def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
+    convention = convention_of(features)
     return [
+        *(
+            [f"Images have `convention={convention}`; with `libero` they are mirrored left to right."]
+            if convention
+            else []
+        ),
         markdown(
             ["column", "type", "meaning"],
             [[f"`{key}`", _type(ft), COLUMNS[key]] for key, ft in features.items() if key in COLUMNS],

@@ -27,6 +27,7 @@ from lerobot_memobench.io import (
     refusing,
 )
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
+from lerobot_memobench.sim.convention import MIRRORED
 
 STAGING = ".staging"
 """Folder of an unfinished run within its destination."""
@@ -113,7 +114,9 @@ def check_clock(names: Collection[str], where: Path | str) -> None:
         )
 
 
-def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
+def dataset_features(
+    image_size: tuple[int, int] | None, cameras: Collection[str] = tuple(CAMERAS)
+) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns; ``image_size`` is (height, width), None without images."""
     from lerobot_memobench.sim.object_layout import SIZE
 
@@ -121,9 +124,10 @@ def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, 
         return {"dtype": dtype, "shape": shape, "names": names}
 
     features: dict[str, dict[str, Any]] = {}
+    stated = {} if {*cameras} == {*CAMERAS} else {"convention": MIRRORED}  # LeRobot merges equal descriptions alone
     if image_size is not None:
-        for camera in CAMERAS:
-            features[image_key(camera)] = feature("video", (*image_size, 3), ["height", "width", "channels"])
+        for camera in cameras:
+            features[image_key(camera)] = feature("video", (*image_size, 3), ["height", "width", "channels"]) | stated
     features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,))
     completed = [f"checkpoint_{k}" for k in range(MAX_CHECKPOINTS)]
     return features | {

@@ -87,7 +87,7 @@ class RemoteConfig(UntrainedConfig):
         keys: observations to send, ``theirs=ours,…`` with ours one of image, wrist_image, state, task or another
             observation of the environment; replaces the dialect's.
         image_size: side of sent images, padded to a square, pixels; 0: as rendered.
-        mirror: send images mirrored left to right, for checkpoints trained on LIBERO's images as openpi rotates them.
+        mirror: replaced by the environment's ``convention=libero``, and refused.
         gripper: meaning of the last number of an action, one of `GRIPPERS`.
         send_prompt: send the demonstration prompt; set to false to save time with a policy without memory.
         history_every: steps between sent frames of the prompt; default ``n_action_steps``, for ``vla_eval`` 1. A
@@ -118,6 +118,8 @@ class RemoteConfig(UntrainedConfig):
         super().__post_init__()
         if self.dialect not in DIALECTS:
             raise MemobenchError(f"policy.dialect is {self.dialect!r}, {nearest(self.dialect, DIALECTS)}")
+        if self.mirror:
+            raise MemobenchError("policy.mirror is now a setting of the environment: give convention=libero")
         if self.gripper not in GRIPPERS:
             raise MemobenchError(f"policy.gripper is {self.gripper!r}, {nearest(self.gripper, GRIPPERS)}")
         if self.n_action_steps is BY_DIALECT:

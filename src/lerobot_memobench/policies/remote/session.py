@@ -29,6 +29,7 @@ from lerobot_memobench.policies.remote.configuration_remote import (
 from lerobot_memobench.policies.remote.transports import ServerAway, Websocket
 from lerobot_memobench.policies.remote.vla_eval import VlaEval, episode_start, observation, png_map
 from lerobot_memobench.protocol import ACTION_DIM
+from lerobot_memobench.sim.convention import CONVENTIONS
 
 logger = logging.getLogger(__name__)
 
@@ -123,7 +124,7 @@ class Session:
     def _value(self, row: Row, name: str) -> Any:
         value = row.get(name)
         if isinstance(value, np.ndarray) and value.ndim == 3:
-            image = fit(value, self.config.side, self.config.mirror)
+            image = fit(value, self.config.side)
             return png_map(image) if self._speaks_vla_eval else image
         return value
 
@@ -227,7 +228,8 @@ class Row:
         """Return an observation by our name: an image (H, W, 3) uint8, a vector float32, or the instruction."""
         if name == TASK:
             return str(self.batch[TASK][self.number])
-        for key in (f"{OBS_IMAGES}.{name}", OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
+        pictures = [f"{OBS_IMAGES}.{names.get(name, name)}" for names in CONVENTIONS.values()]
+        for key in (*pictures, OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
             if key in self.batch:
                 value = self.batch[key][self.number]
                 return to_image(value) if OBS_IMAGES in key else value.float().cpu().reshape(-1).numpy()
@@ -245,13 +247,11 @@ def to_image(value: Tensor) -> NDArray[np.uint8]:
     return array
 
 
-def fit(image: NDArray[np.uint8], side: int | None, mirror: bool = False) -> NDArray[np.uint8]:
+def fit(image: NDArray[np.uint8], side: int | None) -> NDArray[np.uint8]:
     """Resize an image bilinearly to (side, side, 3), padded with black; unchanged if side is None.
 
     Equal to openpi-client's ``resize_with_pad``, pixel for pixel.
     """
-    if mirror:
-        image = np.ascontiguousarray(image[:, ::-1])
     height, width = image.shape[:2]
     if side is None or (height, width) == (side, side):
         return image
