@@ -30,10 +30,10 @@ ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
 REMOVED_FIELDS = {
-    *("align_weight", "feature_cache_dir", "full_chunk_when_stalled", "memory_frames", "min_lr_ratio", "open_gate"),
+    *("align_weight", "feature_cache_dir", "full_chunk_when_stalled", "min_lr_ratio", "open_gate"),
     *("shuffle_seed", "shuffle_subgoals", "tokens_per_frame"),
 }
-"""Fields of memobench_mem in checkpoints of earlier versions (`update_checkpoint`)."""
+"""Fields of memobench_mem that only checkpoints of earlier versions have (`update_checkpoint`)."""
 
 
 class Feature(TypedDict, total=False):
