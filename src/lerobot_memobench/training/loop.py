@@ -121,6 +121,11 @@ def begin(config: TrainPipelineConfig) -> Accelerator:
             f"found {accelerator.distributed_type}; each process of this training holds the whole policy: launch it "
             "with --multi_gpu"
         )
+    if accelerator.gradient_accumulation_steps != 1:
+        raise MemobenchError(
+            f"found gradient_accumulation_steps={accelerator.gradient_accumulation_steps} of accelerate; each batch is "
+            "an update: launch it without, and set batch_size="
+        )
     init_logging(accelerator=accelerator)
     if config.seed is not None:
         set_seed(config.seed, accelerator=accelerator)
