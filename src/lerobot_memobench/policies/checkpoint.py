@@ -30,10 +30,10 @@ ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
 REMOVED_FIELDS = {
-    *("align_weight", "feature_cache_dir", "full_chunk_when_stalled", "min_lr_ratio", "open_gate"),
+    *("align_weight", "feature_cache_dir", "full_chunk_when_stalled", "memory_frames", "min_lr_ratio", "open_gate"),
     *("shuffle_seed", "shuffle_subgoals", "tokens_per_frame"),
 }
-"""Fields of memobench_mem that only checkpoints of earlier versions have (`update_checkpoint`)."""
+"""Fields of memobench_mem in checkpoints of earlier versions (`update_checkpoint`)."""
 
 
 class Feature(TypedDict, total=False):
@@ -201,6 +201,18 @@ def check_checkpoint(path: str) -> None:
             if str(step.get("registry_name", "")).endswith("normalizer_processor"):
                 _check_statistics(folder, name, step)
     check_processors(path)
+
+
+def check_registered(path: str) -> None:
+    """Refuse a checkpoint folder of a policy type that no imported package registers."""
+    from lerobot.configs.policies import PreTrainedConfig
+
+    kind = checkpoint_type(path)
+    if kind is not None and kind not in PreTrainedConfig.get_known_choices():
+        raise MemobenchError(
+            f"the checkpoint {path} is of policy type '{kind}', which no installed package registers; install the "
+            "package that trained it"
+        )
 
 
 def check_processors(path: str | Path, revision: str | None = None) -> None:

@@ -102,8 +102,7 @@ def updated(saved: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     Raises:
         MemobenchError: this version cannot act as the checkpoint was trained.
     """
-    removed = {*REMOVED_FIELDS, "memory_frames"}  # LeRobot's main branch has a field of that name
-    policy = {name: value for name, value in saved.items() if name not in removed}
+    policy = {name: value for name, value in saved.items() if name not in REMOVED_FIELDS}
     if saved.get("shuffle_subgoals"):
         policy["align_targets"] = SHUFFLED
     memory = saved.get("memory") or ("none" if saved.get("memory_fusion") == "none" else "frames")

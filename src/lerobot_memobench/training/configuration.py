@@ -127,6 +127,18 @@ def changes(name: str, value: object, default: object) -> Iterator[tuple[str, ob
         yield name, value
 
 
+def with_features(policy: Any, features: dict[str, Any]) -> Any:
+    """Return a policy's configuration with a dataset's features, as LeRobot sets them; given inputs stay."""
+    unused = None if getattr(policy, "uses_pictures", True) else FeatureType.VISUAL
+    known = dataset_to_policy_features(features)
+    made = copy.copy(policy)
+    made.output_features = {key: one for key, one in known.items() if one.type is FeatureType.ACTION}
+    made.input_features = dict(policy.input_features or {}) or {
+        key: one for key, one in known.items() if one.type not in (FeatureType.ACTION, unused)
+    }
+    return made
+
+
 def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
     """Refuse evaluations on the benchmark during a training on other cameras or sizes.
 
@@ -135,11 +147,10 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
     """
     if config.policy is None or getattr(config.env, "type", None) != "memobench":
         return
-    unused = None if getattr(config.policy, "uses_pictures", True) else FeatureType.VISUAL
-    known = dataset_to_policy_features(features)
-    policy = copy.copy(config.policy)
-    policy.output_features = {key: one for key, one in known.items() if one.type is FeatureType.ACTION}
-    policy.input_features = policy.input_features or {
-        key: one for key, one in known.items() if one.type not in (FeatureType.ACTION, unused)
-    }
+    if config.policy.type == "xvla":
+        raise MemobenchError(
+            "LeRobot's trainer evaluates every XVLA with the processors of LIBERO; leave env out, and evaluate its "
+            "checkpoints with `lerobot eval env=memobench`"
+        )
+    policy = with_features(config.policy, features)
     check_features(f"that learns from {meta.root}", policy, env_to_policy_features(config.env), config.rename_map)

@@ -311,7 +311,7 @@ def make_loader(
 def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> DataLoader[Any]:
     """Return batches of the execution frames of held-out episodes.
 
-    There are at most ``max_eval_samples``, the first of each task.
+    There are at most ``max_eval_samples``, at equal distances in the episodes of each task.
     """
     dataset, lookup = training.held_out, training.lookup
     assert dataset is not None
@@ -322,7 +322,7 @@ def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> Dat
         for frame in frames:
             of_task.setdefault(tasks[frame if rows is None else rows[frame]], []).append(frame)
         most = max(1, config.max_eval_samples // len(of_task))
-        frames = [frame for task in sorted(of_task) for frame in of_task[task][:most]]
+        frames = [frame for task in sorted(of_task) for frame in of_task[task][:: -(-len(of_task[task]) // most)]]
     return make_loader(config, training, Subset(training.samples(dataset), frames))
 
 
