@@ -30,6 +30,7 @@ def test_processes_draw_different_noise_of_the_same_policy(
         noise, time = draw(objective, model, actions)
         weights = sum(parameter.sum().item() for parameter in model.parameters())
         drawn.append((noise.sum().item(), weights))
+        assert torch.get_float32_matmul_precision() != "medium", "dtype sets the precision, not the processor"
         return noise, time
 
     monkeypatch.setattr(modeling, "noise_and_time", noted)
