@@ -204,10 +204,11 @@ def check_checkpoint(path: str) -> None:
 
 
 def check_registered(path: str) -> None:
-    """Refuse a checkpoint folder of a policy type that no imported package registers."""
+    """Refuse a checkpoint, a folder or a repository, of a policy type that no imported package registers."""
     from lerobot.configs.policies import PreTrainedConfig
 
-    kind = checkpoint_type(path)
+    held = _file_of(path, CONFIG_FILE)
+    kind = None if held is None else read_json(held).get("type")
     if kind is not None and kind not in PreTrainedConfig.get_known_choices():
         raise MemobenchError(
             f"the checkpoint {path} is of policy type '{kind}', which no installed package registers; install the "

@@ -39,16 +39,9 @@ TRAIN_CONFIG = "train_config.json"
 TRAINING_STEP = Path("training_state") / "training_step.json"
 OF_OPTIMIZER = ("optimizer.", "policy.optimizer_")
 """Beginnings of settings that a saved optimizer overrides."""
-NOT_COMPARED = (
-    "dataset.root",
-    "dataset.repo_id",
-    "log_freq",
-    "num_workers",
-    "output_dir",
-    "resume",
-    "save_freq",
-    "steps",
-)
+NOT_COMPARED = {
+    *("dataset.root", "dataset.repo_id", "log_freq", "num_workers", "output_dir", "resume", "save_freq", "steps")
+}
 """Settings of a resumed training that other checks compare, or that change nothing that is learned."""
 OPTIMIZER_GROUPS = "optimizer_param_groups.json"
 """Written after an optimizer's state, which is nearly the last part of a checkpoint."""
