@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -14,7 +13,6 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.training.average import WeightAverage
-from lerobot_memobench.training.loop import quick_products
 
 MEMORY_FRAMES = 32
 """Frames of a full memory, the default of memory=frames."""
@@ -44,9 +42,8 @@ def updates(policy: MemobenchMemPolicy, batch: Mapping[str, torch.Tensor]) -> Ca
     average = WeightAverage(policy.trained_parameters(), policy.config.ema_decay)
 
     def update() -> None:
-        with nullcontext() if policy.config.uses_visual_encoder else quick_products():
-            loss, _ = policy.forward(dict(batch))
-            loss.backward()
+        loss, _ = policy.forward(dict(batch))
+        loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         optimizer.step()
         optimizer.zero_grad()

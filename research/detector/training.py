@@ -36,7 +36,7 @@ from lerobot_memobench.perception.geometry import projected
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
-from lerobot_memobench.training.loop import keep_freed_memory, quicker_in_bfloat16
+from lerobot_memobench.training.loop import keep_freed_memory
 from research.detector.data import Pictures
 from research.detector.labels import MASK, Rows, images_of
 
@@ -174,8 +174,7 @@ class _Trainer:
         """Make one update."""
         self.model.train()
         images = augmented(images_of(rows), _generator(self._settings, self.update))
-        with torch.autocast("cpu", torch.bfloat16, enabled=quicker_in_bfloat16()):
-            outputs = self.model(images)
+        outputs = self.model(images)
         losses, weighted = {}, []
         for reading, cells in CELLS.items():
             for name, value in loss(outputs[reading], targets(rows, len(self.model.detector.kinds), *cells)).items():
@@ -263,10 +262,8 @@ def train_last(
     for update in range(schedule.last_epoch, updates):
         rows = pictures.rows(_chosen(settings, settings.updates + update, len(pictures)))
         images = augmented(images_of(rows), _generator(settings, settings.updates + update))
-        with torch.autocast("cpu", torch.bfloat16, enabled=quicker_in_bfloat16()):
-            tokens, maps = detector.encoder.tokens_and_maps(images)
-            fine = detector.fpn(tokens, maps)
-        output = detector.read(fine.float(), maps)  # bfloat16 has errors of its own
+        tokens, maps = detector.encoder.tokens_and_maps(images)
+        output = detector.read(detector.fpn(tokens, maps), maps)
         wanted = targets(rows, len(detector.kinds), *CELLS["fine"])
         errors, wrong = uncertainty_loss(output, wanted), score_loss(output, wanted)
         optimizer.zero_grad()

@@ -369,6 +369,7 @@ def test_settings_that_differ_from_the_checkpoints_are_noted(
         (["resume=true", "output_dir=run", "align=semantic"], "align=none"),
         (["resume=true", "output_dir=run", "policy.optimizer_lr=1e-5"], "leave optimizer_lr out"),
         (["resume=true", "output_dir=run", "--policy.ema_decay=0"], "ema_decay=0.999"),
+        (["resume=true", "output_dir=run", "optimizer.lr=0.5"], "optimizer.lr=0.001"),
         (["resume=true", "output_dir=run", "dataset=mine"], "dataset a/b"),
         (["resume=true", "output_dir=run", "--dataset.repo_id=c/d"], "dataset a/b"),
         (["resume=true", "output_dir=run", "episodes=[0, 1]"], "dataset.episodes=None"),
@@ -462,6 +463,16 @@ def test_more_steps_are_noted_where_the_learning_rate_jumps(
     assert main(RESUME) == 0
     assert training.flags is None
     assert "steps=" in capsys.readouterr().err
+
+
+def test_changed_settings_of_a_resumed_training_are_noted(training: Called, capsys: pytest.CaptureFixture[str]) -> None:
+    training_run(Path("run"))
+    assert main([*RESUME, "batch_size=8", "seed=1000", "optimizer.lr=1e-3"]) == 0  # as before
+    assert "continues with" not in capsys.readouterr().err
+    assert main([*RESUME, "batch_size=3", "seed=7", "dataset.use_imagenet_stats=false"]) == 0
+    noted = " ".join(capsys.readouterr().err.split())
+    for changed in ("seed=7 instead of 1000", "batch_size=3 instead of 8", "use_imagenet_stats=false instead of True"):
+        assert changed in noted
 
 
 def test_a_training_is_resumed_on_its_dataset(training: Called, capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,6 +68,15 @@ def test_wrong_or_missing_package_fails(
     assert findings["lerobot"].status == "ok"
 
 
+@pytest.mark.parametrize(("version", "status"), [("0.6.1", "ok"), ("0.7.0", "warning"), ("0.8.0", "failed")])
+def test_untested_lerobot_is_named(installed: dict[str, str | None], version: str, status: str) -> None:
+    installed["lerobot"] = version
+    found = next(finding for finding in examination.package_versions() if finding.what == "lerobot")
+    assert (found.status, version in found.detail) == (status, True)
+    assert ("not tested" in found.detail) == (status == "warning")
+    assert f"\nlerobot=={examination.RUN_WITH} " in (Path(__file__).parents[2] / "requirements.lock").read_text()
+
+
 def test_overwritten_opencv_and_mujoco_are_warnings(installed: dict[str, str | None]) -> None:
     assert examination.opencv().status == "ok"
     installed["opencv-python"] = "5.0.0.93"

@@ -13,7 +13,7 @@ from torch.nn.functional import cosine_similarity, gelu, layer_norm, rms_norm, s
 
 from lerobot_memobench.policies.memobench_mem.memory import read_settings
 from lerobot_memobench.policies.memobench_mem.memory.bank import Bank
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories, MemorySpec, Query
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec, Query
 
 D, P, STRIDE, LENGTH, FRAMES = 8, 2, 24, 3, 12
 
@@ -98,24 +98,3 @@ def test_bank_equals_its_formula(count: int) -> None:
     assert state["count"].tolist() == [kept]
     if count == FRAMES:
         assert steps["perceptual"] != steps["cognitive"], "streams merge independently"
-
-
-def test_training_merges_with_exact_products(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rounded products would choose other entries than a rollout."""
-    bank, seen = made(), []
-    products: Any = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # torch sets it late
-    usual, write = products.fp32_precision, bank.write
-
-    def noted(*args: Any) -> Any:
-        seen.append(products.fp32_precision)
-        return write(*args)
-
-    monkeypatch.setattr(bank, "write", noted)
-    frames, query = torch.randn(5, P, D), Query(torch.randn(1, P, D))
-    products.fp32_precision = "bf16"
-    try:
-        bank.replay(Histories(frames, torch.arange(5) * STRIDE, torch.arange(5)[None]), query)
-        assert products.fp32_precision == "bf16"
-    finally:
-        products.fp32_precision = usual
-    assert seen == ["ieee"] * 5

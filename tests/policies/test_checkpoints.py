@@ -30,6 +30,7 @@ from lerobot_memobench.policies import checkpoint
 from lerobot_memobench.policies.checkpoint import (
     check_as_trained,
     check_checkpoint,
+    check_registered,
     check_weights,
     checkpoint_type,
     shipped_policies,
@@ -375,3 +376,11 @@ def test_a_policy_is_found_by_its_name(shipped: Path, tmp_path: Path, monkeypatc
 
 
 # -- the script that ships them ------------------------------------------------------------------------------------
+
+
+def test_liberos_xvla_and_unknown_types_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(MemobenchError, match="action_mode=auto"):
+        check_features(str(tmp_path), make_policy_config("xvla", device="cpu"), SHOWN, {})
+    (tmp_path / "config.json").write_text('{"type": "of_a_plugin"}')
+    with pytest.raises(MemobenchError, match="'of_a_plugin', which no installed package registers"):
+        check_registered(str(tmp_path))

@@ -12,6 +12,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_policy_config
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, read_episodes, write_episodes
@@ -20,7 +21,7 @@ from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_protocol, read_runs
 from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchRandomConfig
-from lerobot_memobench.policies.lerobot_config import acting
+from lerobot_memobench.policies.lerobot_config import acting, check_sizes
 from lerobot_memobench.run.shards import merge
 from lerobot_memobench.sim.object_layout import SIZE
 
@@ -90,3 +91,17 @@ def test_identity_follows_checkpoint_and_settings(checkpoints: list[Path]) -> No
     assert (found.inputs, found.counts(8), found.counts(9)) == ("nothing", True, False)
     unknown = UNKNOWN_POLICY
     assert (unknown.protocol, unknown.line, unknown.counts(3)) == ({}, {}, True)
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [
+        ({"chunk_size": 10**9}, "policy.chunk_size=1000000000; expected at most 100000"),
+        ({"dim_feedforward": 10**12}, "policy.dim_feedforward=1000000000000"),
+        ({"input_features": {"observation.state": PolicyFeature(FeatureType.STATE, (10**12,))}}, "shape.0="),
+    ],
+)
+def test_sizes_that_no_machine_holds_are_refused(setting: dict[str, Any], named: str) -> None:
+    check_sizes(make_policy_config("act", device="cpu"))
+    with pytest.raises(MemobenchError, match=named):
+        check_sizes(make_policy_config("act", device="cpu", **{"n_action_steps": 1} | setting))

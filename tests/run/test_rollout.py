@@ -15,6 +15,7 @@ import torch
 from lerobot.configs import FeatureType
 from lerobot.envs import make_env_pre_post_processors
 from lerobot.policies import make_pre_post_processors
+from lerobot.policies.factory import make_policy_config
 from lerobot.scripts import lerobot_eval
 from numpy.typing import NDArray
 
@@ -26,6 +27,7 @@ from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memory_reads import ReadLog, find_reads
+from lerobot_memobench.run import evaluate as evaluation
 from lerobot_memobench.run import rollout as rollouts
 from lerobot_memobench.run.rollout import (
     KNOWN,
@@ -378,3 +380,20 @@ def test_draws_depend_on_the_batch_alone() -> None:
     seeds = {batch_seed(7, task, first) for task in ("a", "b") for first in range(500)}
     assert len(seeds) == 1000
     assert all(0 <= seed < 2**32 for seed in seeds)
+
+
+def test_an_xvla_gets_the_environments_processors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot's function would give it the processors of LIBERO: a turned picture, no clock, six numbers of seven."""
+    loaded = SimpleNamespace(config=SimpleNamespace(device="cpu"))
+    monkeypatch.setattr(evaluation, "make_policy", lambda **_: SimpleNamespace(eval=lambda: loaded))
+    monkeypatch.setattr(evaluation, "make_pre_post_processors", lambda **_: (None, None))
+    environment = MemobenchEnvConfig()
+    plan: Any = SimpleNamespace(
+        policy=make_policy_config("xvla", device="cpu", action_mode="auto"),
+        environment=environment,
+        policy_path=None,
+        settings=SimpleNamespace(rename_map={}),
+    )
+    actor = evaluation.load_actor(plan)
+    for found, own in zip((actor.before[0], actor.after[1]), environment.get_env_processors(), strict=True):
+        assert [type(step) for step in found.steps] == [type(step) for step in own.steps]  # type: ignore[attr-defined]

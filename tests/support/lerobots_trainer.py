@@ -12,11 +12,12 @@ from lerobot_memobench.training import command
 
 
 def run_in_this_process(flags: Sequence[str]) -> int:
-    from lerobot.scripts import lerobot_train
+    from lerobot_memobench.training import samples
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["lerobot-train", *flags])
-        lerobot_train.main()
+        patch.setattr(samples.lerobot_train, "make_train_eval_datasets", samples.open_datasets)
+        samples.lerobot_train.main()
     return 0
 
 

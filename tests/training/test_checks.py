@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from lerobot.configs.default import DatasetConfig
+from lerobot.configs.default import DatasetConfig, EvalConfig, JobConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.training.configuration import check_settings
+from lerobot_memobench.training.configuration import READ, check_settings
 from lerobot_memobench.training.data import open_datasets
+from lerobot_memobench.training.loop import begin
 
 
 def config(**settings: Any) -> TrainPipelineConfig:
@@ -34,13 +35,17 @@ def test_too_small_numbers_are_refused(word: str, synthetic: Path, capsys: pytes
     [
         ({"dataset": DatasetConfig("a/b", streaming=True)}, "dataset.streaming"),
         ({"sample_weighting": SimpleNamespace()}, "sample_weighting"),
-        ({"job": SimpleNamespace(is_remote=True)}, "job.target"),
+        ({"job": JobConfig(target="a10g-small")}, "job.target=a10g-small has no effect"),
+        ({"reward_model": SimpleNamespace()}, "reward_model"),
+        ({"field_of_tomorrow": 3}, "field_of_tomorrow=3 has no effect"),
+        ({"eval": EvalConfig(recording=True)}, "eval.recording"),
         ({"eval_steps": 2}, "dataset.eval_split"),
         ({"rename_map": {"a": "b"}}, "rename_map"),
         ({"save_checkpoint_to_hub": True}, "policy.repo_id"),
         ({"use_policy_training_preset": False}, "optimizer.type"),
-        ({"parallelism": SimpleNamespace(is_sharded=True)}, "parallelism.dp_shard"),
-        ({"ema": SimpleNamespace(enable=True)}, "ema.enable"),
+        ({"parallelism": SimpleNamespace(is_sharded=True)}, "parallelism"),
+        ({"ema": SimpleNamespace(enable=True)}, "ema"),
+        ({"checkpoint_format": "dcp"}, "checkpoint_format"),
     ],
     ids=lambda part: next(iter(part)) if isinstance(part, dict) else part,
 )
@@ -51,6 +56,23 @@ def test_unsupported_settings_are_refused(changed: dict[str, Any], named: str) -
         setattr(asked, name, value)
     with pytest.raises(MemobenchError, match=named):
         check_settings(asked)
+
+
+def test_each_field_of_lerobots_configuration_is_read_or_refused() -> None:
+    """A field that a later LeRobot adds is refused until it is listed here or read."""
+    refused = {"job", "reward_model", "sample_weighting"}
+    main = {"accelerator", "checkpoint_format", "ema", "parallelism"}
+    assert READ | refused <= {field.name for field in fields(TrainPipelineConfig)} <= READ | refused | main
+
+
+def test_mixed_precision_and_accumulation_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = config()
+    asked.policy.use_amp = True  # type: ignore[union-attr]
+    with pytest.raises(MemobenchError, match="use_amp"):
+        check_settings(asked)
+    monkeypatch.setenv("ACCELERATE_GRADIENT_ACCUMULATION_STEPS", "4")
+    with pytest.raises(MemobenchError, match="gradient_accumulation_steps=4"):
+        begin(config())
 
 
 def test_image_transforms_are_refused_if_images_are_encoded_once() -> None:

@@ -22,7 +22,10 @@ from tests.training.conftest import hashes
 
 SEEN = {
     "objects": ("perception=objects", "size=tiny", "batch_size=50", "policy.chunk_size=4"),
-    "pixels": ("perception=pixels", "size=tiny", "batch_size=2", "num_workers=0", "policy.chunk_size=4"),
+    "pixels": (
+        *("perception=pixels", "size=tiny", "batch_size=2", "num_workers=0", "policy.chunk_size=4"),
+        "dataset.image_transforms.enable=true",
+    ),
 }
 DEFAULT = {("pixels", "frames"), ("objects", "bank"), ("objects", "subgoal")}
 CASES = [

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.sampler import compute_sampler_state
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.training.data import open_datasets, open_training
+from lerobot_memobench.training.loop import make_held_out_loader, make_sampler
 from lerobot_memobench.training.sampler import frame_sampler, grouped_order, weighted_order
+from tests.support.small_policy import small_config
 
 EPISODES, PHASE = np.array([0, 40, 63, 94]), np.ones(94, int)
 PHASE[40:48] = 0
@@ -75,3 +81,32 @@ def test_tasks_are_drawn_by_weight_and_not_by_length(weights: tuple[int, ...]) -
     first, second, third = np.array(weights) / sum(weights)
     assert shares == pytest.approx([third / 2, first / 2, second, third / 2, first / 2], abs=0.06)
     assert len(set(order[episodes == 0].tolist())) > 150, "frames of an episode are drawn at random"
+
+
+def test_held_out_samples_are_spread_over_the_episodes(objects: Path) -> None:
+    config = TrainPipelineConfig(
+        DatasetConfig("local/data", root=str(objects), eval_split=0.4),
+        policy=small_config(size="tiny", perception="objects"),
+        batch_size=4,
+        max_eval_samples=5,
+    )
+    training = open_training(config, open_datasets(config))
+    loader: Any = make_held_out_loader(config, training)
+    frames = loader.dataset.indices
+    episodes = [training.lookup.locate(frame)[0] for frame in frames]
+    held_out = training.held_out
+    assert held_out is not None
+    assert len(frames) <= 5
+    assert set(episodes) == set(held_out.episodes or [])
+    first, last = training.lookup.episodes[episodes[-1]], training.lookup.episodes[episodes[-1] + 1]
+    assert frames[-1] > (first + last) / 2
+
+
+def test_null_draws_frames_uniformly(objects: Path) -> None:
+    for given, drawn in (({}, False), (None, True)):
+        config = TrainPipelineConfig(
+            DatasetConfig("local/data", root=str(objects)),
+            policy=small_config(size="tiny", perception="objects", task_weights=given),
+        )
+        training = open_training(config, open_datasets(config))
+        assert (sorted(make_sampler(config, training)) == sorted(make_sampler(config, training).frames)) is drawn

@@ -110,3 +110,20 @@ def test_command_writes_a_view(pictured: Path, tmp_path: Path, capsys: pytest.Ca
     assert set(inputs(out)) == {STATE, SLOTS}
     for words in (["--out", str(out)], ["--out", str(tmp_path / "b"), "--obs-type", "some"]):
         assert memobench(["view", str(pictured), *words]) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["policy=vqbet"], "policy=vqbet cannot read"),
+        (["policy=xvla", "env=memobench"], "processors of LIBERO"),
+    ],
+)
+def test_inputs_that_a_policy_cannot_have_are_refused(
+    synthetic: Path, words: list[str], named: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    given = read_arguments("train", split_arguments([*words, "policy.device=cpu", f"dataset={synthetic}"]))
+    with pytest.raises(MemobenchError, match=named):
+        viewed(given, None, None, print)
+    assert not [*tmp_path.rglob("info.json")]

@@ -24,6 +24,8 @@ from lerobot_memobench.tasks.task import LIBERO
 
 DISTRIBUTION = "lerobot_policy_memobench"
 PLUGIN = "LeRobot plugin"
+RUN_WITH = "0.6.1"
+"""The version of LeRobot with which all tests of this version ran."""
 
 #: Packages checked against the requirements of this project and of LeRobot.
 SHOWN = ("lerobot", "torch", "transformers", "mujoco", "robosuite", "numpy", "gymnasium", "torchcodec", "av")
@@ -99,6 +101,9 @@ def package_versions() -> Iterator[Finding]:
             detail = "not installed" if found is None else f"{found}; supported is {wanted}"
             fix = INSTALL_ROBOSUITE if name == "robosuite" else f'pip install "{name}{wanted}"'
             yield Finding(name, "failed", detail, fix)
+        elif name == "lerobot" and found != RUN_WITH:
+            detail = f"{found}, with which this version was not tested; it was with {RUN_WITH}"
+            yield Finding(name, "warning", detail, f'pip install "lerobot=={RUN_WITH}" if a command fails')
         else:
             yield Finding(name, "ok", found + (f" (supported {wanted})" if str(wanted) else ""))
 

@@ -220,6 +220,19 @@ def check_checkpoint(path: str) -> None:
     check_processors(path)
 
 
+def check_registered(path: str) -> None:
+    """Refuse a checkpoint, a folder or a repository, of a policy type that no imported package registers."""
+    from lerobot.configs.policies import PreTrainedConfig
+
+    held = _file_of(path, CONFIG_FILE)
+    kind = None if held is None else read_json(held).get("type")
+    if kind is not None and kind not in PreTrainedConfig.get_known_choices():
+        raise MemobenchError(
+            f"the checkpoint {path} is of policy type '{kind}', which no installed package registers; install the "
+            "package that trained it"
+        )
+
+
 def check_processors(path: str | Path, revision: str | None = None) -> None:
     """Refuse processors that name other code than registered steps (`processor_steps`), without building them.
 

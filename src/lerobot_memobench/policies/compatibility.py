@@ -66,6 +66,12 @@ def check_features(
     Raises:
         MemobenchError: an input differs.
     """
+    if policy.type == "xvla" and policy.action_mode == "ee6d":
+        raise MemobenchError(
+            f"the policy {path} predicts absolute poses of two hands (action_mode=ee6d, as LIBERO's XVLA), and the "
+            "environment takes relative motions of one; train it with policy.action_mode=auto on a dataset of this "
+            "environment"
+        )
     if getattr(policy, "perception", None) == "any" or not policy.input_features:
         return
     trained = statistics_shapes(path)

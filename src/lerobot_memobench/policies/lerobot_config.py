@@ -15,6 +15,7 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import Acting
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 
 SEALED_LEDGER = "sealed_tests.jsonl"
@@ -30,6 +31,10 @@ ELSEWHERE = (
     *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
 )
 """Settings of where a policy runs or is published; its actions do not depend on them."""
+
+LONGEST, LARGEST = 100_000, 10_000_000
+"""Largest number of control steps or tokens of a policy, and largest other number of its configuration."""
+LENGTHS = ("chunk_size", "horizon", "memory_settings.frames", "n_action_steps", "n_obs_steps", "tokenizer_max_length")
 
 
 def overrides(key: str, flags: Sequence[str]) -> list[str]:
@@ -59,6 +64,23 @@ def encoded(policy: Any) -> dict[str, Any]:
     found = json.loads(json.dumps(draccus.encode(policy), default=str))
     assert isinstance(found, dict)
     return {**found, "type": policy.type}
+
+
+def check_sizes(policy: Any) -> None:
+    """Refuse a policy whose configuration has a length or a size that no machine can allocate."""
+    for name, value in _integers(encoded(policy)):
+        most = LONGEST if name in LENGTHS else None if name.startswith("scheduler_") or "seed" in name else LARGEST
+        if most is not None and value > most:
+            raise MemobenchError(f"found policy.{name}={value}; expected at most {most}")
+
+
+def _integers(value: Any, name: str = "") -> Iterator[tuple[str, int]]:
+    """Yield dotted name and value of the whole numbers in an encoded configuration."""
+    if isinstance(value, dict | list):
+        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _integers(one, f"{name}.{key}".lstrip("."))
+    elif isinstance(value, int):
+        yield name, value
 
 
 # --- identity ---

@@ -26,12 +26,13 @@ from draccus.utils import DecodingError, is_choice_type, is_enum, is_literal, is
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import (
     check_checkpoint,
+    check_registered,
     checkpoint_folder,
     checkpoint_type,
     looks_local,
     shipped_policies,
 )
-from lerobot_memobench.policies.lerobot_config import overrides, quiet
+from lerobot_memobench.policies.lerobot_config import check_sizes, overrides, quiet
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -215,8 +216,8 @@ def load_plugins(given: Arguments) -> None:
         if key.endswith(f".{CHOICE_KEYS[-1]}"):
             try:
                 parser.load_plugin(value)
-            except (parser.PluginLoadError, ImportError) as error:
-                raise MemobenchError(f"{key}={value} cannot be imported ({error})") from None
+            except Exception as error:  # a plug-in may raise anything
+                raise MemobenchError(f"{key}={value} cannot be imported as a package ({error})") from None
 
 
 @dataclass(frozen=True)
@@ -296,7 +297,10 @@ def policy_config(arguments: LerobotArguments) -> PreTrainedConfig | None:
     """
     if (path := arguments.get("policy.path")) is not None:
         check_checkpoint(path)
+        check_registered(path)
     found: PreTrainedConfig | None = arguments.configuration("policy")
+    if found is not None:
+        check_sizes(found)
     return found
 
 

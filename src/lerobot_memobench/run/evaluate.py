@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.envs import make_env_pre_post_processors
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.random_utils import set_seed
@@ -110,5 +109,5 @@ def load_actor(plan: EvaluationPlan) -> Actor:
             "rename_observations_processor": {"rename_map": renamed},
         },
     )
-    env_before, env_after = make_env_pre_post_processors(env_cfg=environment, policy_cfg=policy)
+    env_before, env_after = environment.get_env_processors()  # LeRobot's function would give any XVLA those of LIBERO
     return Actor(loaded, (env_before, before), (after, env_after))

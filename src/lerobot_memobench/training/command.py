@@ -111,8 +111,8 @@ def train(given: Arguments, line: Sequence[str], notify: Callable[[str], None]) 
 
 
 def run_lerobot(flags: Sequence[str]) -> int:
-    """Run LeRobot's trainer in a process of its own; return its exit status."""
-    command = [sys.executable, "-m", "lerobot.scripts.lerobot_train", *flags]
+    """Run LeRobot's trainer, with samples in memory, in a process of its own; return its exit status."""
+    command = [sys.executable, "-m", "lerobot_memobench.training.samples", *flags]
     return subprocess.run(command, check=False).returncode
 
 

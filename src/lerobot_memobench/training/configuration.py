@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import datetime as dt
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,17 @@ from lerobot_memobench.sim.convention import convention_of
 
 CHOICES = ["policy", "reward_model"]
 """Fields for which LeRobot's parser takes a ``path``."""
+
+READ = frozenset(
+    {
+        *("batch_size", "checkpoint_path", "cudnn_deterministic", "dataloader_multiprocessing_context", "dataset"),
+        *("env", "env_eval_freq", "eval", "eval_steps", "job_name", "log_freq", "max_eval_samples", "num_workers"),
+        *("optimizer", "output_dir", "peft", "persistent_workers", "policy", "prefetch_factor", "rename_map", "resume"),
+        *("save_checkpoint", "save_checkpoint_to_hub", "save_freq", "scheduler", "seed", "steps", "tolerance_s"),
+        *("use_policy_training_preset", "wandb"),
+    }
+)
+"""Fields of LeRobot's configuration that the loop of memory policies reads, itself or through LeRobot's functions."""
 
 
 def read_config(flags: Sequence[str]) -> TrainPipelineConfig:
@@ -77,20 +89,21 @@ def read_training(flags: Sequence[str]) -> TrainPipelineConfig:
 
 
 def check_settings(config: TrainPipelineConfig) -> None:
-    """Refuse settings of LeRobot's trainer that the loop of memory policies does not support."""
+    """Refuse settings of LeRobot's trainer that the loop of memory policies does not support, or does not read."""
     policy: Any = config.policy
+    unused = TrainPipelineConfig(config.dataset)
+    for name, value in vars(config).items():
+        for setting, found in () if name in READ else changes(name, value, getattr(unused, name, None)):
+            raise MemobenchError(f"{setting}={found} has no effect on policy={policy.type}; leave it out")
     encoded = config.dataset.image_transforms.enable and policy.encodes_ahead
     no_optimizer = config.optimizer is None and not config.use_policy_training_preset
     new_policy = not policy.pretrained_path and not config.resume
     repository = policy.repo_id
     refused = [
         (config.dataset.streaming, "dataset.streaming=true", "memory needs all frames of an episode"),
-        (config.sample_weighting is not None, "sample_weighting", "all samples have the same weight"),
-        (config.job.is_remote, "job.target", "the loop runs on this machine"),
+        (policy.use_amp, "policy.use_amp=true", "policy.dtype sets the precision"),
+        (config.eval.recording, "eval.recording=true", "rollouts of a training are not recorded"),
         (encoded, "dataset.image_transforms.enable=true", "images are encoded once, before training"),
-        # Of LeRobot's main branch.
-        (getattr(getattr(config, "parallelism", None), "is_sharded", False), "parallelism.dp_shard", "no shards"),
-        (getattr(getattr(config, "ema", None), "enable", False), "ema.enable=true", "see policy.ema_decay"),
     ]
     for present, setting, why in refused:
         if present:
@@ -107,6 +120,27 @@ def check_settings(config: TrainPipelineConfig) -> None:
             raise MemobenchError(f"{setting} needs {needed}; give it, or leave {setting.rstrip('=')} out")
 
 
+def changes(name: str, value: object, default: object) -> Iterator[tuple[str, object]]:
+    """Yield name and value of the settings of a field that differ from its default."""
+    if is_dataclass(value) and is_dataclass(default):
+        for one in fields(value):
+            yield from changes(f"{name}.{one.name}", getattr(value, one.name), getattr(default, one.name, None))
+    elif value != default:
+        yield name, value
+
+
+def with_features(policy: Any, features: dict[str, Any]) -> Any:
+    """Return a policy's configuration with a dataset's features, as LeRobot sets them; given inputs stay."""
+    unused = None if getattr(policy, "uses_pictures", True) else FeatureType.VISUAL
+    known = dataset_to_policy_features(features)
+    made = copy.copy(policy)
+    made.output_features = {key: one for key, one in known.items() if one.type is FeatureType.ACTION}
+    made.input_features = dict(policy.input_features or {}) or {
+        key: one for key, one in known.items() if one.type not in (FeatureType.ACTION, unused)
+    }
+    return made
+
+
 def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
     """Refuse evaluations on the benchmark during a training on other cameras, sizes or conventions of pictures.
 
@@ -118,11 +152,10 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
     env: Any = config.env
     if (stated := convention_of(features)) not in (None, env.convention) and env.obs_type != OBJECTS:
         raise MemobenchError(f"{meta.root} has pictures of convention={stated}; set env.convention={stated}")
-    unused = None if getattr(config.policy, "uses_pictures", True) else FeatureType.VISUAL
-    known = dataset_to_policy_features(features)
-    policy = copy.copy(config.policy)
-    policy.output_features = {key: one for key, one in known.items() if one.type is FeatureType.ACTION}
-    policy.input_features = policy.input_features or {
-        key: one for key, one in known.items() if one.type not in (FeatureType.ACTION, unused)
-    }
+    if config.policy.type == "xvla":
+        raise MemobenchError(
+            "LeRobot's trainer evaluates every XVLA with the processors of LIBERO; leave env out, and evaluate its "
+            "checkpoints with `lerobot eval env=memobench`"
+        )
+    policy = with_features(config.policy, features)
     check_features(f"that learns from {meta.root}", policy, env_to_policy_features(config.env), config.rename_map)

@@ -50,6 +50,7 @@ from lerobot_memobench.policies.memobench_mem.subgoals import require_known, sub
 from lerobot_memobench.policies.memobench_mem.targets import with_targets
 from lerobot_memobench.protocol import OBS_PHASE, PROMPT
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
+from lerobot_memobench.training.sampler import seed_of
 
 logger = logging.getLogger(__name__)
 
@@ -67,6 +68,7 @@ class Training:
         policy: possibly with adapters. processors: pre- and postprocessor.
         dataset: the episodes to train on. held_out: the held-out episodes, or None.
         lookup: all frames of the dataset.
+        seed: of augmentations.
     """
 
     policy: Any
@@ -74,12 +76,13 @@ class Training:
     dataset: LeRobotDataset
     held_out: LeRobotDataset | None
     lookup: FrameLookup
+    seed: int = 0
 
     def samples(self, dataset: LeRobotDataset | None = None) -> Dataset[dict[str, Any]]:
         """Return the samples of a part of the dataset by their global indices; None: of the episodes to train on."""
         dataset = dataset or self.dataset
         if not self.lookup.columns:
-            return DecodedSamples(dataset)
+            return DecodedSamples(dataset, self.seed)
         return RecordedSamples(self.lookup, dataset.meta.tasks.index.tolist(), self.policy.config.action_delta_indices)
 
 
@@ -100,7 +103,7 @@ def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, L
         policy = policy.wrap_with_peft(peft_cli_overrides=asdict(config.peft))
     lookup = open_lookup(Path(dataset.meta.root), policy_config, policy.perception, config.rename_map)
     processors = make_processors(config, dataset.meta, lookup)
-    return Training(policy, processors, dataset, held_out, lookup)
+    return Training(policy, processors, dataset, held_out, lookup, config.seed or 0)
 
 
 # -- datasets ----------------------------------------------------------------------------------------------------------
@@ -262,13 +265,19 @@ class RecordedSamples(Dataset[dict[str, Any]]):
 
 
 class DecodedSamples(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their global indices, pictures included."""
+    """LeRobot's samples by their global indices, pictures included.
 
-    def __init__(self, dataset: LeRobotDataset) -> None:
-        self._dataset, self._row = dataset, dataset.absolute_to_relative_idx
+    With the number of a draw (`FrameSampler.numbered`) an augmentation depends on it and the seed alone.
+    """
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        found: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
+    def __init__(self, dataset: LeRobotDataset, seed: int) -> None:
+        self._dataset, self._seed, self._row = dataset, seed, dataset.absolute_to_relative_idx
+
+    def __getitem__(self, drawn: int | tuple[int, int]) -> dict[str, Any]:
+        index, number = drawn if isinstance(drawn, tuple) else (drawn, 0)
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(seed_of(self._seed, number, 0, 0))
+            found: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
         return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 from collections.abc import Iterator, Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +47,19 @@ class TrainingLog:
         }
         if torch.cuda.is_available():
             meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f", reduction="max")
+        processes = {"accelerator": accelerator, "dp_world_size": accelerator.num_processes}  # LeRobot 0.6, its main
+        known = signature(MetricsTracker).parameters
         self.numbers = MetricsTracker(
-            config.batch_size, dataset.num_frames, dataset.num_episodes, meters, step, accelerator=accelerator
+            config.batch_size,
+            dataset.num_frames,
+            dataset.num_episodes,
+            meters,
+            step,
+            **{name: value for name, value in processes.items() if name in known},
         )
         self._wandb = None
-        if self._first and config.wandb.enable and config.wandb.project:
+        wandb = getattr(config, "wandb", None)
+        if self._first and wandb is not None and wandb.enable and wandb.project:
             from lerobot.common.wandb_utils import WandBLogger
 
             self._wandb = WandBLogger(config)

@@ -22,19 +22,16 @@ from accelerate.utils import DistributedDataParallelKwargs, DistributedType
 from lerobot.common.train_utils import (
     get_step_checkpoint_dir,
     get_step_identifier,
-    load_training_batch_size,
-    load_training_num_processes,
-    load_training_state,
     push_checkpoint_to_hub,
-    save_checkpoint,
     should_save_checkpoint,
     update_last_checkpoint,
 )
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
+from lerobot.envs import close_envs, make_env
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from lerobot.utils.collate import lerobot_collate_fn
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import cycle, init_logging
 from torch.utils.data import DataLoader, Subset
@@ -44,7 +41,8 @@ from lerobot_memobench.training.average import WeightAverage, begin_average
 from lerobot_memobench.training.configuration import check_environment
 from lerobot_memobench.training.data import Training, open_datasets, open_training
 from lerobot_memobench.training.log import TrainingLog
-from lerobot_memobench.training.sampler import FrameSampler, frame_sampler, task_weights
+from lerobot_memobench.training.sampler import FrameSampler, frame_sampler, seed_of, task_weights
+from lerobot_memobench.training.state import load_state, save_state
 
 logger = logging.getLogger(__name__)
 
@@ -68,9 +66,10 @@ def train(config: TrainPipelineConfig) -> None:
     optimizer, scheduler = make_optimizer_and_scheduler(config, training.policy)
     sampler, step = make_sampler(config, training), 0
     if config.resume:
-        step, optimizer, scheduler = load_training_state(config.checkpoint_path, optimizer, scheduler)
-        processes = load_training_num_processes(config.checkpoint_path) or accelerator.num_processes
-        sampler.go_on(step, load_training_batch_size(config.checkpoint_path) or config.batch_size, processes)
+        assert config.checkpoint_path is not None
+        progress = load_state(config.checkpoint_path, optimizer, scheduler)
+        step, batch_size = progress["step"], progress.get("batch_size") or config.batch_size
+        sampler.go_on(step, batch_size, progress.get("num_processes") or accelerator.num_processes)
 
     loader = make_loader(config, training, training.samples(), sampler=sampler)
     held_out_loader = None if training.held_out is None else make_held_out_loader(config, training)
@@ -80,7 +79,10 @@ def train(config: TrainPipelineConfig) -> None:
     run = Run(config, accelerator, training, model, average, optimizer, scheduler)
     log, batches = TrainingLog(config, training.dataset, accelerator, step), cycle(loader)
     model.train()
+    seed = torch.initial_seed() if config.seed is None else config.seed
     while step < config.steps:
+        # Processes draw different noise, and a resumed training draws what an uninterrupted one does.
+        set_seed(seed_of(seed, accelerator.process_index, step))
         begun = time.perf_counter()
         batch = run.preprocessed(next(batches))
         log.numbers.dataloading_s = time.perf_counter() - begun
@@ -99,10 +101,10 @@ def train(config: TrainPipelineConfig) -> None:
                 log.write_evaluation(step, run.evaluate(step))
             accelerator.wait_for_everyone()
     log.close()
+    accelerator.wait_for_everyone()
+    accelerator.end_training()  # LeRobot's main branch would wait for the others of the group in an upload
     if accelerator.is_main_process and policy_config.push_to_hub:
         run.push()
-    accelerator.wait_for_everyone()
-    accelerator.end_training()
 
 
 def begin(config: TrainPipelineConfig) -> Accelerator:
@@ -118,6 +120,11 @@ def begin(config: TrainPipelineConfig) -> Accelerator:
         raise MemobenchError(
             f"found {accelerator.distributed_type}; each process of this training holds the whole policy: launch it "
             "with --multi_gpu"
+        )
+    if accelerator.gradient_accumulation_steps != 1:
+        raise MemobenchError(
+            f"found gradient_accumulation_steps={accelerator.gradient_accumulation_steps} of accelerate; each batch is "
+            "an update: launch it without, and set batch_size="
         )
     init_logging(accelerator=accelerator)
     if config.seed is not None:
@@ -159,11 +166,9 @@ class Run:
     def update(self, batch: dict[str, Any]) -> dict[str, Any]:
         """Train on a batch; return the numbers to log."""
         begun = time.perf_counter()
-        on_cpu = self.accelerator.device.type == "cpu" and not self.training.policy.config.uses_visual_encoder
-        with quick_products() if on_cpu else nullcontext():
-            with self.accelerator.autocast():
-                loss, logged = self.model(batch)
-            self.accelerator.backward(loss)
+        with self.accelerator.autocast():
+            loss, logged = self.model(batch)
+        self.accelerator.backward(loss)
         assert self.config.optimizer is not None
         most = self.config.optimizer.grad_clip_norm
         norm = self.accelerator.clip_grad_norm_(self.model.parameters(), most if most > 0 else float("inf"))
@@ -207,20 +212,18 @@ class Run:
         assert config.policy is not None
         logger.info("Checkpoint policy after step %d", step)
         folder: Path = get_step_checkpoint_dir(config.output_dir, config.steps, step)
+        pretrained = folder / PRETRAINED_MODEL_DIR
         if self.average is not None:  # before LeRobot's files, so that a checkpoint that looks whole has it
-            self.average.save(folder / "pretrained_model")
+            self.average.save(pretrained)
         with self._averaged():
-            save_checkpoint(
-                folder,
-                step,
-                config,
-                self.accelerator.unwrap_model(self.model),
-                self.optimizer,
-                self.scheduler,
-                *self.training.processors,
-                num_processes=self.accelerator.num_processes,
-                batch_size=config.batch_size,
-            )
+            self.accelerator.unwrap_model(self.model).save_pretrained(pretrained)
+        config.save_pretrained(pretrained)
+        if self.training.policy.config.use_peft:  # PEFT saves adapters alone
+            self.training.policy.config.save_pretrained(pretrained)
+        for processor in self.training.processors:
+            processor.save_pretrained(pretrained)
+        progress = {"step": step, "batch_size": config.batch_size, "num_processes": self.accelerator.num_processes}
+        save_state(folder, progress, self.optimizer, self.scheduler)
         update_last_checkpoint(folder)
         if config.save_checkpoint_to_hub:
             push_checkpoint_to_hub(folder, config.policy.repo_id, private=config.policy.private)
@@ -232,7 +235,7 @@ class Run:
         assert config.output_dir is not None
         assert config.env is not None
         environments = make_env(config.env, n_envs=config.eval.batch_size, use_async_envs=config.eval.use_async_envs)
-        before, after = make_env_pre_post_processors(env_cfg=config.env, policy_cfg=config.policy)
+        before, after = config.env.get_env_processors()
         try:
             with self._averaged(acting=True), torch.no_grad(), self.accelerator.autocast():
                 found: Mapping[str, Any] = eval_policy_all(
@@ -277,7 +280,8 @@ def make_sampler(config: TrainPipelineConfig, training: Training) -> FrameSample
         dataset.episodes,
         together=policy.frames_per_episode,
         tasks=tasks,
-        seed=0 if config.seed is None else config.seed,
+        seed=training.seed,
+        numbered=config.dataset.image_transforms.enable and not lookup.columns,
     )
 
 
@@ -307,7 +311,7 @@ def make_loader(
 def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> DataLoader[Any]:
     """Return batches of the execution frames of held-out episodes.
 
-    There are at most ``max_eval_samples``, the first of each task.
+    There are at most ``max_eval_samples``, at equal distances in the episodes of each task.
     """
     dataset, lookup = training.held_out, training.lookup
     assert dataset is not None
@@ -318,45 +322,11 @@ def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> Dat
         for frame in frames:
             of_task.setdefault(tasks[frame if rows is None else rows[frame]], []).append(frame)
         most = max(1, config.max_eval_samples // len(of_task))
-        frames = [frame for task in sorted(of_task) for frame in of_task[task][:most]]
+        frames = [frame for task in sorted(of_task) for frame in of_task[task][:: -(-len(of_task[task]) // most)]]
     return make_loader(config, training, Subset(training.samples(dataset), frames))
 
 
-# -- speed on a CPU ----------------------------------------------------------------------------------------------------
-
-
-def quicker_in_bfloat16() -> bool:
-    """Return whether this CPU has instructions that make products in bfloat16 faster; False if torch does not know it.
-
-    The answer depends on the instructions and not on a measurement, so that a machine always learns the same. With
-    ``avx512_bf16`` an AMD EPYC made twice as many products per second as in float32; an Intel Xeon without AMX, which
-    also has ``avx512_fp16``, made no more.
-    """
-    # LeRobot supports torch 2.7, which has no such function.
-    known: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()
-    return known.get("amx_bf16", False) or (known.get("avx512_bf16", False) and not known.get("avx512_fp16", False))
-
-
-@contextmanager
-def quick_products() -> Iterator[None]:
-    """Inside the block, round the factors of products to bfloat16, if that is faster on this CPU.
-
-    Weights, gradients, sums and everything but products stay float32. The fused attention kernel, whose many small
-    products suffer, is disabled; code that asks for it (`layers.attend`) computes exact products.
-    """
-    if not quicker_in_bfloat16():
-        yield
-        return
-    before = torch.get_float32_matmul_precision(), torch.backends.cuda.flash_sdp_enabled()  # of the CPU's kernel, too
-    # Not the setting of mkldnn alone, which this setting would contradict: the compiler refuses that.
-    torch.set_float32_matmul_precision("medium")
-    torch.backends.cuda.enable_flash_sdp(False)
-    try:
-        yield
-    finally:
-        precision, fused = before
-        torch.set_float32_matmul_precision(precision)
-        torch.backends.cuda.enable_flash_sdp(fused)
+# -- memory on a CPU ---------------------------------------------------------------------------------------------------
 
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # of glibc's malloc.h

@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import shlex
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -35,6 +37,12 @@ from lerobot_memobench.run.arguments import (
 TRAIN_CONFIG = "train_config.json"
 """LeRobot's file of a training's configuration, in each checkpoint."""
 TRAINING_STEP = Path("training_state") / "training_step.json"
+OF_OPTIMIZER = ("optimizer.", "policy.optimizer_")
+"""Beginnings of settings that a saved optimizer overrides."""
+NOT_COMPARED = {
+    *("dataset.root", "dataset.repo_id", "log_freq", "num_workers", "output_dir", "resume", "save_freq", "steps")
+}
+"""Settings of a resumed training that other checks compare, or that change nothing that is learned."""
 OPTIMIZER_GROUPS = "optimizer_param_groups.json"
 """Written after an optimizer's state, which is nearly the last part of a checkpoint."""
 
@@ -135,6 +143,13 @@ def check_same_training(arguments: LerobotArguments) -> None:
         return
     check_processors(checkpoint)
     _check_same_dataset(arguments, checkpoint)
+    for name, value, held in changed_settings(arguments, checkpoint):
+        if name.startswith(OF_OPTIMIZER):
+            raise MemobenchError(
+                f"this training was begun with {name}={held}, which its saved optimizer keeps; found {value}; leave "
+                f"{name.removeprefix('policy.')} out, or train a new run from the checkpoint: policy={checkpoint} "
+                "output_dir=<new folder>"
+            )
     given = overrides("policy", arguments.for_parser)
     if not given:
         return
@@ -194,7 +209,30 @@ def note_on_resume(arguments: LerobotArguments) -> tuple[str | None, bool]:
             f"the training in {checkpoint.parents[2]} has finished its {done} steps; for more, set steps=",
             False,
         )
-    return note_on_schedule(checkpoint, steps), True
+    changed = [
+        f"{name}={value} instead of {held}"
+        for name, value, held in changed_settings(arguments, checkpoint)
+        if not name.startswith("policy.")  # see `check_as_begun`
+    ]
+    note = f"note: this training continues with {', '.join(changed)}" if changed else None
+    return "\n".join(filter(None, (note, note_on_schedule(checkpoint, steps)))) or None, True
+
+
+def changed_settings(arguments: LerobotArguments, checkpoint: Path) -> Iterator[tuple[str, str, object]]:
+    """Yield name, text and earlier value of settings that differ from the run's, but for its folders and length."""
+    begun = read_json(checkpoint / TRAIN_CONFIG)
+    for name, text in arguments.values.items():
+        section, _, last = name.rpartition(".")
+        held: Any = begun
+        for part in filter(None, section.split(".")):
+            held = held.get(part) if isinstance(held, dict) else None
+        if text is None or name in NOT_COMPARED or not isinstance(held, dict) or last not in held:
+            continue
+        value = held[last]
+        with suppress(ValueError, TypeError, yaml.YAMLError):
+            if yaml.safe_load(text) == value or float(text) == float(value):
+                continue
+        yield name, text, value
 
 
 def note_on_schedule(checkpoint: Path, steps: int | None) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ class FrameSampler:
         tasks: (E,) number of each episode's task, with ``weights``; None: each frame is drawn once per epoch.
         weights: (T,) weight of each task. An epoch has as many frames as without weights.
         epoch, offset: start of the next iteration.
+        numbered: whether it yields pairs of a frame and its number among all draws.
     """
 
     starts: np.ndarray
@@ -41,6 +43,7 @@ class FrameSampler:
     seed: int = 0
     epoch: int = 0
     offset: int = 0
+    numbered: bool = False
 
     def __post_init__(self) -> None:
         drawn = self.starts < self.ends
@@ -53,15 +56,15 @@ class FrameSampler:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __iter__(self) -> Iterator[int]:
-        order = self.order(self.epoch)[self.offset :]
+    def __iter__(self) -> Iterator[Any]:
+        order, first = self.order(self.epoch)[self.offset :], self.epoch * len(self) + self.offset
         self.epoch, self.offset = self.epoch + 1, 0
-        return iter(self.frames[order.numpy()].tolist())
+        frames = self.frames[order.numpy()].tolist()
+        return zip(frames, itertools.count(first)) if self.numbered else iter(frames)
 
     def order(self, epoch: int) -> Tensor:
         """Return an epoch's order of the entries of ``frames``."""
-        seed = np.random.SeedSequence([self.seed, epoch]).generate_state(1, dtype=np.uint64)[0]
-        generator = torch.Generator().manual_seed(int(seed))
+        generator = torch.Generator().manual_seed(seed_of(self.seed, epoch, dtype=np.uint64))
         ends = np.cumsum(self.ends - self.starts)
         if self.tasks is not None and self.weights is not None:
             return weighted_order(ends, self.tasks, self.weights, self.together, generator)
@@ -74,6 +77,11 @@ class FrameSampler:
         per_epoch = math.ceil(math.ceil(len(self) / batch_size) / processes)  # accelerate pads the last batches
         self.epoch, batches = divmod(step, per_epoch)
         self.offset = min(batches * batch_size * processes, len(self))
+
+
+def seed_of(*numbers: int, dtype: type[np.uint32 | np.uint64] = np.uint32) -> int:
+    """Return a seed that depends on all the numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1, dtype)[0])
 
 
 def grouped_order(ends: np.ndarray, together: int, generator: torch.Generator) -> Tensor:
@@ -132,18 +140,19 @@ def frame_sampler(
     together: int = 1,
     tasks: tuple[np.ndarray, np.ndarray] | None = None,
     seed: int = 0,
+    numbered: bool = False,
 ) -> FrameSampler:
     """Return the sampler of a dataset's execution frames.
 
     Args:
         episodes: (E + 1,) first frame of each episode, and N. phase: (N,) 0 in the prompt.
         used: the episodes to draw; None: all.
-        tasks: result of `task_weights`.
+        tasks: result of `task_weights`. numbered: as of `FrameSampler`.
     """
     chosen = np.arange(len(episodes) - 1) if used is None else np.array(sorted(used), dtype=np.int64)
     starts = execution_starts(episodes, phase)[chosen]
     numbers, weights = (None, None) if tasks is None else (tasks[0][chosen], tasks[1])
-    return FrameSampler(starts, episodes[1:][chosen], together, numbers, weights, seed)
+    return FrameSampler(starts, episodes[1:][chosen], together, numbers, weights, seed, numbered=numbered)
 
 
 def task_weights(

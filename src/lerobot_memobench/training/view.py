@@ -43,7 +43,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, write_file
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import LerobotArguments
-from lerobot_memobench.training.configuration import check_environment, read_config
+from lerobot_memobench.training.configuration import check_environment, read_config, with_features
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
@@ -114,7 +114,9 @@ def viewed(
     check_episodes(given.episodes, meta)
     choice = choice_for(policy, meta.features, prompt_frames, obs_type)
     kept = choice.columns(meta.features)
-    check_environment(config, meta, {new: meta.features[name] for name, new in kept.items()})
+    features = {new: meta.features[name] for name, new in kept.items()}
+    check_environment(config, meta, features)
+    check_inputs(policy, meta, features)
     if given.streaming and not (Path(meta.root) / "data").is_dir():
         if needs_view(meta.features, choice):
             raise MemobenchError(
@@ -142,6 +144,18 @@ def viewed(
         write_view(root, folder, choice)
     notify(f"LeRobot's trainer reads {folder}: {described(choice)}")
     return completed.changed("dataset.root", folder).changed("dataset.repo_id", given.repo_id)
+
+
+def check_inputs(policy: Any, meta: Any, features: dict[str, Any]) -> None:
+    """Refuse inputs that a policy cannot have, such as two cameras of VQ-BeT; LeRobot does after opening the data."""
+    made = with_features(policy, features)
+    try:
+        made.validate_features()
+    except ValueError as error:
+        raise MemobenchError(
+            f"policy={policy.type} cannot read {', '.join(made.input_features)} of {meta.root}: {error} Choose its "
+            "inputs by policy.input_features"
+        ) from None
 
 
 def choice_for(policy: Any, features: Mapping[str, Any], prompt_frames: bool | None, obs_type: str | None) -> Choice:

@@ -173,7 +173,7 @@ MAY_DIFFER = frozenset(
 """Fields that may have another value than in training when a checkpoint acts or its training is resumed. All others
 are refused then. LeRobot sets ``output_features`` from the environment; `policies.compatibility` checks them."""
 PI05_ALONE = _names(
-    "use_visual_memory use_proprioceptive_memory memory_temporal_attention_every rtc_training_max_delay"
+    "use_visual_memory use_proprioceptive_memory memory_frames memory_temporal_attention_every rtc_training_max_delay"
 )
 """Fields that LeRobot's main branch adds to pi0.5: visual memory, and training for real-time chunking. They are not
 saved, so that both versions of LeRobot load a checkpoint."""
@@ -321,10 +321,10 @@ class MemobenchMemConfig(PI05Config):
     frames_per_episode: int = FROM_SIZE
     """Frames per episode in a batch; they share memory. ``batch_size`` counts frames. None: 6 if training decodes no
     video, else 1, as in LeRobot."""
-    task_weights: dict[str, float] | None = None
+    task_weights: dict[str, float] | None = field(default_factory=dict)
     """Draw tasks in proportion to these weights, independent of the length of their episodes. A key is a task's name, a
     memory type or ``prompted`` (tasks with a demonstration prompt); the first match counts, and other tasks weigh 1.
-    None: ``{}``, all tasks alike, if training decodes no video; else all frames alike."""
+    None: all frames alike, which is the default if training decodes video; ``{}``, the default, else: all tasks."""
     warmup_fraction: float = 0.05
     """Share of the updates in which the learning rate rises. It then stays constant, or falls as a cosine to 0.02 of
     its maximum at ``size=small``."""
@@ -377,6 +377,8 @@ class MemobenchMemConfig(PI05Config):
         for name, value in defaults.items():
             if getattr(self, name) in (None, {}):
                 setattr(self, name, value)
+        if not self.task_weights and not self.decodes_no_video:
+            self.task_weights = None
         self._choose("objective", OBJECTIVES)
         # A checkpoint without oracle memory holds the shorter prompt length, which would cut the memory text off.
         if self.tokenizer_max_length == self.dimensions.tokenizer_max_length:
@@ -401,7 +403,6 @@ class MemobenchMemConfig(PI05Config):
             "optimizer_lr": dims.learning_rate,
             "memory_stride": MEMORY_STRIDE if self.decodes_no_video else 1,
             "frames_per_episode": FRAMES_PER_EPISODE if self.decodes_no_video else 1,
-            "task_weights": {} if self.decodes_no_video else None,
             "tokenizer_name": dims.tokenizer,
             "tokenizer_max_length": dims.tokenizer_max_length + room,
             "text_encoder": dims.text_encoder,

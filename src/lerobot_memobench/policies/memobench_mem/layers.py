@@ -5,8 +5,6 @@ They equal LeRobot's up to rounding and are faster. Shapes: B rows, N queries, M
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -16,26 +14,6 @@ from torch import Tensor
 EPS = 1e-6
 FEW_KEYS = 64
 """Up to this number of keys, attention with stored scores trains faster on a CPU than torch's fused kernel."""
-
-
-@contextmanager
-def exact_products() -> Iterator[None]:
-    """Compute matrix products in float32 inside an update that rounds them (`quick_products` of `training`).
-
-    A memory that compares vectors then makes the same choices as in a rollout; and small products are faster so.
-    """
-    products: Any = getattr(torch.backends.mkldnn, "matmul", None)  # torch >= 2.9
-    if products is None or products.fp32_precision != "bf16":
-        yield
-        return
-    fused = torch.backends.cuda.flash_sdp_enabled()
-    products.fp32_precision = "ieee"
-    torch.backends.cuda.enable_flash_sdp(True)
-    try:
-        yield
-    finally:
-        products.fp32_precision = "bf16"
-        torch.backends.cuda.enable_flash_sdp(fused)
 
 
 class _Normed(torch.autograd.Function):
@@ -118,8 +96,7 @@ def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, found: list[
     many = torch.is_grad_enabled() and key.shape[1] > FEW_KEYS
     if found is None and (query.is_cuda or many):
         mask = bias.expand(-1, count * heads, -1)[:, None]
-        with nullcontext() if torch.compiler.is_compiling() else exact_products():
-            read = F.scaled_dot_product_attention(flat[:, None], key[:, None], value[:, None], mask)
+        read = F.scaled_dot_product_attention(flat[:, None], key[:, None], value[:, None], mask)
         return read.view(rows, count, heads * width)
     scores = torch.baddbmm(bias, flat, key.transpose(1, 2), alpha=scale)
     weights = scores.softmax(dim=-1, dtype=torch.float32)

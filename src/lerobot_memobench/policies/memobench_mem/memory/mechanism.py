@@ -19,8 +19,6 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.layers import exact_products
-
 MEMORY_GRID = 4
 """A remembered picture is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
 OBJECT_TOKENS = 2
@@ -254,7 +252,7 @@ class MemoryMechanism(nn.Module, ABC):
         """Return the states of B samples, each after the last frame of its history."""
         count = (histories.places >= 0).sum(dim=1)
         begin = (count - self.gradient_frames).clamp(min=0)
-        with torch.no_grad(), exact_products():
+        with torch.no_grad():
             state = self._before(histories, begin, query)
         if not self.gradient_frames:
             return state

@@ -1,0 +1,76 @@
+"""Samples of LeRobot's trainer in main memory: for policies without pictures, equal to LeRobot's."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_policy_config
+from lerobot.scripts import lerobot_train
+from torch.utils.data import DataLoader
+
+from lerobot_memobench.training import command, samples
+from lerobot_memobench.training.samples import keep_in_memory, open_datasets
+
+STATE, SLOTS = "observation.state", "observation.environment_state"
+FEATURES = {STATE: PolicyFeature(FeatureType.STATE, (8,)), SLOTS: PolicyFeature(FeatureType.ENV, (208,))}
+DELTAS = {STATE: [-0.2, -0.05, 0.0], SLOTS: [-0.2, -0.05, 0.0], "action": [0.0, 0.05, 0.1]}
+
+
+@pytest.mark.parametrize("episodes", [None, [1, 2]])
+def test_samples_equal_lerobots(objects: Path, episodes: list[int] | None) -> None:
+    """Rows at the bounds of episodes, whose histories and chunks are padded."""
+    theirs, ours = (
+        LeRobotDataset("local/data", root=objects, episodes=episodes, delta_timestamps=DELTAS) for _ in range(2)
+    )
+    keep_in_memory(ours)
+    rows = [0, 1, 4, 22, 23, 24, len(theirs) - 1]
+    for row, found in zip(rows, ours.__getitems__(rows), strict=True):
+        for one in (found, ours[row]):
+            expected = theirs[row]
+            assert one.keys() == expected.keys()
+            for name, value in expected.items():
+                same = torch.equal(one[name], value) if isinstance(value, torch.Tensor) else one[name] == value
+                assert same, (row, name)
+
+
+def opened(root: Path, features: dict[str, PolicyFeature] | None = None) -> tuple[TrainPipelineConfig, Any]:
+    policy = make_policy_config("act", device="cpu", push_to_hub=False, input_features=features)
+    config = TrainPipelineConfig(DatasetConfig("local/data", root=str(root)), policy=policy, num_workers=4)
+    return config, open_datasets(config)[0]
+
+
+def test_policies_without_pictures_train_from_memory(objects: Path, pictured: Path) -> None:
+    for root, features in ((objects, None), (pictured, FEATURES)):
+        config, dataset = opened(root, features)
+        del dataset.reader.hf_dataset  # not read any more
+        batch = next(iter(DataLoader(dataset, batch_size=5)))
+        assert (len(batch["action"]), config.num_workers) == (5, 0)
+        assert not [name for name in batch if name.startswith("observation.images")]
+    config, dataset = opened(pictured)
+    assert config.num_workers == 4
+    assert "observation.images.image" in dataset[3]
+
+
+def test_lerobots_trainer_opens_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[list[str]] = []
+
+    def run(words: list[str], **_: Any) -> SimpleNamespace:
+        called.append(words)
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert command.run_lerobot(["--steps=1"]) == 0
+    assert called[0][1:] == ["-m", samples.__name__, "--steps=1"]
+    monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", None)
+    monkeypatch.setattr(lerobot_train, "main", lambda: None)
+    samples.main()
+    assert lerobot_train.make_train_eval_datasets is open_datasets
