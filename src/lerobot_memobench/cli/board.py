@@ -14,9 +14,6 @@ from lerobot_memobench.cli.console import say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
 
-BOARD = Path("results/board")
-"""The board's folder in a checkout."""
-
 
 class ExportFormat(StrEnum):
     """Formats of other boards."""
@@ -62,7 +59,7 @@ def submit(
     """
     from lerobot_memobench.board.check import check_partners, check_submission, read_board
     from lerobot_memobench.board.rows import board_row
-    from lerobot_memobench.board.submission import LINKS, About, RowName, read_submission, write_submission
+    from lerobot_memobench.board.submission import BOARD, LINKS, About, RowName, read_submission, write_submission
     from lerobot_memobench.board.text import pull_request
     from lerobot_memobench.io import checked
 
