@@ -17,6 +17,8 @@ from lerobot_memobench.evaluation.tables import NOT_APPLICABLE
 BOARD = Path(__file__).resolve().parents[1] / "results" / "board"
 PLACE = "<!-- board -->"
 """Line of the page that the table replaces."""
+TABLE = "board-table"
+"""Id of the table; the page's heading has the id ``board``."""
 HEAD = (
     *("policy", "rank", *METRICS, "follows evidence", "change by pauses", "without memory, SR", "suite", "assets"),
     *("inputs", "parameters", "training data", "episodes of each task", "run by us"),
@@ -38,7 +40,7 @@ def table() -> str:
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in HEAD)
     body = "\n".join([*lines, *_waiting()])
     whole = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>"
-    return f'<div class="board">\n<table id="board">\n{whole}\n</table>\n</div>'
+    return f'<div class="board">\n<table id="{TABLE}">\n{whole}\n</table>\n</div>'
 
 
 def _line(rank: int | None, row: BoardRow) -> str:

@@ -22,7 +22,9 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.run.card import with_episodes, write_card
 from lerobot_memobench.run.sealed import scenes_hash
+from research.kept import keep, restore
 from tests.support.board import (
     ABOUT,
     FILES,
@@ -297,6 +299,39 @@ def test_submission_of_a_new_user_is_accepted(
     assert "also changes 'src/" in capsys.readouterr().err
     assert main([*words[:3], "other", *words[4:]]) == 2  # a copy of the row that is there now
     assert "has the episodes of the row 'mine'" in capsys.readouterr().err
+
+
+def test_part_of_the_tasks_is_checked_and_not_submitted(
+    evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = Path(shutil.copytree(evaluated, "part"))
+    lines = [json.loads(each) for each in (part / "episodes.jsonl").read_text().splitlines()]
+    some = [each for each in lines if each["task"] in TASKS[:3] and each["episode"] < 3]
+    (part / "episodes.jsonl").write_text("".join(json.dumps(each) + "\n" for each in some))
+    card = json.loads((part / CARD).read_text())
+    card["protocol"].update(tasks=sorted(TASKS[:3]), episodes=3)
+    card["task_files"] = {name: card["task_files"][name] for name in TASKS[:3]}
+    write_card(part, with_episodes({**card, "episodes": []}, some))
+    assert main(["submit", "part", "--check"]) == 0
+    assert "accepted: 9 rollouts of part; nothing is written" in capsys.readouterr().out
+    assert [each.name for each in tmp_path.iterdir()] == ["part"]
+    assert main(["submit", "part"]) == 2
+    assert "needs --name, --model, --submitter, --training-data; to check" in capsys.readouterr().err
+    words = ["--name", "mine", "--model", "Mine", "--submitter", "@me", "--training-data", "none"]
+    assert main(["submit", "part", *words]) == 2
+    assert "has 3 episodes of 3 of 30 tasks; expected 10 to 50 episodes of each" in capsys.readouterr().err
+    write_card(part, with_episodes({**card, "episodes": []}, some[1:]))
+    assert main(["submit", "part", "--check"]) == 2
+    assert "card and log disagree" in capsys.readouterr().err
+
+
+def test_restored_evaluation_is_submitted(evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    keep(evaluated.parent, [evaluated.name], Path("kept"))
+    restore(Path("kept"), Path("restored"))
+    words = ["--name", "mine", "--model", "Mine", "--submitter", "@me", "--training-data", "none"]
+    assert main(["submit", f"restored/{evaluated.name}", *words, "--out", "out"]) == 0
 
 
 def test_submission_replaces_an_earlier_one_only(with_controls: Path, evaluated: Path, tmp_path: Path) -> None:

@@ -140,20 +140,23 @@ def check_author(author: str, name: str | None, board: Path, present: Path) -> N
             )
 
 
-def check_submission(submission: Submission, others: Sequence[Submission] = ()) -> None:
+def check_submission(submission: Submission, others: Sequence[Submission] = (), *, part: bool = False) -> None:
     """Check a submission by all rules.
 
     Args:
         others: rows that are on the board already.
+        part: whether any tasks of the suite, and any number of their episodes, will do.
 
     Raises:
         MemobenchError: naming the first rule that it breaks.
     """
     run = submission.evaluation
     _check_protocol(run)
-    _check_evaluation(run, task_names(suite=run.protocol["suite"]))
+    names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
+    least = 1 if part else FEWEST
+    _check_evaluation(run, names, least)
     for name, control in submission.controls.items():
-        _check_control(run, control, name)
+        _check_control(run, control, name, names, least)
     for other in others:
         _check_original(submission, other)
     _check_scenes([run for each in (*others, submission) for run in (each.evaluation, *each.controls.values())])
@@ -188,7 +191,7 @@ def _check_protocol(run: Evaluation, **control: Any) -> None:
         raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
 
 
-def _check_control(run: Evaluation, control: Evaluation, name: str) -> None:
+def _check_control(run: Evaluation, control: Evaluation, name: str, names: Sequence[str], least: int) -> None:
     """Check that an evaluation is of the same policy under one control."""
     _check_protocol(control, **CONTROL_SETTING[name])
     for key in ("type", "sha256", "settings"):
@@ -197,18 +200,17 @@ def _check_control(run: Evaluation, control: Evaluation, name: str) -> None:
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
     if found := differences(run.protocol, control.protocol, ignore=CONTROL_SETTING[name]):
         raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
-    names = task_names(suite=run.protocol["suite"])
     if name == EVIDENCE:
         names = [task for task in names if get_task(task).num_variants > 1]
-    _check_evaluation(control, names)
+    _check_evaluation(control, names, least)
 
 
 # --- the log against card, catalogue and seeds ---
 
 
-def _check_evaluation(run: Evaluation, names: Sequence[str]) -> None:
+def _check_evaluation(run: Evaluation, names: Sequence[str], fewest: int) -> None:
+    _check_extent(run, names, fewest)
     _check_versions(run, names)
-    _check_extent(run, names)
     _check_inputs(run)
     _check_policy(run)
     for record in run.records:
@@ -243,13 +245,13 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
             )
 
 
-def _check_extent(run: Evaluation, names: Sequence[str]) -> None:
+def _check_extent(run: Evaluation, names: Sequence[str], least: int) -> None:
     """Check that the log holds each episode of each task once, from the first seed of a split on."""
     protocol, seed = run.protocol, run.card[POLICY].get("seed")
     count, base = protocol["episodes"], protocol["seed_base"]
-    least, most = FEWEST, MOST
+    most = MOST
     if protocol["evidence"]:  # whole scenes
-        least, most = max(len(get_task(name).random_variants) for name in names), 12 * MOST
+        least, most = max((len(get_task(name).random_variants) for name in names), default=1), 12 * MOST
     if base not in list(SEEDS) or seed != base:
         raise MemobenchError(
             f"{run.place}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
@@ -257,8 +259,8 @@ def _check_extent(run: Evaluation, names: Sequence[str]) -> None:
         )
     if not least <= count <= most or sorted(protocol["tasks"]) != sorted(names):
         raise MemobenchError(
-            f"{run.place}: the protocol has {count} episodes of {len(protocol['tasks'])} tasks; expected {least} to "
-            f"{most} of each of the {len(names)} tasks of the suite"
+            f"{run.place}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
+            f"{len(names)} tasks; expected {least} to {most} episodes of each"
         )
     asked = set(itertools.product(names, range(count)))
     there = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
