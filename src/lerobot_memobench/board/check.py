@@ -407,7 +407,11 @@ def _check_scenes(runs: Sequence[Evaluation]) -> None:
     scenes: dict[Any, str] = {}
     seeds: dict[Any, int] = {}
     for run in runs:
-        simulator = run.card["runs"][-1]["versions"].get("mujoco"), run.protocol.get(HASH_VERSION, 1), run.protocol["world"]
+        simulator = (
+            run.card["runs"][-1]["versions"].get("mujoco"),
+            run.protocol.get(HASH_VERSION, 1),
+            run.protocol["world"],
+        )
         for record in run.records:
             kind = (*simulator, *record.get("stand_ins", ()), record["task"])
             scene, seed = str(record.get("scene_hash")), record["seed"]
