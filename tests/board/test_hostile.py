@@ -203,6 +203,14 @@ STRICT: dict[str, tuple[Change, str]] = {
         in_card(lambda card: card["settings"].update(env={"expert_action": True})),
         "inputs are 'pixels'",
     ),
+    "features without a form": (
+        both(
+            in_card(lambda card: card["policy"]["settings"].update(input_features=[7])),
+            in_card(lambda card: card["settings"].update(env="expert_action")),
+            inputs("pixels", obs_type="environment_state_agent_pos"),
+        ),
+        "inputs are 'pixels'",
+    ),
     "another checkpoint": (in_card(lambda card: card["policy"].update(sha256="3" * 64)), "the policy's sha256"),
     "another file of weights": (
         in_card(lambda card: card["checkpoint"].update(files={**FILES, "model.safetensors": "4" * 64})),
@@ -212,6 +220,10 @@ STRICT: dict[str, tuple[Change, str]] = {
     "versions of other years": (
         in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "lerobot": "0.1.0"})),
         "the card names lerobot 0.1.0",
+    ),
+    "a version without a form": (
+        in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "mujoco": "not 3"})),
+        "the card names mujoco not 3",
     ),
     # seeds
     "seeds named as sealed": (both(relabelled, commit()), "begins after"),
@@ -318,5 +330,5 @@ def test_a_pull_request_changes_one_row_of_its_author(
     for paths in (["one/a", "two/a"], ["one/a", "reruns.json"], ["one/a", "../../src/x.py"], ["one/a", "x"]):
         with pytest.raises(MemobenchError, match="the pull request also changes"):
             check_paths(f"results/board/{path}" for path in paths)
-    with pytest.raises(MemobenchError, match=r"changes reruns.json of no row"):
+    with pytest.raises(MemobenchError, match=r"changes reruns.json of the maintainers"):
         check_author("one", check_paths(["results/board/reruns.json"]), board, board)

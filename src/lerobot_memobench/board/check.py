@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from packaging.requirements import Requirement
+from packaging.version import InvalidVersion
 
 from lerobot_memobench.board.submission import EVIDENCE, PAUSES, RERUNS, Evaluation, Submission, read_submission
 from lerobot_memobench.datasets.generation import task_hash
@@ -120,24 +121,24 @@ def check_paths(changed: Iterable[str], board: str = "results/board") -> str | N
     return rows[0] if rows else None
 
 
-def check_author(author: str, name: str | None, board: Path, present: Path) -> None:
+def check_author(author: str, name: str | None, *boards: Path) -> None:
     """Check that a pull request of somebody other than a maintainer changes a row of its author.
 
     Args:
         author: account on GitHub.
         name: the row that it changes, see `check_paths`.
-        board: the board with the change. present: the board without it.
+        boards: the board with the change and without it.
 
     Raises:
-        MemobenchError: the row, with or without the change, names another submitter, or it changes no row.
+        MemobenchError: the row names another submitter, or it changes no row.
     """
-    folders = [] if name is None else [place / name for place in (board, present) if (place / name).exists()]
-    for submitter in [read_submission(folder).about.submitter for folder in folders] or ["no row"]:
-        if submitter.lower() != f"@{author}".lower():
-            raise MemobenchError(
-                f"the pull request of @{author[:40]} changes {name or RERUNS} of {submitter}; expected a row whose "
-                f"submitter is @{author[:40]}; results of others, and {RERUNS}, are entered by the maintainers"
-            )
+    rows = [read_submission(board / name) for board in boards if name and (board / name).exists()]
+    submitters = {row.about.submitter.lower() for row in rows} or {"the maintainers"}
+    if others := submitters - {f"@{author}".lower()}:
+        raise MemobenchError(
+            f"the pull request changes {name or RERUNS} of {min(others)}; expected a row whose submitter is its "
+            f"author, @{author[:40]}: the maintainers enter results of others and {RERUNS}"
+        )
 
 
 def check_submission(submission: Submission, others: Sequence[Submission] = (), *, part: bool = False) -> None:
@@ -232,7 +233,11 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
                 "again with one version"
             )
         for version in map(str, versions):
-            if package in REQUIRED and version not in REQUIRED[package]:
+            try:
+                fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
+            except InvalidVersion:
+                fits = False
+            if not fits:
                 raise MemobenchError(
                     f"{run.place}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
                 )
@@ -316,7 +321,7 @@ def _contradictions(protocol: Mapping[str, Any], record: Mapping[str, Any], task
     for goal, (first, ordered) in zip((each.goal for each in task.checkpoints), marks, strict=True):
         if goal == task.goal and first != (steps if success else None):
             yield f"has the goal at step {first}, success={success} and {steps} steps; the goal ends a rollout"
-        if success and first is None and _implies(task.goal, goal):
+        if success and first is None and _conjuncts(goal, And) <= _conjuncts(task.goal, And | Then):
             yield f"is a success without the checkpoint {format_formula(goal)}, which is part of its goal"
         # A checkpoint counts in order at the first step at which it holds with all earlier ones complete.
         at_once = first is not None and before is not None and first >= before
@@ -344,13 +349,8 @@ def _contradictions(protocol: Mapping[str, Any], record: Mapping[str, Any], task
         yield f"has prompt_shown={record.get('prompt_shown')}; its prompt was {'' if shown else 'not '}part of it"
 
 
-def _implies(goal: Formula, part: Formula) -> bool:
-    """Return whether a part has held when the goal holds; False if undecided."""
-    parts = _conjuncts(part, And)
-    return parts <= _conjuncts(goal, And) or (len(parts) == 1 and parts <= _conjuncts(goal, And | Then))
-
-
 def _conjuncts(formula: Formula, kinds: Any) -> set[Formula]:
+    """Return the parts of a conjunction, and with `Then` those of a sequence: each has held when the whole holds."""
     if not isinstance(formula, kinds):
         return {formula}
     return {each for child in children(formula) for each in _conjuncts(child, kinds)}
@@ -373,13 +373,13 @@ def _check_inputs(run: Evaluation) -> None:
     policy, obs_type = run.card[POLICY], run.protocol["obs_type"]
     kind, settings = str(policy.get("type")), policy.get("settings", {})
     claimed = {*str(run.protocol[INPUTS]).split(", ")}
-    features = settings.get("input_features") or {}
-    types = {str(each.get("type")) for each in features.values() if isinstance(each, dict)} & {"VISUAL", "ENV"}
+    features = [*_block(settings.get("input_features")).values()]
+    types = {str(_block(each).get("type")) for each in features} & {"VISUAL", "ENV"}
     drawn = {PIXEL_INPUT, DETECTIONS} if obs_type != OBJECTS and types != {"ENV"} else set()
     objects = {PRIVILEGED} if obs_type != PIXELS and types != {"VISUAL"} else set()
     reads = settings.get("perception", OBJECTS_READ if kind in READ_OBJECTS else None) == OBJECTS_READ
     needed = objects if reads and "ENV" in types and settings.get("detector") is None else set()
-    asked = run.card.get("settings", {}).get("env", {})
+    asked = _block(run.card.get("settings", {}).get("env"))
     if kind in SCRIPTS or asked.get("expert_action") or asked.get("blind_action"):
         needed = {SIMULATOR}
     if claimed - drawn - objects - {SIMULATOR, NO_INPUT} or needed - claimed:
@@ -387,6 +387,10 @@ def _check_inputs(run: Evaluation) -> None:
             f"{run.place}: inputs are {run.protocol[INPUTS]!r} on the card with obs_type={obs_type} and the policy "
             f"{kind} of {' and '.join(sorted(types)) or 'unknown'} features; expected {needed or drawn | objects}"
         )
+
+
+def _block(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
 
 
 def _check_policy(run: Evaluation) -> None:

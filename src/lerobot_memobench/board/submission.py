@@ -7,8 +7,6 @@ is read, and no part is executed.
 
 from __future__ import annotations
 
-import codecs
-import contextlib
 import datetime as dt
 import gzip
 import hashlib
@@ -193,23 +191,16 @@ def _read_evaluation(folder: Path, folders: Sequence[str] = ()) -> Evaluation:
     _check_entries(folder, folders)
     card = read_evaluation(folder / CARD, whole=True)
     content = _unpacked(folder / LOG)
-    for file, text in ((CARD, (folder / CARD).read_bytes()), *((LOG, line) for line in content.splitlines())):
-        _check_keys(folder / file, text)
+    json.loads((folder / CARD).read_bytes(), object_pairs_hook=_once)
     return Evaluation(folder, card, list(_records(folder / LOG, content)), hashlib.sha256(content).hexdigest())
 
 
-def _check_keys(file: Path, text: bytes) -> None:
-    """Refuse JSON with a key twice: readers differ in the value that counts. Other faults are reported elsewhere."""
-
-    twice: list[dict[str, Any]] = []
-
-    def read(pairs: list[tuple[str, Any]]) -> None:
-        twice.extend([dict(pairs)] if len(dict(pairs)) < len(pairs) else [])
-
-    with contextlib.suppress(ValueError, RecursionError):
-        json.loads(text.removeprefix(codecs.BOM_UTF8), object_pairs_hook=read)
-    if twice:
-        raise MemobenchError(f"{file} has a key twice in {str(twice[0])[:80]}; submit it unchanged")
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object; raise for a key given twice, because readers differ in the value that counts."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise MemobenchError(f"card or log has a key twice in {str(found)[:80]}; submit them unchanged")
+    return found
 
 
 def _check_entries(folder: Path, folders: Sequence[str]) -> None:
@@ -255,6 +246,7 @@ def _records(file: Path, content: bytes) -> Iterator[Mapping[str, Any]]:
     for number, line in enumerate(content.splitlines(), start=1):
         try:
             record = checked(parsed(line), EpisodeRecord)
+            json.loads(line, object_pairs_hook=_once)
         except Malformed as error:
             raise MemobenchError(f"{file}, line {number}: {error}; `memobench submit` writes it") from None
         if key_of(record) in known:

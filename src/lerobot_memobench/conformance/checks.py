@@ -193,9 +193,10 @@ def remembers_every_step(found: Behaviour) -> str:
     try:
         return _remembers_between_plans(found)
     except Refuted as refusal:
-        for steps in INTERVALS:
-            with found.subject.planning_every(steps) as fits, contextlib.suppress(Refuted, NotAsked):
-                if fits:
+        config = found.subject.policy.config
+        for steps in INTERVALS if hasattr(config, "n_action_steps") else ():
+            if steps <= getattr(config, "chunk_size", steps):
+                with found.subject.planning_every(steps), contextlib.suppress(Refuted, NotAsked):
                     return _remembers_between_plans(Behaviour(found.subject))
         raise refusal
 

@@ -65,18 +65,14 @@ class Subject:
         return reads_prompt(self.policy.config)
 
     @contextmanager
-    def planning_every(self, steps: int) -> Iterator[bool]:
-        """Let it plan at another interval; yield False where its configuration has none of this length."""
-        config = self.policy.config
-        now = getattr(config, "n_action_steps", steps)
-        fits = steps != now and steps <= getattr(config, "chunk_size", steps)
-        if fits:
-            config.n_action_steps = steps
+    def planning_every(self, steps: int) -> Iterator[None]:
+        """Let it plan at another interval, in control steps."""
+        config, usual = self.policy.config, self.policy.config.n_action_steps
         try:
-            yield fits
+            config.n_action_steps = steps
+            yield
         finally:
-            if fits:
-                config.n_action_steps = now
+            config.n_action_steps = usual
 
     def roll(self, streams: Sequence[Stream], *, equal_noise: bool = True, sparing: bool = False) -> Actions:
         """Reset the policy and let it act on streams, one row each, until the longest ends.
