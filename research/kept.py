@@ -19,6 +19,7 @@ from lerobot_memobench.envs.episode_log import MERGED_FILE, read_log
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import draft_of, write_file
+from lerobot_memobench.run.card import with_episodes, write_card
 
 ROLLOUTS, EVALUATIONS = "rollouts.parquet", "evaluations.parquet"
 NAME, FIELDS, CARD, COMMAND = "evaluation", "fields", "card", "command"
@@ -80,9 +81,9 @@ def restore(kept: Path, root: Path, names: Sequence[str] | None = None) -> list[
     for name in wanted:
         if name not in evaluations:
             raise MemobenchError(f"{kept} holds no evaluation {name!r}; {nearest(name, evaluations)}")
-    lines: dict[str, list[str]] = {}
+    lines: dict[str, Rows] = {}
     for row in _read(kept / ROLLOUTS, wanted):
-        lines.setdefault(row[NAME], []).append(json.dumps(_line(row, evaluations[row[NAME]][FIELDS])) + "\n")
+        lines.setdefault(row[NAME], []).append(_line(row, evaluations[row[NAME]][FIELDS]))
     for name in wanted:
         row, folder = evaluations[name], root / name
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -90,8 +91,11 @@ def restore(kept: Path, root: Path, names: Sequence[str] | None = None) -> list[
             write_file(root / f"{name}.json", row[COMMAND])
         if name in lines:
             folder.mkdir(exist_ok=True)
-            write_file(folder / MERGED_FILE, "".join(lines[name]))
-        if row[CARD] is not None:
+            write_file(folder / MERGED_FILE, "".join(json.dumps(line) + "\n" for line in lines[name]))
+        card = json.loads(row[CARD] or "{}")
+        if "runs" in card:  # it was whole: its episodes are the log's
+            write_card(folder, with_episodes({**card, "episodes": []}, lines.get(name, [])))
+        elif card:
             write_file(folder / EVALUATION_FILE, row[CARD])
     return wanted
 

@@ -1,4 +1,4 @@
-"""The board's table for the site: HTML of the rows in ``results/board`` and of rows that wait for a result.
+"""The board's table for the site: HTML of the rows in ``results/board``.
 
 `scripts/docs_reference.py` puts it into ``docs/benchmark/board.md``. ``docs/javascripts/board.js`` makes it sortable.
 """
@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
@@ -17,13 +17,12 @@ from lerobot_memobench.evaluation.tables import NOT_APPLICABLE
 BOARD = Path(__file__).resolve().parents[1] / "results" / "board"
 PLACE = "<!-- board -->"
 """Line of the page that the table replaces."""
+TABLE = "board-table"
+"""Id of the table; the page's heading has the id ``board``."""
 HEAD = (
     *("policy", "rank", *METRICS, "follows evidence", "change by pauses", "without memory, SR", "suite", "assets"),
     *("inputs", "parameters", "training data", "episodes of each task", "run by us"),
 )
-WAITING = ("ACT", "Diffusion Policy", "SmolVLA", "π0.5")
-"""Policies with a recipe on the page and without a result."""
-
 UNRANKED = 1000
 """Value by which rows without a rank are sorted."""
 
@@ -36,9 +35,9 @@ def table() -> str:
     ranks = itertools.count(1)
     lines = [_line(next(ranks) if row.ranked else None, row) for row in board_rows(BOARD)]
     head = "".join(f'<th scope="col">{escape(name)}</th>' for name in HEAD)
-    body = "\n".join([*lines, *_waiting()])
+    body = "\n".join(lines)
     whole = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody>"
-    return f'<div class="board">\n<table id="board">\n{whole}\n</table>\n</div>'
+    return f'<div class="board">\n<table id="{TABLE}">\n{whole}\n</table>\n</div>'
 
 
 def _line(rank: int | None, row: BoardRow) -> str:
@@ -65,15 +64,6 @@ def _line(rank: int | None, row: BoardRow) -> str:
 
 def _rate(rate: Rate | None) -> Cell:
     return rate_text(rate), -1 if rate is None or rate.value is None else rate.value
-
-
-def _waiting() -> Iterator[str]:
-    """Yield grey rows of policies that wait for a result."""
-    for name in WAITING:
-        policy = f'{name}<br><small><a href="#recipes">recipe</a></small>'
-        known = {"suite": "strict", "assets": "package", "inputs": "pixels", "run by us": "not run"}
-        cells = [(text := known.get(title, NOT_APPLICABLE), text if title in known else -2) for title in HEAD[2:]]
-        yield _html([(policy, name.lower()), (NOT_APPLICABLE, UNRANKED), *cells], "unverified")
 
 
 def _html(cells: Iterable[Cell], kind: str) -> str:

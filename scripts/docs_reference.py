@@ -451,7 +451,7 @@ def needs(suite: str) -> dict[str, dict[str, tuple[str, str]]]:
 VERDICTS = {
     "no": "no: the current image determines each action",
     "order": "no: the goal also accepts another order, in which the current image determines each action",
-    "yes": "yes: no policy that uses only the current images was found to succeed",
+    "yes": "yes: no policy that uses only the current images was found to succeed in every scene",
 }
 WITHOUT = {
     "published": "*Without a memory* is the best rate that was found for a policy that decides from pictures alone "

@@ -1,6 +1,6 @@
 // Make the board's table sortable: a button in each heading. Without JavaScript the table is complete and in order.
 document.addEventListener("DOMContentLoaded", () => {
-  const table = document.getElementById("board");
+  const table = document.getElementById("board-table");
   if (!table) return;
   const body = table.tBodies[0];
   const heads = [...table.tHead.rows[0].cells];

@@ -6,6 +6,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from lerobot_memobench.tasks.task import STRICT
 from research.drawing import pyplot, save
 from research.memory_study.grid import Grid
 from research.memory_study.tables import figures_of_rows
@@ -53,7 +54,8 @@ def _draw_suite(axis: Any, suite: str, found: dict[str, dict[str, Any]]) -> None
         axis.text(1, place, f"{mean(found[row]['solved']):.0f}", va="center", fontsize=8, color="white")
     without = found[rows[0]]["without"]
     if without is not None:
-        axis.axvline(without, color=WITHOUT, linewidth=2, label="best found without a memory")
+        how = "exact ceiling" if suite == STRICT else "best found"
+        axis.axvline(without, color=WITHOUT, linewidth=2, label=f"{how} without a memory")
     axis.set_yticks(places, rows)
     axis.invert_yaxis()
     axis.set_xlim(0, 100)

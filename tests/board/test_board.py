@@ -19,74 +19,29 @@ from lerobot_memobench.board.rows import board_row, board_rows
 from lerobot_memobench.board.submission import CARD, LOG, About, read_submission, write_submission
 from lerobot_memobench.board.text import PROMISES
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.datasets.generation import task_hash
-from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
-from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.run.card import new_card, with_episodes, write_card
+from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.run.card import with_episodes, write_card
 from lerobot_memobench.run.sealed import scenes_hash
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evidence import chance, scene_and_variant
+from research.kept import keep, restore
+from tests.support.board import (
+    ABOUT,
+    FILES,
+    TASKS,
+    VERSIONS,
+    evaluation,
+    first_failure,
+    in_card,
+    in_log,
+    sealed,
+    stating,
+)
 from tests.support.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
-TASKS = task_names(suite="strict")
-ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
-VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
 Json = dict[str, Any]
-
-
-# --- a valid evaluation and its submission ---
-
-
-def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Json:
-    """A rollout of a strict task: every third one fails at its first checkpoint."""
-    published = get_task(name)
-    scene, seed = episode, first + episode
-    task = referent_of(published, seed)
-    if settings.get("evidence"):
-        scene, variant = scene_and_variant(published, episode)
-        seed, task = first + scene, published.variant(variant)
-    success = episode % 3 > 0
-    marks = [speed * (k + 1) + scene if success or k else None for k in range(len(task.checkpoints))]
-    choice = {"choice": task.variant_index if success else None, "answered": success}
-    choice |= {"variants": len(published.random_variants), "chance": chance(published)}
-    return {
-        **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed, "referent": "drawn"},
-        **{"variant": task.variant_index, "replan_steps": 5, "prompt_steps": 100, "prompt_shown": None},
-        **{"steps": 900 + scene, "success": success},
-        **(choice if settings.get("evidence") else {}),
-        **({"paused_steps": 500} if settings.get("pause_steps") else {}),
-        "checkpoints": [
-            {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
-            for c, step in zip(task.checkpoints, marks, strict=True)
-        ],
-        **{"failure": None if success else "storage_failure", "suite": "strict", "lost": False},
-        **{"scene_hash": f"{name[:20]}-{seed}", "wall_s": 2.0, "policy": "act 0123", "run": "r", "inputs": "pixels"},
-    }
-
-
-def evaluation(folder: Path, first: int = 7, speed: int = 50, **settings: Any) -> Path:
-    """Write the folder of an evaluation of the strict suite: 10 episodes of each task, of those with variants 12."""
-    names = [name for name in TASKS if not settings.get("evidence") or get_task(name).num_variants > 1]
-    count = 12 if settings.get("evidence") else 10
-    records = [line(name, episode, first, speed, **settings) for name in names for episode in range(count)]
-    block = EnvSettings(suite="strict", seed_base=first, replan_steps=5, **settings).protocol_block
-    card = new_card(
-        protocol={"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
-        policy={"type": "act", "seed": first, "settings": {}, "sha256": "0" * 64},
-        checkpoint={"path": "user/one", "revision": "abc", "files": {}},
-        trained_on={"repo_id": "user/data", "revision": "def"},
-        task_files={name: task_hash(get_task(name)) for name in names},
-        settings={},
-        runs=[{"command": ["lerobot"], "batch_size": 1, "versions": VERSIONS, "git_commit": None, "machine": {}}],
-    )
-    folder.mkdir(parents=True)
-    write_episodes(folder, records)
-    write_card(folder, with_episodes(card, records))
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -129,37 +84,6 @@ def test_board_of_the_repository_is_valid() -> None:
 # --- doctored submissions ---
 
 
-def first_failure(records: list[Json]) -> Json:
-    return next(record for record in records if not record["success"])
-
-
-def in_log(change: Callable[[list[Json]], object], *, card: bool = False) -> Callable[[Path], None]:
-    """A change of the log, and of the card's episodes with ``card``."""
-
-    def apply(folder: Path) -> None:
-        lines = [json.loads(each) for each in gzip.decompress((folder / LOG).read_bytes()).splitlines()]
-        change(lines)
-        (folder / LOG).write_bytes(gzip.compress("".join(json.dumps(each) + "\n" for each in lines).encode()))
-        if card:
-            in_card(lambda content: change(content["episodes"]))(folder)
-
-    return apply
-
-
-def in_card(change: Callable[[Json], object]) -> Callable[[Path], None]:
-    def apply(folder: Path) -> None:
-        content = json.loads((folder / CARD).read_text())
-        change(content)
-        (folder / CARD).write_text(json.dumps(content))
-
-    return apply
-
-
-def stating(key: str, value: Any) -> Callable[[Path], None]:
-    """A statement of the submitter."""
-    return in_card(lambda content: content["submission"].__setitem__(key, value))
-
-
 def to_success(records: list[Json]) -> None:
     record = first_failure(records)
     record.update(success=True, failure=None)
@@ -167,10 +91,12 @@ def to_success(records: list[Json]) -> None:
         mark.update(first_step=50, ordered_step=50)
 
 
-def later(records: list[Json]) -> None:
-    for record in records:
+def shifted(records: list[Json], by: Callable[[int, int], int]) -> None:
+    """Move the steps of each success by a function of its number and the checkpoint's."""
+    for number, record in enumerate(records):
         if record["success"]:
-            record["steps"] += 1
+            for k, mark in enumerate(record["checkpoints"]):
+                mark["first_step"] = mark["ordered_step"] = record["steps"] = mark["first_step"] + by(number, k)
 
 
 def linked(folder: Path) -> None:
@@ -180,18 +106,6 @@ def linked(folder: Path) -> None:
 
 def traversing(folder: Path) -> None:
     (folder / "evidence").symlink_to("../../elsewhere")
-
-
-def sealed(folder: Path) -> None:
-    """Move all seeds to the sealed ones, with the variants that they draw, without a commitment."""
-
-    def move(records: list[Json]) -> None:
-        for record in records:
-            record["seed"] = 100_007 + record["episode"]
-            record["variant"] = referent_of(get_task(record["task"]), record["seed"]).variant_index
-
-    in_log(move, card=True)(folder)
-    in_card(lambda card: (card["protocol"].update(seed_base=100_007), card["policy"].update(seed=100_007)))(folder)
 
 
 def other_variant(records: list[Json]) -> None:
@@ -277,7 +191,9 @@ def test_doctored_control_is_refused(with_controls: Path, tmp_path: Path, name: 
 def test_committed_sealed_result_is_accepted(board: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(board / "one", tmp_path / "one")
     sealed(folder)
-    commitment = {"policy": "0" * 64, "release": "0.2.0", "run": 2, "earlier": []}
+    start = {"started": "2026-11-01", "suite": "strict", "referent": "drawn", "replan_steps": 5}
+    earlier = [{**start, "tasks": 30, "episodes": 10}]
+    commitment = {"policy": tree_hash(FILES), "release": "0.2.0", "run": 2, "earlier": earlier}
     in_card(lambda card: card.update(sealed={**commitment, "scenes": scenes_hash(card)}))(folder)
     check_submission(found := read_submission(folder))
     assert board_row(found).seeds == "sealed, run 2"
@@ -288,10 +204,12 @@ def test_committed_sealed_result_is_accepted(board: Path, tmp_path: Path) -> Non
     [
         None,
         in_log(to_success, card=True),
-        in_log(later, card=True),
+        in_log(lambda log: shifted(log, lambda number, k: 7), card=True),
+        in_log(lambda log: shifted(log, lambda number, k: -(number % 3)), card=True),
+        in_log(lambda log: shifted(log, lambda number, k: -25 if number % 5 == 0 else k), card=True),
         in_log(lambda log: [each.update(scene_hash=None) for each in log], card=True),
     ],
-    ids=["copied", "copied with another success", "copied with later ends", "copied without hashes of scenes"],
+    ids=["copied", "another success", "all later", "some earlier", "a few changed much", "no hashes of scenes"],
 )
 def test_copied_card_is_refused(board: Path, tmp_path: Path, change: Callable[[Path], None] | None) -> None:
     both = shutil.copytree(board, tmp_path / "board")
@@ -382,6 +300,39 @@ def test_submission_of_a_new_user_is_accepted(
     assert "also changes 'src/" in capsys.readouterr().err
     assert main([*words[:3], "other", *words[4:]]) == 2  # a copy of the row that is there now
     assert "has the episodes of the row 'mine'" in capsys.readouterr().err
+
+
+def test_part_of_the_tasks_is_checked_and_not_submitted(
+    evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = Path(shutil.copytree(evaluated, "part"))
+    lines = [json.loads(each) for each in (part / "episodes.jsonl").read_text().splitlines()]
+    some = [each for each in lines if each["task"] in TASKS[:3] and each["episode"] < 3]
+    (part / "episodes.jsonl").write_text("".join(json.dumps(each) + "\n" for each in some))
+    card = json.loads((part / CARD).read_text())
+    card["protocol"].update(tasks=sorted(TASKS[:3]), episodes=3)
+    card["task_files"] = {name: card["task_files"][name] for name in TASKS[:3]}
+    write_card(part, with_episodes({**card, "episodes": []}, some))
+    assert main(["submit", "part", "--check"]) == 0
+    assert "accepted: 9 rollouts of part; nothing is written" in capsys.readouterr().out
+    assert [each.name for each in tmp_path.iterdir()] == ["part"]
+    assert main(["submit", "part"]) == 2
+    assert "needs --name, --model, --submitter, --training-data; to check" in capsys.readouterr().err
+    words = ["--name", "mine", "--model", "Mine", "--submitter", "@me", "--training-data", "none"]
+    assert main(["submit", "part", *words]) == 2
+    assert "has 3 episodes of 3 of 30 tasks; expected 10 to 50 episodes of each" in capsys.readouterr().err
+    write_card(part, with_episodes({**card, "episodes": []}, some[1:]))
+    assert main(["submit", "part", "--check"]) == 2
+    assert "card and log disagree" in capsys.readouterr().err
+
+
+def test_restored_evaluation_is_submitted(evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    keep(evaluated.parent, [evaluated.name], Path("kept"))
+    restore(Path("kept"), Path("restored"))
+    words = ["--name", "mine", "--model", "Mine", "--submitter", "@me", "--training-data", "none"]
+    assert main(["submit", f"restored/{evaluated.name}", *words, "--out", "out"]) == 0
 
 
 def test_submission_replaces_an_earlier_one_only(with_controls: Path, evaluated: Path, tmp_path: Path) -> None:

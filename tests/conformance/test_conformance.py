@@ -14,6 +14,7 @@ import torch
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.conformance.checks import CHECKS, Behaviour, Outcome, run_check, run_checks
 from lerobot_memobench.conformance.pytest_class import MemoryConformance
+from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.conformance.subject import Subject, load_subject
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -238,3 +239,42 @@ def test_memory_of_another_package_runs_an_episode(traces: None) -> None:
     histories = Histories(frames[:1].expand(5, -1, -1), torch.arange(5), places)
     assert memory.replay(histories).rows().dtype == torch.float32
     assert memory.read(state).rows().shape == (2, 4 * memory.spec.tokens, memory.spec.width)
+
+
+@pytest.mark.parametrize("stride", [12, 15])
+def test_strides_that_an_interval_divides_conform(
+    stride: int, example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At a multiple of the interval, each plan reads frames of earlier plans alone; a flaw is found all the same."""
+    data = write_streams(tmp_path / "streams", pictures=False)
+    words = ["policy=window", "policy.width=16", "policy.frames=8", f"policy.stride={stride}", f"dataset={data}"]
+    subject = load_subject(words, tmp_path)
+    check = "remembers every control step"
+    assert run_check(check, Behaviour(subject)).outcome is Outcome.PASSED
+    assert subject.policy.config.n_action_steps == 3
+    monkeypatch.setattr(subject.policy, "__class__", flaws(type(subject.policy))[check])
+    assert run_check(check, Behaviour(subject)).outcome is not Outcome.PASSED
+
+
+def test_inputs_are_found(example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new policy may read pictures or objects; what both lack is named in a sentence."""
+    from lerobot_policy_window import OBJECTS, WindowPolicy
+
+    data = write_streams(tmp_path / "streams", frames=4)
+    words = ["policy=window", "policy.width=16", "policy.frames=4", "policy.stride=1", f"dataset={data}"]
+    made = WindowPolicy.__init__
+
+    def needing(name: str) -> Any:
+        def init(self: Any, config: Any, **settings: Any) -> None:
+            assert config.input_features[name]
+            made(self, config, **settings)
+
+        return init
+
+    monkeypatch.setattr(WindowPolicy, "__init__", needing(OBJECTS))
+    (tmp_path / "one").mkdir()
+    assert OBJECTS in load_subject(words, tmp_path / "one").policy.config.input_features
+    monkeypatch.setattr(WindowPolicy, "__init__", needing("observation.touch"))
+    (tmp_path / "two").mkdir()
+    with pytest.raises(MemobenchError, match=r"does not act on .*observation\.touch.*obs_type="):
+        load_subject(words, tmp_path / "two")

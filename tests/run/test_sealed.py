@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import shutil
 from pathlib import Path
@@ -25,6 +26,7 @@ from tests.support.fake_loop import STOVE, FakeLoop, make_checkpoint
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 COMMAND = ["test-sealed", "policy=memobench_random", f"tasks={STOVE}", "episodes=2"]
 SEALED = ["env=memobench", *COMMAND[1:], "split=sealed"]
+SHARDS = ["output_dir=b", "shards=2", "batch_size=1"]
 
 
 @pytest.fixture(autouse=True)
@@ -101,6 +103,25 @@ def test_the_parts_of_one_evaluation_are_one_start() -> None:
     assert numbers(*parts) == [1, 1]
     assert numbers(*parts) == [2, 2], "a part that runs again is another start"
     assert numbers(plan_line([*SEALED, "output_dir=b"]), parts[0], parts[1]) == [3, 4, 4]
+
+
+@pytest.mark.parametrize("clock", ["set back", "at rest"])
+def test_the_clock_does_not_matter(clock: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Starts are counted in the order of the ledger, whatever their times."""
+    times = iter(range(2030, 2000, -1) if clock == "set back" else [2030] * 30)
+
+    class Clock(dt.datetime):
+        @classmethod
+        def now(cls, tz: dt.tzinfo | None = None) -> dt.datetime:
+            return dt.datetime(next(times), 1, 1, tzinfo=tz)
+
+    monkeypatch.setattr("lerobot_memobench.run.sealed.dt.datetime", Clock)
+    plan = plan_line([*SEALED, "output_dir=a"])
+    first, second, third = (begun(plan)["sealed"] for _ in range(3))
+    assert [start["run"] for start in (first, second, third)] == [1, 2, 3]
+    assert [start["started"] for start in third["earlier"]] == [first["started"], second["started"]]
+    parts = [plan_line(job.arguments[1:]) for job in plan_shards(plan_line([*SEALED, *SHARDS]), (), print)]
+    assert numbers(*parts, *parts, plan) == [4, 4, 5, 5, 6]
 
 
 def test_a_checkpoint_is_known_by_its_files() -> None:

@@ -7,23 +7,33 @@ package draws. It cannot prove that a rollout took place; therefore the board ma
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+import re
+import statistics
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.board.submission import EVIDENCE, PAUSES, Evaluation, Submission, read_submission
+from packaging.requirements import Requirement
+from packaging.version import InvalidVersion
+
+from lerobot_memobench.board.submission import EVIDENCE, PAUSES, RERUNS, Evaluation, Submission, read_submission
 from lerobot_memobench.datasets.generation import task_hash
+from lerobot_memobench.envs.episode import first_execution_step
 from lerobot_memobench.envs.episode_log import INPUTS, OF_THE_POLICY, OMITTED, POLICY, differences, evidence_line
-from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, SIMULATOR
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS, EnvSettings
+from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PIXELS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.metrics import failure_of, operations, seed_base
-from lerobot_memobench.protocol import EVALUATION_EPISODES, PAPER, SEALED, SPLITS
+from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.protocol import EVALUATION_EPISODES, PAPER, PROMPT_HORIZON, SEALED, SPLITS
 from lerobot_memobench.run.card import PACKAGES, first_variant_mismatch
-from lerobot_memobench.run.sealed import scenes_hash
+from lerobot_memobench.run.sealed import policy_hash, scenes_hash
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS
+from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
+from lerobot_memobench.tasks.task import STRICT, Task
 
 FEWEST, MOST = 10, EVALUATION_EPISODES
 """Episodes of each task; a row is ranked with the most."""
@@ -37,8 +47,19 @@ CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {EVIDENCE: {"evidence": True}
 CONTROL_FIELDS = ("paused_steps", "choice", "answered", "variants", "chance")
 """Fields of a line of the log that only a control has."""
 KNOWN_INPUTS = (PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, NO_INPUT)
-COPIED = 0.5
-"""Share of equal successful episodes, step for step, from which on one log counts as a copy of another."""
+COPIED, CLOSE = 0.5, 2
+"""Share of similar successful episodes above which a log counts as a copy, and steps by which similar ones differ."""
+FASTEST = 20
+"""Fewest steps to a checkpoint, 1 s; the fastest of 7,764 kept rollouts needed 66."""
+REQUIRED = {
+    found.name: found.specifier for found in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not found.marker
+}
+"""Package -> its versions under which this package runs."""
+SCENE, HASH_VERSION = re.compile(r"[0-9a-f]{16}"), "scene_hash_version"
+SCRIPTS = ("memobench_expert", "memobench_blind")
+"""Policies whose actions the simulator computes."""
+OBJECTS_READ = "objects"
+"""Value of the setting ``perception`` of a policy that reads objects."""
 
 
 def read_board(board: Path) -> list[Submission]:
@@ -79,42 +100,67 @@ def check_partners(submissions: Sequence[Submission]) -> None:
             )
 
 
-def check_paths(changed: Iterable[str], board: str = "results/board") -> None:
-    """Check that a pull request with a submission changes folders of rows only.
+def check_paths(changed: Iterable[str], board: str = "results/board") -> str | None:
+    """Check that a pull request with a submission changes the folder of one row only, and return its name, if any.
 
     Args:
         changed: paths that it changes, relative to the repository.
         board: folder of the board.
 
     Raises:
-        MemobenchError: it also changes another file.
+        MemobenchError: it also changes another file, or another row.
     """
-    parts = {path: path.removeprefix(f"{board}/").split("/") for path in changed}
-    rows = [path for path in parts if path.startswith(f"{board}/") and len(parts[path]) > 1]
-    others = [path for path in parts if path not in rows]
-    if rows and others:
+    paths = [*changed]
+    rows = sorted({path.split("/")[board.count("/") + 1] for path in paths if path.startswith(f"{board}/")} - {RERUNS})
+    others = [path for path in paths if not path.startswith(tuple(f"{board}/{row}/" for row in rows))]
+    if rows and (others or len(rows) > 1):
         raise MemobenchError(
-            f"the pull request also changes {others[0][:80]!r}; expected files in folders of {board} only: move the "
-            "rest to another pull request"
+            f"the pull request also changes {(others or rows[1:])[0][:80]!r}; expected files in one folder of {board} "
+            "only: move the rest to another pull request"
+        )
+    return rows[0] if rows else None
+
+
+def check_author(author: str, name: str | None, *boards: Path) -> None:
+    """Check that a pull request of somebody other than a maintainer changes a row of its author.
+
+    Args:
+        author: account on GitHub.
+        name: the row that it changes, see `check_paths`.
+        boards: the board with the change and without it.
+
+    Raises:
+        MemobenchError: the row names another submitter, or it changes no row.
+    """
+    rows = [read_submission(board / name) for board in boards if name and (board / name).exists()]
+    submitters = {row.about.submitter.lower() for row in rows} or {"the maintainers"}
+    if others := submitters - {f"@{author}".lower()}:
+        raise MemobenchError(
+            f"the pull request changes {name or RERUNS} of {min(others)}; expected a row whose submitter is its "
+            f"author, @{author[:40]}: the maintainers enter results of others and {RERUNS}"
         )
 
 
-def check_submission(submission: Submission, others: Sequence[Submission] = ()) -> None:
+def check_submission(submission: Submission, others: Sequence[Submission] = (), *, part: bool = False) -> None:
     """Check a submission by all rules.
 
     Args:
         others: rows that are on the board already.
+        part: whether any tasks of the suite, and any number of their episodes, will do.
 
     Raises:
         MemobenchError: naming the first rule that it breaks.
     """
     run = submission.evaluation
     _check_protocol(run)
-    _check_evaluation(run, task_names(suite=run.protocol["suite"]))
+    names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
+    least = 1 if part else FEWEST
+    _check_evaluation(run, names, least)
     for name, control in submission.controls.items():
-        _check_control(run, control, name)
+        _check_control(run, control, name, names, least)
     for other in others:
         _check_original(submission, other)
+    _check_scenes([run for each in (*others, submission) for run in (each.evaluation, *each.controls.values())])
 
 
 # --- protocol ---
@@ -146,7 +192,7 @@ def _check_protocol(run: Evaluation, **control: Any) -> None:
         raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
 
 
-def _check_control(run: Evaluation, control: Evaluation, name: str) -> None:
+def _check_control(run: Evaluation, control: Evaluation, name: str, names: Sequence[str], least: int) -> None:
     """Check that an evaluation is of the same policy under one control."""
     _check_protocol(control, **CONTROL_SETTING[name])
     for key in ("type", "sha256", "settings"):
@@ -155,18 +201,19 @@ def _check_control(run: Evaluation, control: Evaluation, name: str) -> None:
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
     if found := differences(run.protocol, control.protocol, ignore=CONTROL_SETTING[name]):
         raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
-    names = task_names(suite=run.protocol["suite"])
     if name == EVIDENCE:
         names = [task for task in names if get_task(task).num_variants > 1]
-    _check_evaluation(control, names)
+    _check_evaluation(control, names, least)
 
 
 # --- the log against card, catalogue and seeds ---
 
 
-def _check_evaluation(run: Evaluation, names: Sequence[str]) -> None:
+def _check_evaluation(run: Evaluation, names: Sequence[str], fewest: int) -> None:
+    _check_extent(run, names, fewest)
     _check_versions(run, names)
-    _check_extent(run, names)
+    _check_inputs(run)
+    _check_policy(run)
     for record in run.records:
         _check_record(run, record)
     if (problem := first_variant_mismatch(run.records)) is not None:
@@ -185,6 +232,15 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
                 f"{run.place}: its parts ran under {package} {' and '.join(sorted(map(str, versions)))}; evaluate "
                 "again with one version"
             )
+        for version in map(str, versions):
+            try:
+                fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
+            except InvalidVersion:
+                fits = False
+            if not fits:
+                raise MemobenchError(
+                    f"{run.place}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
+                )
     for name in names:
         here, there = task_hash(get_task(name)), run.card["task_files"].get(name)
         if here != there:
@@ -194,13 +250,13 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
             )
 
 
-def _check_extent(run: Evaluation, names: Sequence[str]) -> None:
+def _check_extent(run: Evaluation, names: Sequence[str], least: int) -> None:
     """Check that the log holds each episode of each task once, from the first seed of a split on."""
     protocol, seed = run.protocol, run.card[POLICY].get("seed")
     count, base = protocol["episodes"], protocol["seed_base"]
-    least, most = FEWEST, MOST
+    most = MOST
     if protocol["evidence"]:  # whole scenes
-        least, most = max(len(get_task(name).random_variants) for name in names), 12 * MOST
+        least, most = max((len(get_task(name).random_variants) for name in names), default=1), 12 * MOST
     if base not in list(SEEDS) or seed != base:
         raise MemobenchError(
             f"{run.place}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
@@ -208,8 +264,8 @@ def _check_extent(run: Evaluation, names: Sequence[str]) -> None:
         )
     if not least <= count <= most or sorted(protocol["tasks"]) != sorted(names):
         raise MemobenchError(
-            f"{run.place}: the protocol has {count} episodes of {len(protocol['tasks'])} tasks; expected {least} to "
-            f"{most} of each of the {len(names)} tasks of the suite"
+            f"{run.place}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
+            f"{len(names)} tasks; expected {least} to {most} episodes of each"
         )
     asked = set(itertools.product(names, range(count)))
     there = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
@@ -233,7 +289,7 @@ def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
             raise MemobenchError(f"{where} has {key}={value} and the card {key}={expected}; submit one evaluation only")
     for part in str(record.get(INPUTS)).split(", "):
         check_choice(f"{where}: {INPUTS}", part, KNOWN_INPUTS)
-    if record.get(POLICY) != named[0] or not str(named[0]).startswith(named[1]):
+    if record.get(POLICY) != named[0] or str(named[0]).rpartition(" ")[0] != named[1]:
         raise MemobenchError(f"{where} is of the policy {record.get(POLICY)!r}; expected the policy of the card only")
     if record.get("seed") is None or seed_base(record) != protocol["seed_base"]:
         raise MemobenchError(
@@ -248,18 +304,57 @@ def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
         )
     _check_control_fields(where, protocol, record)
     failure_of(record)
-    steps, reached = record.get("steps"), [mark["first_step"] for mark in record["checkpoints"]]
-    ordered = [mark.get("ordered_step") for mark in record["checkpoints"]]
-    within = all(step is None or 1 <= step <= (steps or 0) for step in (*reached, *ordered))
-    if steps is None or steps > protocol["horizon"] or not within:
-        raise MemobenchError(
-            f"{where} has {steps} steps and checkpoints at {reached}, in order at {ordered}; expected at most "
-            f"{protocol['horizon']} steps, and checkpoints within them"
+    for problem in _contradictions(protocol, record, task):
+        raise MemobenchError(f"{where} {problem}; submit the log unchanged")
+
+
+def _contradictions(protocol: Mapping[str, Any], record: Mapping[str, Any], task: Task) -> Iterator[str]:
+    """Yield what no execution of a task, a variant, can have written: its prompt, its steps, how it ended."""
+    success, lost, fault, steps = record["success"], record.get("lost"), record.get("fault"), record.get("steps") or 0
+    marks = [(mark["first_step"], mark.get("ordered_step")) for mark in record["checkpoints"]]
+    named = [step for step in (*itertools.chain(*marks), steps if success else None) if step is not None]
+    if steps > protocol["horizon"] or any(not FASTEST <= step <= steps for step in named):
+        yield (
+            f"has {steps} steps and checkpoints at {marks} (first, in order); expected at most {protocol['horizon']} "
+            f"steps, and checkpoints within them, from step {FASTEST} on"
         )
-    if record["success"] and (record.get("lost") or record.get("fault")):
-        raise MemobenchError(f"{where} is a success and was lost or broken off; submit the log unchanged")
-    if record["success"] and protocol["suite"] == STRICT and None in reached:  # the goal includes each checkpoint
-        raise MemobenchError(f"{where} is a success without all checkpoints ({reached}); submit the log unchanged")
+    before: int | None = 0
+    for goal, (first, ordered) in zip((each.goal for each in task.checkpoints), marks, strict=True):
+        if goal == task.goal and first != (steps if success else None):
+            yield f"has the goal at step {first}, success={success} and {steps} steps; the goal ends a rollout"
+        if success and first is None and _conjuncts(goal, And) <= _conjuncts(task.goal, And | Then):
+            yield f"is a success without the checkpoint {format_formula(goal)}, which is part of its goal"
+        # A checkpoint counts in order at the first step at which it holds with all earlier ones complete.
+        at_once = first is not None and before is not None and first >= before
+        late = None not in (first, before, ordered) and (ordered or 0) >= (before or 0)
+        if ordered != first if at_once else not (ordered is None or late):
+            yield f"has a checkpoint at step {first} and in order at {ordered}, after one in order at {before}"
+        before = ordered
+    if success and protocol["suite"] == STRICT and any(first is None for first, _ in marks):
+        yield f"is a success without all checkpoints ({marks})"  # the goal includes each checkpoint
+    if success and (lost or fault):
+        yield "is a success and was lost or broken off"
+    if not (success or lost or fault or steps == protocol["horizon"]):
+        yield f"ended after {steps} of {protocol['horizon']} steps without success, a lost goal or a fault"
+    failure = record.get("failure")
+    if (lost is None) == (protocol["suite"] == STRICT) or failure == CUT_OFF or (failure in FAULTS) != bool(fault):
+        yield f"has lost={lost}, the failure class {failure} and the fault {fault}"
+    shown = protocol["demonstration_prompt"] and task.prompt is not None
+    hidden = task.prompt is not None and not task.prompt.restores
+    longest = PROMPT_HORIZON if shown else 0
+    at = first_execution_step(get_task(task.name), record["seed"], protocol["demonstration_prompt"])
+    prompt = record.get("prompt_steps") or 0
+    if prompt != at if task.idles else not int(shown) <= prompt <= longest:
+        yield f"begins after {prompt} steps of prompt and idling; expected {at or f'{int(shown)} to {longest}'}"
+    if (record.get("prompt_shown") is not None) != (shown or hidden):
+        yield f"has prompt_shown={record.get('prompt_shown')}; its prompt was {'' if shown else 'not '}part of it"
+
+
+def _conjuncts(formula: Formula, kinds: Any) -> set[Formula]:
+    """Return the parts of a conjunction, and with `Then` those of a sequence: each has held when the whole holds."""
+    if not isinstance(formula, kinds):
+        return {formula}
+    return {each for child in children(formula) for each in _conjuncts(child, kinds)}
 
 
 def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mapping[str, Any]) -> None:
@@ -274,15 +369,76 @@ def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mappi
         raise MemobenchError(f"{where} has {found}, expected {expected}; submit the log of this control unchanged")
 
 
+def _check_inputs(run: Evaluation) -> None:
+    """Check that the inputs on a card agree with its observations, its policy and the policy's features."""
+    policy, obs_type = run.card[POLICY], run.protocol["obs_type"]
+    kind, settings = str(policy.get("type")), policy.get("settings", {})
+    claimed = {*str(run.protocol[INPUTS]).split(", ")}
+    features = [*_block(settings.get("input_features")).values()]
+    types = {str(_block(each).get("type")) for each in features} & {"VISUAL", "ENV"}
+    drawn = {PIXEL_INPUT, DETECTIONS} if obs_type != OBJECTS and types != {"ENV"} else set()
+    objects = {PRIVILEGED} if obs_type != PIXELS and types != {"VISUAL"} else set()
+    reads = settings.get("perception", OBJECTS_READ if kind in READ_OBJECTS else None) == OBJECTS_READ
+    needed = objects if reads and "ENV" in types and settings.get("detector") is None else set()
+    asked = _block(run.card.get("settings", {}).get("env"))
+    if kind in SCRIPTS or asked.get("expert_action") or asked.get("blind_action"):
+        needed = {SIMULATOR}
+    if claimed - drawn - objects - {SIMULATOR, NO_INPUT} or needed - claimed:
+        raise MemobenchError(
+            f"{run.place}: inputs are {run.protocol[INPUTS]!r} on the card with obs_type={obs_type} and the policy "
+            f"{kind} of {' and '.join(sorted(types)) or 'unknown'} features; expected {needed or drawn | objects}"
+        )
+
+
+def _block(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _check_policy(run: Evaluation) -> None:
+    """Check that the hash of a checkpoint is that of its files on the card."""
+    there, checkpoint = run.card[POLICY].get("sha256"), run.card["checkpoint"] or {}
+    if there != (tree_hash(checkpoint["files"]) if checkpoint.get("files") else None):
+        raise MemobenchError(
+            f"{run.place}: the policy's sha256 {str(there)[:12]} is not that of the checkpoint's files on the card; "
+            "submit the card unchanged"
+        )
+
+
+def _check_scenes(runs: Sequence[Evaluation]) -> None:
+    """Check that each seed of a task has one scene in all evaluations, and that no two seeds share one.
+
+    Hashes of scenes depend on MuJoCo, on LIBERO's missing scans and on the version of the hash.
+    """
+    scenes: dict[Any, str] = {}
+    seeds: dict[Any, int] = {}
+    for run in runs:
+        simulator = (
+            run.card["runs"][-1]["versions"].get("mujoco"),
+            run.protocol.get(HASH_VERSION, 1),
+            run.protocol["world"],
+        )
+        for record in run.records:
+            kind = (*simulator, *record.get("stand_ins", ()), record["task"])
+            scene, seed = str(record.get("scene_hash")), record["seed"]
+            known = scenes.setdefault((kind, seed), scene), seeds.setdefault((kind, scene), seed)
+            if not SCENE.fullmatch(scene) or known != (scene, seed):
+                raise MemobenchError(
+                    f"{run.place}: {record['task']}, episode {record['episode']} has the scene {scene[:20]!r} of seed "
+                    f"{seed}; another rollout of the board has {known[0][:20]!r} for this seed, and this scene for "
+                    f"{known[1]}; expected hashes of 16 digits, equal for equal seeds only"
+                )
+
+
 def _check_sealed(run: Evaluation) -> None:
     """Check that a sealed evaluation was committed to this policy and these scenes when it started."""
-    sealed = run.card.get("sealed")
     if SEEDS[run.protocol["seed_base"]] != SEALED:
         return
-    expected = {"scenes": scenes_hash(run.card), "policy": run.card[POLICY].get("sha256")}
+    sealed: Mapping[str, Any] = run.card.get("sealed", {})
+    release = run.card["runs"][0]["versions"].get(PACKAGES[0])
+    expected = {"scenes": scenes_hash(run.card), "policy": policy_hash(run.card), "release": release}
+    expected["run"] = len(sealed.get("earlier", ())) + 1
     for key, value in expected.items():
-        there = None if sealed is None else sealed.get(key)
-        if there is None or (value is not None and there != value):
+        if (there := sealed.get(key)) != value:
             raise MemobenchError(
                 f"{run.place}: the commitment of the sealed test does not match ({key}: {str(there)[:12]} there, "
                 f"{str(value)[:12]} by the card); evaluate by `memobench test-sealed`"
@@ -302,19 +458,27 @@ def _check_original(submission: Submission, other: Submission) -> None:
 
 
 def _copied(mine: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any]]) -> float:
-    """Return the share of equal episodes among those in which both policies succeed in the same scene.
+    """Return the share of similar episodes among those in which both policies succeed in the same scene.
 
-    Two policies seldom need the same number of steps to each checkpoint; steps after the last one are easily edited.
-    Failures do not count: two policies may reach nothing.
+    They are similar if no checkpoint differs by more than `CLOSE` from the median difference of both logs: two
+    trainings on the same demonstrations share at most a third of them. Steps after the last checkpoint are easily
+    edited. Failures do not count: two policies may reach nothing.
     """
-    scenes = {(record["task"], record["seed"]): record for record in theirs if record["success"]}
+    scenes = {(record["task"], record["seed"]): _reached(record) for record in theirs if record["success"]}
     pairs = [
-        (record, scenes[key])
+        [a - b for a, b in zip(_reached(record), scenes[key], strict=True)]
         for record in mine
         if record["success"] and (key := (record["task"], record["seed"])) in scenes
     ]
-    equal = sum(a["checkpoints"] == b["checkpoints"] for a, b in pairs)
-    return equal / len(pairs) if len(pairs) >= FEWEST else 0.0
+    if len(pairs) < FEWEST:
+        return 0.0
+    shift = statistics.median(itertools.chain(*pairs))
+    return sum(all(abs(each - shift) <= CLOSE for each in steps) for steps in pairs) / len(pairs)
+
+
+def _reached(record: Mapping[str, Any]) -> list[int]:
+    """Return the first step of each checkpoint, 0 for never."""
+    return [mark["first_step"] or 0 for mark in record["checkpoints"]]
 
 
 def ranked(run: Evaluation) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_memobench.board.check import SEEDS, ranked, read_board
-from lerobot_memobench.board.submission import EVIDENCE, PAUSES, About, Submission
+from lerobot_memobench.board.submission import EVIDENCE, PAUSES, RERUNS, About, Submission
 from lerobot_memobench.envs.episode_log import INPUTS
 from lerobot_memobench.evaluation.comparison import Difference, compare
 from lerobot_memobench.evaluation.evidence import Evidence
@@ -16,9 +16,6 @@ from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure, with_int
 from lerobot_memobench.io import checked, parsed
 from lerobot_memobench.protocol import PAPER
 from lerobot_memobench.tasks.task import LIBERO
-
-RERUNS = "reruns.json"
-"""File of the board, kept by its maintainers: row -> SHA-256 of the log that they ran or repeated."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +26,7 @@ class BoardRow:
         name: of its folder.
         about: statements of the submitter.
         ranked: whether it enters the ranking.
-        rerun: whether the maintainers ran or repeated the evaluation.
+        rerun: whether the maintainers ran or repeated the evaluation and its controls.
         suite: with the referent where it is not the suite's default.
         assets: origin of the scenes' models.
         inputs: of the policy.
@@ -81,7 +78,7 @@ def board_row(
         name=submission.name,
         about=submission.about,
         ranked=ranked(evaluation),
-        rerun=(reruns or {}).get(submission.name) == evaluation.digest,
+        rerun=(reruns or {}).get(submission.name) == submission.digest,
         suite=" ".join([protocol["suite"], *(["random referents"] if protocol["referent"] == "random" else [])]),
         assets=_assets(protocol["world"], bool(stand_ins_of(run.records))),
         inputs=protocol[INPUTS],

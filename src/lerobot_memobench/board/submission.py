@@ -15,6 +15,7 @@ import json
 import re
 import shutil
 import stat
+import unicodedata
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,14 +39,22 @@ LARGEST = {CARD: 2 << 20, LOG: 1 << 20}
 """File -> its largest size, bytes."""
 LARGEST_UNPACKED = 8 << 20
 """Largest unpacked size of a log, bytes: some ten thousand episodes."""
+BOARD = Path("results/board")
+"""The board's folder in a checkout."""
+RERUNS = "reruns.json"
+"""File of the board, kept by its maintainers: row -> `Submission.digest` of what they ran or repeated."""
 ABOUT = "submission"
 """Key of the block that a card has in addition."""
 
 # --- the block ---
 
-ROW_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{1,63}")
-TEXT = re.compile(r"[\w(@][\w .,:;+()/@%~–-]{0,199}")
-LINK = re.compile(r"https://[A-Za-z0-9.-]+(/[\w.~/%+@=-]*)?")
+ROW_NAME = re.compile(r"(?!(con|prn|aux|nul|com\d|lpt\d)$)[a-z0-9][a-z0-9_-]{1,63}")
+"""Without the names of devices in Windows."""
+TEXT = re.compile(r"[\w(][\w .,:;+()/%~–-]{0,199}")
+FIRST_DAY = "2026-01-01"
+ACCOUNT = re.compile(r"@[A-Za-z0-9-]{1,39}")
+LINK = re.compile(r"https://(?!(.*\.)?xn--|.*/\.\.?(/|$))[A-Za-z0-9.-]+(/[\w.~/%+@=-]*)?", re.ASCII | re.IGNORECASE)
+"""Without look-alike hosts (IDNA) and paths that lead elsewhere."""
 
 
 def row_name(name: str) -> str:
@@ -56,9 +65,14 @@ def row_name(name: str) -> str:
 
 
 def _text(value: str) -> str:
-    if not TEXT.fullmatch(value):
-        raise ValueError("expected 1 to 200 letters, digits, spaces and . , : ; + ( ) / @ % ~ - _")
+    alphabets = {unicodedata.name(letter, "").split(" ")[0] for letter in value if letter.isalpha() and letter != "π"}
+    if not TEXT.fullmatch(value) or len(alphabets) > 1 or unicodedata.normalize("NFKC", value) != value:
+        raise ValueError("expected 1 to 200 letters of one alphabet, digits, spaces and . , : ; + ( ) / % ~ - _")
     return value
+
+
+def _submitter(value: str) -> str:
+    return value if ACCOUNT.fullmatch(value) else _text(value)
 
 
 def _link(value: str) -> str:
@@ -68,13 +82,15 @@ def _link(value: str) -> str:
 
 
 def _day(value: str) -> str:
-    if str(dt.date.fromisoformat(value)) != value:
-        raise ValueError("expected a date as YYYY-MM-DD")
+    latest = dt.date.today() + dt.timedelta(days=1)  # somewhere it is tomorrow
+    if str(dt.date.fromisoformat(value)) != value or not FIRST_DAY <= value <= str(latest):
+        raise ValueError(f"expected a date as YYYY-MM-DD, from {FIRST_DAY} to {latest}")
     return value
 
 
 RowName = Annotated[str, AfterValidator(row_name)]
 Text = Annotated[str, AfterValidator(_text)]
+Submitter = Annotated[str, AfterValidator(_submitter)]
 Link = Annotated[str, AfterValidator(_link)]
 Day = Annotated[str, AfterValidator(_day)]
 LINKS = ("code", "weights", "paper")
@@ -96,7 +112,7 @@ class About(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     model: Text
-    submitter: Text
+    submitter: Submitter
     date: Day
     training_data: Text
     parameters: Annotated[int, Ge(0), Le(10**13)] | None = None
@@ -143,6 +159,12 @@ class Submission:
     evaluation: Evaluation
     controls: Mapping[str, Evaluation] = field(default_factory=dict)
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the cards, with the statements of the submitter, and the logs of all evaluations."""
+        parts = {name: [run.card, run.digest] for name, run in {"": self.evaluation, **self.controls}.items()}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
 
 def read_submission(folder: Path) -> Submission:
     """Return the content of a submission's folder.
@@ -169,7 +191,16 @@ def _read_evaluation(folder: Path, folders: Sequence[str] = ()) -> Evaluation:
     _check_entries(folder, folders)
     card = read_evaluation(folder / CARD, whole=True)
     content = _unpacked(folder / LOG)
+    json.loads((folder / CARD).read_bytes(), object_pairs_hook=_once)
     return Evaluation(folder, card, list(_records(folder / LOG, content)), hashlib.sha256(content).hexdigest())
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object; raise for a key given twice, because readers differ in the value that counts."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise MemobenchError(f"card or log has a key twice in {str(found)[:80]}; submit them unchanged")
+    return found
 
 
 def _check_entries(folder: Path, folders: Sequence[str]) -> None:
@@ -215,6 +246,7 @@ def _records(file: Path, content: bytes) -> Iterator[Mapping[str, Any]]:
     for number, line in enumerate(content.splitlines(), start=1):
         try:
             record = checked(parsed(line), EpisodeRecord)
+            json.loads(line, object_pairs_hook=_once)
         except Malformed as error:
             raise MemobenchError(f"{file}, line {number}: {error}; `memobench submit` writes it") from None
         if key_of(record) in known:

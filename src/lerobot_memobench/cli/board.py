@@ -14,9 +14,6 @@ from lerobot_memobench.cli.console import say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
 
-BOARD = Path("results/board")
-"""The board's folder in a checkout."""
-
 
 class ExportFormat(StrEnum):
     """Formats of other boards."""
@@ -35,10 +32,13 @@ FILES = {
 
 def submit(
     card: Annotated[Path, typer.Argument(help="The folder of a finished evaluation.")],
-    name: Annotated[str, typer.Option(help="Name of the row's folder: lower-case letters, digits, _ and -.")],
-    model: Annotated[str, typer.Option(help="Name of the policy, as the board shows it.")],
-    submitter: Annotated[str, typer.Option(help="You or your team; @name for a GitHub account.")],
-    training_data: Annotated[str, typer.Option(help="Origin and number of the demonstrations, in a few words.")],
+    name: Annotated[str, typer.Option(help="Name of the row's folder: lower-case letters, digits, _ and -.")] = "",
+    model: Annotated[str, typer.Option(help="Name of the policy, as the board shows it.")] = "",
+    submitter: Annotated[str, typer.Option(help="You or your team; @name for a GitHub account.")] = "",
+    training_data: Annotated[str, typer.Option(help="Origin and number of the demonstrations, in a few words.")] = "",
+    check: Annotated[
+        bool, typer.Option(help="Check only: any tasks and episodes, no name or model; write nothing.")
+    ] = False,
     parameters: Annotated[int | None, typer.Option(min=0, help="Number of parameters; 0 for a script.")] = None,
     code: Annotated[str | None, typer.Option(help="Address of the code, https://…")] = None,
     weights: Annotated[str | None, typer.Option(help="Address of the weights, https://…")] = None,
@@ -62,10 +62,15 @@ def submit(
     """
     from lerobot_memobench.board.check import check_partners, check_submission, read_board
     from lerobot_memobench.board.rows import board_row
-    from lerobot_memobench.board.submission import LINKS, About, RowName, read_submission, write_submission
+    from lerobot_memobench.board.submission import BOARD, LINKS, About, RowName, read_submission, write_submission
     from lerobot_memobench.board.text import pull_request
-    from lerobot_memobench.io import checked
+    from lerobot_memobench.io import checked, count_of
 
+    given = {"--name": name, "--model": model, "--submitter": submitter, "--training-data": training_data}
+    if missing := [option for option, text in given.items() if not (text or check)]:
+        raise MemobenchError(f"a submission needs {', '.join(missing)}; to check a result alone, give --check")
+    if check:
+        name, model, submitter, training_data = (text or "unnamed" for text in (name, model, submitter, training_data))
     checked(name, RowName)
     links = dict(zip(LINKS, (code, weights, paper), strict=True))
     about = checked(
@@ -82,10 +87,12 @@ def submit(
         written = write_submission(Path(draft) / "board" / name, about, sources)
         try:
             found = read_submission(written)
-            check_submission(found, others)
+            check_submission(found, others, part=check)
         except MemobenchError as error:
             raise MemobenchError(str(error).replace(f"{written.parent}/", "")) from None
         check_partners([*others, found] if BOARD.is_dir() else [])
+        if check:
+            return say(f"accepted: {count_of(len(found.evaluation.records), 'rollout')} of {card}; nothing is written")
         text = pull_request(board_row(found, others))
         write_submission(out / name, about, sources)
     say(f"accepted: {out / name}")

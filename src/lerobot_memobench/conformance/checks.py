@@ -7,6 +7,7 @@ call, the policy plans at that call; if a frame changes actions of later plans, 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,6 +21,8 @@ from lerobot_memobench.errors import MemobenchError
 
 PROBED = 12
 """Execution frames that are replaced, one at a time, to measure their effects."""
+INTERVALS = (5, 7, 4)
+"""Further intervals of plans for the check of frames between them; no stride within a stream is a multiple of all."""
 SHARE, LEAST = 0.01, {"float32": 2e-6, "other": 1e-2}
 """Actions are equal if they differ by less than this share of a memory's effect, or by rounding, which depends on the
 number of rows in a batch and on the precision of the weights."""
@@ -182,8 +185,23 @@ def plans_after_prompt(found: Behaviour) -> str:
 
 
 def remembers_every_step(found: Behaviour) -> str:
-    """Frames between two plans are remembered as well."""
+    """Frames between two plans are remembered as well.
+
+    Where the interval divides a memory's stride, plans read frames of earlier plans alone; so any interval will do.
+    """
     found.require_memory()
+    try:
+        return _remembers_between_plans(found)
+    except Refuted as refusal:
+        config = found.subject.policy.config
+        for steps in INTERVALS if hasattr(config, "n_action_steps") else ():
+            if steps <= getattr(config, "chunk_size", steps):
+                with found.subject.planning_every(steps), contextlib.suppress(Refuted, NotAsked):
+                    return _remembers_between_plans(Behaviour(found.subject))
+        raise refusal
+
+
+def _remembers_between_plans(found: Behaviour) -> str:
     between = [frame for frame in found.by_frame if frame not in found.plans]
     if not between:
         return "it plans at every control step"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import nullcontext
+import copy
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,16 @@ class Subject:
     def reads_prompt(self) -> bool:
         """Whether its configuration declares that it reads prompts."""
         return reads_prompt(self.policy.config)
+
+    @contextmanager
+    def planning_every(self, steps: int) -> Iterator[None]:
+        """Let it plan at another interval, in control steps."""
+        config, usual = self.policy.config, self.policy.config.n_action_steps
+        try:
+            config.n_action_steps = steps
+            yield
+        finally:
+            config.n_action_steps = usual
 
     def roll(self, streams: Sequence[Stream], *, equal_noise: bool = True, sparing: bool = False) -> Actions:
         """Reset the policy and let it act on streams, one row each, until the longest ends.
@@ -167,11 +178,25 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
         raise MemobenchError("name a policy: a checkpoint folder, policy=memobench_small, or a type such as policy=act")
     path = arguments.get("policy.path")
     config.pretrained_path = None if path is None else Path(path)
-    with quiet():
-        return _built(config, str(arguments.get("dataset.repo_id")), arguments.get("dataset.root"), obs_type, folder)
+    data = str(arguments.get("dataset.repo_id")), arguments.get("dataset.root")
+    errors = []
+    for asked in [obs_type] if obs_type else [None, OBJECTS, BOTH]:
+        try:
+            with quiet():
+                subject = _built(copy.deepcopy(config), *data, asked, folder / f"view {asked}")
+                subject.roll([subject.streams[0].until(subject.streams[0].start)])
+            return subject
+        except MemobenchError:
+            raise
+        except Exception as error:  # a policy may raise anything where it lacks an input
+            errors.append(error)
+    raise MemobenchError(
+        f"{config.type} does not act on this benchmark's observations: {type(errors[0]).__name__}: {errors[0]}; let it "
+        "read inputs that the dataset has, or choose them by obs_type="
+    ) from errors[0]
 
 
-def _built(config: Any, repository: str, root: str | None, obs_type: str | None, folder: Path) -> Subject:
+def _built(config: Any, repository: str, root: str | None, obs_type: str | None, view: Path) -> Subject:
     from lerobot.configs.default import DatasetConfig
     from lerobot.configs.train import TrainPipelineConfig
     from lerobot.datasets import LeRobotDataset
@@ -199,8 +224,8 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
         if not choice.prompts:
             numbers = np.cumsum(read_frame_table(Path(raw.root)).phase == EXECUTION) - 1
         if needs_view(raw.meta.features, choice):
-            write_view(Path(raw.root), folder / "view", choice)
-            whole.dataset.root = str(folder / "view")
+            write_view(Path(raw.root), view, choice)
+            whole.dataset.root = str(view)
         dataset = make_dataset(whole)
         policy = make_policy(config, ds_meta=dataset.meta)
         loaded = {} if path is None else {"preprocessor_overrides": {"device_processor": {"device": config.device}}}

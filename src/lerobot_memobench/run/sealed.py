@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime as dt
 import hashlib
+import itertools
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -69,15 +70,14 @@ def counted(plan: EvaluationPlan, card: dict[str, Any], note: Callable[[str], No
 
 
 def _line_of(card: Mapping[str, Any], folder: str) -> dict[str, Any]:
-    protocol, policy = card["protocol"], card["policy"]
-    identity = {key: policy.get(key) for key in ("type", "settings", "detector_sha256")}
+    protocol = card["protocol"]
     return {
         "started": dt.datetime.now(dt.UTC).isoformat(timespec="microseconds"),
         **{name: protocol.get(name) for name in ("suite", "referent", "replan_steps")},
         **_world(protocol),
         "tasks": len(protocol["tasks"]),
         "episodes": protocol["episodes"],
-        "policy": policy.get("sha256") or _hash(identity),
+        "policy": policy_hash(card),
         "release": versions()[PACKAGES[0]],
         "scenes": scenes_hash(card),
         "folder": folder,
@@ -86,15 +86,20 @@ def _line_of(card: Mapping[str, Any], folder: str) -> dict[str, Any]:
 
 
 def _add(ledger: Path, line: dict[str, Any]) -> dict[str, Any]:
-    """Add a start to the ledger; return it with its number and the starts before it."""
+    """Add a start to the ledger; return it with its number and the starts before it, by the ledger's order.
+
+    Times only tell starts apart: a clock may be set back, or stand still.
+    """
     lines = [each for each in _lines(ledger) if all(each[key] == line[key] for key in ("policy", "release"))]
+    starts = {_start_of(each): each for each in lines}
     parts = [each for each in lines if each["folder"] == line["folder"] and each.get("scenes") == line["scenes"]]
-    last = max((each["started"] for each in parts), default="")
-    begun = {each.get("shard") for each in parts if each["started"] == last}
+    begun = {each.get("shard") for each in parts if _start_of(each) == _start_of(parts[-1])}
     if begun and line["shard"] is not None and not {None, line["shard"]} & begun:  # another part of that start
-        line["started"] = last
-    starts = {(each["started"], each["folder"]): each for each in lines}
-    earlier = [each for key, each in sorted(starts.items()) if key < (line["started"], line["folder"])]
+        line["started"] = parts[-1]["started"]
+    else:
+        while _start_of(line) in starts:
+            line["started"] = f"{dt.datetime.fromisoformat(line['started']) + dt.timedelta(microseconds=1)}"
+    earlier = [starts[key] for key in itertools.takewhile(lambda key: key != _start_of(line), starts)]
     with ledger.open("ab") as file:
         file.write(b"\n" + json.dumps(line).encode() + b"\n")  # the last line may have been cut off
         file.flush()
@@ -106,6 +111,10 @@ def _add(ledger: Path, line: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _start_of(line: Mapping[str, Any]) -> tuple[str, str]:
+    return line["started"], line["folder"]
+
+
 def _lines(ledger: Path) -> Iterator[dict[str, Any]]:
     """Yield the lines of a ledger that can be read."""
     for line in ledger.read_bytes().splitlines() if ledger.is_file() else ():
@@ -113,6 +122,12 @@ def _lines(ledger: Path) -> Iterator[dict[str, Any]]:
             yield checked(parsed(line), LedgerLine)
         except Malformed:
             continue
+
+
+def policy_hash(card: Mapping[str, Any]) -> str:
+    """Return the hash of a card's checkpoint; without one, of the policy's type, settings and detector."""
+    policy = card["policy"]
+    return policy.get("sha256") or _hash({key: policy.get(key) for key in ("type", "settings", "detector_sha256")})
 
 
 def scenes_hash(card: Mapping[str, Any]) -> str:

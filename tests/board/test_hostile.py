@@ -1,0 +1,334 @@
+"""Hostile submissions: each invents or contradicts something, and is refused with one sentence.
+
+Strict ones are made from a row without a simulation (`tests.support.board`), published ones from a kept row.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_memobench.board.__main__ import main as check_board
+from lerobot_memobench.board.check import check_author, check_paths, check_submission, read_board
+from lerobot_memobench.board.rows import board_rows
+from lerobot_memobench.board.submission import CARD, LOG, About, read_submission, write_submission
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.run.sealed import policy_hash, scenes_hash
+from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.board import (
+    ABOUT,
+    FILES,
+    evaluation,
+    first_failure,
+    in_card,
+    in_log,
+    scene_of,
+    sealed,
+    stating,
+)
+
+Json = dict[str, Any]
+Change = Callable[[Path], object]
+KEPT = Path(__file__).parents[2] / "results" / "board"
+
+
+@pytest.fixture(scope="module")
+def row(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A valid row with both controls; do not change it."""
+    place = tmp_path_factory.mktemp("hostile")
+    folders = {
+        "": evaluation(place / "m"),
+        "evidence": evaluation(place / "e", evidence=True),
+        "pauses": evaluation(place / "p", pause_steps=100),
+    }
+    return write_submission(place / "one", About(**ABOUT), folders)
+
+
+def every(change: Callable[[Json], object]) -> Change:
+    return in_log(lambda log: [change(record) for record in log], card=True)
+
+
+def successes(change: Callable[[Json], object]) -> Change:
+    return every(lambda record: change(record) if record["success"] else None)
+
+
+def failures(change: Callable[[Json], object]) -> Change:
+    return every(lambda record: None if record["success"] else change(record))
+
+
+def one(change: Callable[[Json], object], number: int = 1) -> Change:
+    return in_log(lambda log: change(log[number]), card=True)
+
+
+def marked(record: Json, steps: list[int | None], ordered: list[int | None] | None = None) -> None:
+    for mark, first, second in zip(record["checkpoints"], steps, steps if ordered is None else ordered, strict=True):
+        mark.update(first_step=first, ordered_step=second)
+
+
+def firsts(record: Json) -> list[Any]:
+    return [mark["first_step"] for mark in record["checkpoints"]]
+
+
+def solved(record: Json, step: int) -> None:
+    record.update(success=True, failure=None, lost=False, steps=step)
+    marked(record, [step] * len(record["checkpoints"]))
+
+
+def inputs(words: str, **protocol: Any) -> Change:
+    def change(folder: Path) -> None:
+        in_log(lambda log: [record.update(inputs=words) for record in log])(folder)
+        in_card(lambda card: card["protocol"].update(inputs=words, **protocol))(folder)
+
+    return change
+
+
+def features(kinds: dict[str, str]) -> Change:
+    made = {name: {"type": kind, "shape": [1]} for name, kind in kinds.items()}
+    return in_card(lambda card: card["policy"]["settings"].update(input_features=made))
+
+
+def both(*changes: Change) -> Change:
+    return lambda folder: [change(folder) for change in changes]
+
+
+def twice(file: str, text: str) -> Change:
+    def change(folder: Path) -> None:
+        content = (folder / file).read_text().replace("{", "{" + text, 1)
+        (folder / file).write_text(content)
+
+    return change
+
+
+def commit(**changed: Any) -> Change:
+    """Add the commitment of a first start on the sealed seeds, with changes."""
+
+    def change(card: Json) -> None:
+        start = {"started": "2026-11-20", "run": 1, "earlier": [], "release": "0.2.0", "policy": policy_hash(card)}
+        card["sealed"] = {**start, "scenes": scenes_hash(card), **changed}
+
+    return in_card(change)
+
+
+def relabelled(folder: Path) -> None:
+    """Move the seeds to the sealed ones and keep what was drawn from the others."""
+    in_log(lambda log: [record.update(seed=100_007 + record["episode"]) for record in log], card=True)(folder)
+    in_card(lambda card: (card["protocol"].update(seed_base=100_007), card["policy"].update(seed=100_007)))(folder)
+
+
+STRICT: dict[str, tuple[Change, str]] = {
+    # steps that no execution can have
+    "all solved at once": (every(lambda record: solved(record, 1)), "from step 20 on"),
+    "solved within half a second": (successes(lambda record: solved(record, 10)), "from step 20 on"),
+    "one checkpoint at once": (one(lambda record: record["checkpoints"][0].update(first_step=2)), "from step 20 on"),
+    "longer than the horizon": (failures(lambda record: record.update(steps=1300)), "at most 1200"),
+    "order without checkpoints": (
+        one(lambda record: marked(record, firsts(record), [None] * len(record["checkpoints"]))),
+        "in order at None",
+    ),
+    "order before the checkpoint": (
+        one(lambda record: record["checkpoints"][-1].update(ordered_step=firsts(record)[-1] - 10)),
+        "in order at",
+    ),
+    "order after the checkpoint": (
+        one(lambda record: record["checkpoints"][0].update(ordered_step=firsts(record)[0] + 10)),
+        "in order at",
+    ),
+    "order with a gap": (one(lambda record: record["checkpoints"][0].update(ordered_step=None)), "in order at"),
+    "order without a first step": (
+        in_log(lambda log: first_failure(log)["checkpoints"][0].update(ordered_step=300), card=True),
+        "at step None and in order at 300",
+    ),
+    # ends that no execution can have
+    "given up early": (failures(lambda record: record.update(steps=900, lost=False)), "ended after 900 of 1200"),
+    "cut off by a horizon": (failures(lambda record: record.update(failure="cut_off")), "the failure class cut_off"),
+    "a fault without a reason": (
+        failures(lambda record: record.update(failure="unstable_physics")),
+        "unstable_physics and the fault None",
+    ),
+    "a reason without a fault": (failures(lambda record: record.update(fault="it broke")), "the fault it broke"),
+    "lost and solved": (successes(lambda record: record.update(lost=True)), "was lost or broken off"),
+    "never asked whether it was lost": (every(lambda record: record.pop("lost", None)), "has lost=None"),
+    "a goal that did not end it": (successes(lambda record: record.update(steps=1100)), "the goal ends a rollout"),
+    "a goal that was no success": (
+        successes(lambda record: record.update(success=False, failure="execution_failure", steps=1200)),
+        "the goal ends a rollout",
+    ),
+    "failures as successes": (failures(lambda record: record.update(success=True, failure=None)), "success"),
+    # prompts
+    "no prompt": (every(lambda record: record.update(prompt_steps=0)), "begins after 0 steps"),
+    "a longer prompt": (one(lambda record: record.update(prompt_steps=record["prompt_steps"] + 1)), "begins after"),
+    "a prompt that was not shown": (
+        every(lambda record: record.update(prompt_shown=None)),
+        "has prompt_shown=None",
+    ),
+    "a prompt of a task without": (
+        every(lambda record: record.update(prompt_shown=get_task(record["task"]).prompt is None or None)),
+        "prompt_shown",
+    ),
+    # scenes
+    "scenes of zeros": (every(lambda record: record.update(scene_hash="0" * 16)), "equal for equal seeds only"),
+    "no scenes": (every(lambda record: record.pop("scene_hash")), "hashes of 16 digits"),
+    "a scene's name": (one(lambda record: record.update(scene_hash="kitchen")), "hashes of 16 digits"),
+    "two seeds of one scene": (
+        one(lambda record: record.update(scene_hash=scene_of(record["task"], 7)), 3),
+        "equal for equal seeds only",
+    ),
+    "other scenes in a control": (
+        lambda folder: one(lambda record: record.update(scene_hash="ab" * 8))(folder / "pauses"),
+        "equal for equal seeds only",
+    ),
+    # who acted, on what
+    "privileged state as pixels": (inputs("pixels", obs_type="environment_state_agent_pos"), "inputs are 'pixels'"),
+    "a policy of objects as pixels": (features({"observation.environment_state": "ENV"}), "inputs are 'pixels'"),
+    "both read, pixels named": (
+        both(
+            inputs("pixels", obs_type="both"),
+            features({"observation.environment_state": "ENV", "observation.images.image": "VISUAL"}),
+        ),
+        "inputs are 'pixels'",
+    ),
+    "the expert as pixels": (
+        both(
+            every(lambda record: record.update(policy="memobench_expert 0123")),
+            in_card(lambda card: card["policy"].update(type="memobench_expert")),
+        ),
+        "inputs are 'pixels'",
+    ),
+    "the expert's action as pixels": (
+        in_card(lambda card: card["settings"].update(env={"expert_action": True})),
+        "inputs are 'pixels'",
+    ),
+    "features without a form": (
+        both(
+            in_card(lambda card: card["policy"]["settings"].update(input_features=[7])),
+            in_card(lambda card: card["settings"].update(env="expert_action")),
+            inputs("pixels", obs_type="environment_state_agent_pos"),
+        ),
+        "inputs are 'pixels'",
+    ),
+    "another checkpoint": (in_card(lambda card: card["policy"].update(sha256="3" * 64)), "the policy's sha256"),
+    "another file of weights": (
+        in_card(lambda card: card["checkpoint"].update(files={**FILES, "model.safetensors": "4" * 64})),
+        "the policy's sha256",
+    ),
+    "lines of a similar policy": (every(lambda record: record.update(policy="act_large 0123")), "of the policy"),
+    "versions of other years": (
+        in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "lerobot": "0.1.0"})),
+        "the card names lerobot 0.1.0",
+    ),
+    "a version without a form": (
+        in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "mujoco": "not 3"})),
+        "the card names mujoco not 3",
+    ),
+    # seeds
+    "seeds named as sealed": (both(relabelled, commit()), "begins after"),
+    "sealed for another policy": (both(sealed, commit(policy="5" * 64)), r"match \(policy"),
+    "sealed in another release": (both(sealed, commit(release="0.1.0")), r"match \(release"),
+    "run 0 of the sealed test": (both(sealed, commit(run=0)), "run|greater"),
+    "a second run without a first": (both(sealed, commit(run=2)), r"match \(run: 2 there, 1"),
+    # statements
+    "a key twice on the card": (twice(CARD, '"protocol": {},'), "a key twice"),
+    "look-alike letters": (stating("model", "mеmobench"), "one alphabet"),
+    "wide letters": (stating("model", "ｍｅｍｏ"), "one alphabet"),
+    "a call of many people": (stating("submitter", "@team @all"), "submitter = "),
+    "a date to come": (stating("date", "9999-12-31"), "date = "),
+    "a date before the benchmark": (stating("date", "0001-01-01"), "date = "),
+    "a look-alike host": (stating("links", {"code": "https://www.xn--ggle-55da.com/"}), "begins with https"),
+    "a path upwards": (stating("links", {"code": "https://github.com/../x"}), "begins with https"),
+}
+
+
+@pytest.mark.parametrize("name", STRICT)
+def test_hostile_submission_is_refused(row: Path, tmp_path: Path, name: str) -> None:
+    change, reason = STRICT[name]
+    folder = shutil.copytree(row, tmp_path / "one")
+    change(folder)
+    with pytest.raises(MemobenchError, match=reason) as refused:
+        check_submission(read_submission(folder))
+    assert "\n" not in str(refused.value)
+
+
+PUBLISHED: dict[str, tuple[Change, str]] = {
+    "prompts never played": (every(lambda record: record.update(prompt_steps=0, prompt_shown=None)), "begins after 0"),
+    "idling of a strict task": (every(lambda record: record.update(prompt_steps=300)), "begins after 300"),
+    "failures as successes": (
+        failures(lambda record: record.update(success=True, failure=None, steps=1000)),
+        "without the checkpoint|the goal ends a rollout",
+    ),
+    "lost goals": (failures(lambda record: record.update(lost=True)), "has lost=True"),
+    "privileged state as pixels": (inputs("pixels", obs_type="pixels_agent_pos"), "inputs are 'pixels'"),
+    "seeds named as sealed": (both(relabelled, commit()), "drew the variants"),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_hostile_published_submission_is_refused(tmp_path: Path, name: str) -> None:
+    change, reason = PUBLISHED[name]
+    folder = shutil.copytree(KEPT / "memobench_small", tmp_path / "one")
+    check_submission(read_submission(folder))
+    change(folder)
+    with pytest.raises(MemobenchError, match=reason):
+        check_submission(read_submission(folder))
+
+
+def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
+    """A row of fixed referents draws no variants: its seeds are known by their scenes."""
+    others = [read_submission(KEPT / "memobench_small")]
+    folder = shutil.copytree(KEPT / "memobench_blind", tmp_path / "one")
+    check_submission(read_submission(folder), others)
+    both(relabelled, commit())(folder)
+    check_submission(read_submission(folder))
+    with pytest.raises(MemobenchError, match="equal for equal seeds only"):
+        check_submission(read_submission(folder), others)
+    folder = shutil.copytree(KEPT / "memobench_blind", tmp_path / "two")
+    every(lambda record: record.update(scene_hash=scene_of(record["task"], record["seed"])))(folder)
+    check_submission(read_submission(folder))
+    with pytest.raises(MemobenchError, match="another rollout of the board"):
+        check_submission(read_submission(folder), others)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        stating("model", "Other"),
+        in_card(lambda card: card["checkpoint"].update(path="user/other")),
+        lambda folder: in_card(lambda card: card["checkpoint"].update(path="user/other"))(folder / "pauses"),
+        lambda folder: one(lambda record: record.update(wall_s=1.0))(folder / "evidence"),
+        lambda folder: shutil.rmtree(folder / "evidence"),
+    ],
+    ids=["another model", "other weights", "a control's card", "a control's log", "a control less"],
+)
+def test_mark_of_a_rerun_covers_the_whole_row(row: Path, tmp_path: Path, change: Change) -> None:
+    board = tmp_path / "board"
+    folder = shutil.copytree(row, board / "one")
+    (board / "reruns.json").write_text(json.dumps({"one": read_submission(folder).digest}))
+    assert [each.rerun for each in board_rows(board)] == [True]
+    change(folder)
+    assert [each.rerun for each in board_rows(board)] == [False]
+
+
+def test_a_pull_request_changes_one_row_of_its_author(
+    row: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    board = Path("submitted")
+    shutil.copytree(row, board / "one")
+    Path("changed").write_text(f"results/board/one/{CARD}\0results/board/one/{LOG}\0")
+    assert check_board([str(board), "changed", "One"]) == 0
+    assert f"accepted: one {read_board(board)[0].digest}" in capsys.readouterr().out
+    assert check_board([str(board), "changed", ""]) == 0, "a maintainer"
+    assert check_board([str(board), "changed", "other"]) == 1
+    assert "changes one of @one; expected" in capsys.readouterr().err
+    stating("submitter", "@other")(shutil.copytree(row, Path("results/board/one")))
+    assert check_board([str(board), "changed", "one"]) == 1, "the row belongs to somebody else so far"
+    assert "one of @other" in capsys.readouterr().err
+    for paths in (["one/a", "two/a"], ["one/a", "reruns.json"], ["one/a", "../../src/x.py"], ["one/a", "x"]):
+        with pytest.raises(MemobenchError, match="the pull request also changes"):
+            check_paths(f"results/board/{path}" for path in paths)
+    with pytest.raises(MemobenchError, match=r"changes reruns.json of the maintainers"):
+        check_author("one", check_paths(["results/board/reruns.json"]), board, board)

@@ -1,0 +1,133 @@
+"""Evaluations and submissions for tests of the board, without a simulation, and changes of them."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.board.submission import CARD, LOG
+from lerobot_memobench.datasets.generation import task_hash
+from lerobot_memobench.envs.episode import first_execution_step, referent_of
+from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.run.card import new_card, with_episodes, write_card
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.evidence import chance, scene_and_variant
+
+TASKS = task_names(suite="strict")
+ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
+VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
+FILES = {"config.json": "1" * 64, "model.safetensors": "2" * 64}
+PICTURES = {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}}
+Json = dict[str, Any]
+
+
+# --- a valid evaluation and its submission ---
+
+
+def scene_of(name: str, seed: int) -> str:
+    return hashlib.sha256(f"{name}, {seed}".encode()).hexdigest()[:16]
+
+
+def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Json:
+    """A rollout of a strict task: every third one fails at its first checkpoint."""
+    published = get_task(name)
+    scene, seed = episode, first + episode
+    task = referent_of(published, seed)
+    if settings.get("evidence"):
+        scene, variant = scene_and_variant(published, episode)
+        seed, task = first + scene, published.variant(variant)
+    success = episode % 3 > 0
+    steps = speed * len(task.checkpoints) + scene if success else 1200
+    goals = [checkpoint.goal for checkpoint in task.checkpoints]
+    marks = [speed * (k + 1) + scene if success or (k and goals[k] != task.goal) else None for k in range(len(goals))]
+    choice = {"choice": task.variant_index if success else None, "answered": success}
+    choice |= {"variants": len(published.random_variants), "chance": chance(published)}
+    return {
+        **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed, "referent": "drawn"},
+        **{"variant": task.variant_index, "replan_steps": 5, "prompt_shown": None if task.prompt is None else True},
+        **{"prompt_steps": first_execution_step(published, seed, True), "steps": steps, "success": success},
+        **(choice if settings.get("evidence") else {}),
+        **({"paused_steps": 500} if settings.get("pause_steps") else {}),
+        "checkpoints": [
+            {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
+            for c, step in zip(task.checkpoints, marks, strict=True)
+        ],
+        **{"failure": None if success else "storage_failure", "suite": "strict", "lost": False},
+        **{"scene_hash": scene_of(name, seed), "wall_s": 2.0, "policy": "act 0123", "run": "r", "inputs": "pixels"},
+    }
+
+
+def evaluation(folder: Path, first: int = 7, speed: int = 50, **settings: Any) -> Path:
+    """Write the folder of an evaluation of the strict suite: 10 episodes of each task, of those with variants 12."""
+    names = [name for name in TASKS if not settings.get("evidence") or get_task(name).num_variants > 1]
+    count = 12 if settings.get("evidence") else 10
+    records = [line(name, episode, first, speed, **settings) for name in names for episode in range(count)]
+    block = EnvSettings(suite="strict", seed_base=first, replan_steps=5, **settings).protocol_block
+    card = new_card(
+        protocol={"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
+        policy={"type": "act", "seed": first, "settings": {"input_features": PICTURES}, "sha256": tree_hash(FILES)},
+        checkpoint={"path": "user/one", "revision": "abc", "files": FILES},
+        trained_on={"repo_id": "user/data", "revision": "def"},
+        task_files={name: task_hash(get_task(name)) for name in names},
+        settings={},
+        runs=[{"command": ["lerobot"], "batch_size": 1, "versions": VERSIONS, "git_commit": None, "machine": {}}],
+    )
+    folder.mkdir(parents=True)
+    write_episodes(folder, records)
+    write_card(folder, with_episodes(card, records))
+    return folder
+
+
+# --- changes of a submission ---
+
+
+def first_failure(records: list[Json]) -> Json:
+    return next(record for record in records if not record["success"])
+
+
+def in_log(change: Callable[[list[Json]], object], *, card: bool = False) -> Callable[[Path], None]:
+    """A change of the log, and of the card's episodes with ``card``."""
+
+    def apply(folder: Path) -> None:
+        lines = [json.loads(each) for each in gzip.decompress((folder / LOG).read_bytes()).splitlines()]
+        change(lines)
+        (folder / LOG).write_bytes(gzip.compress("".join(json.dumps(each) + "\n" for each in lines).encode()))
+        if card:
+            in_card(lambda content: change(content["episodes"]))(folder)
+
+    return apply
+
+
+def in_card(change: Callable[[Json], object]) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        content = json.loads((folder / CARD).read_text())
+        change(content)
+        (folder / CARD).write_text(json.dumps(content))
+
+    return apply
+
+
+def stating(key: str, value: Any) -> Callable[[Path], None]:
+    """A statement of the submitter."""
+    return in_card(lambda content: content["submission"].__setitem__(key, value))
+
+
+def sealed(folder: Path) -> None:
+    """Move all seeds to the sealed ones, with the variants that they draw, without a commitment."""
+
+    def move(records: list[Json]) -> None:
+        for record in records:
+            record["seed"] = 100_007 + record["episode"]
+            task = get_task(record["task"])
+            record["variant"] = referent_of(task, record["seed"]).variant_index
+            record["prompt_steps"] = first_execution_step(task, record["seed"], True)
+            record["scene_hash"] = scene_of(task.name, record["seed"])
+
+    in_log(move, card=True)(folder)
+    in_card(lambda card: (card["protocol"].update(seed_base=100_007), card["policy"].update(seed=100_007)))(folder)
