@@ -166,6 +166,13 @@ def test_refused_destinations_and_episodes(synthetic, demos, make_demo, tmp_path
             write_dataset(demos, folder)
     assert hashes(synthetic) == before
     assert [path.name for path in other.iterdir()] == ["thesis.tex"]
+    linked = tmp_path / "linked"
+    linked.mkdir()
+    (linked / ".staging").symlink_to(tmp_path)  # `episodes` in it would be removed
+    (tmp_path / "episodes").mkdir()
+    with pytest.raises(MemobenchError, match=r"\.staging is a link"):
+        write_dataset(demos, linked)
+    assert (tmp_path / "episodes").is_dir()
     with pytest.raises(MemobenchError, match="some episodes"):
         write_dataset([make_demo(["01"]), make_demo(["01"], size=16)], tmp_path / "mixed")
     assert not is_dataset(tmp_path / "mixed")

@@ -24,6 +24,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     without_pattern,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import files_below
 from lerobot_memobench.protocol import OBS_PHASE
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def read_frame_table(root: Path) -> FrameTable:
 
 def holds_texts(root: Path, column: str) -> bool:
     """Return whether a column of texts exists and has a text that is not empty."""
-    for path in sorted((root / "data").rglob("*.parquet")):
+    for path in files_below(root / "data", ".parquet"):
         if column in pq.read_schema(path).names and any(_texts(pq.read_table(path, columns=[column]), column)):
             return True
     return False
@@ -89,7 +90,7 @@ def holds_texts(root: Path, column: str) -> bool:
 
 def _read_columns(root: Path, optional: list[str]) -> pa.Table:
     """Return each frame's indices, and the existing ones among the optional columns."""
-    files = sorted((root / "data").rglob("*.parquet"))
+    files = files_below(root / "data", ".parquet")
     if not files:
         raise MemobenchError(f"{root} holds no frames: there is no parquet file below {root / 'data'}.")
     with undamaged(files[0]):
@@ -296,7 +297,7 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
     table = read_frame_table(root)
     frames = int(table.episodes[-1])
     columns: dict[str, np.ndarray] = {}
-    for path in sorted((root / "data").rglob("*.parquet")):
+    for path in files_below(root / "data", ".parquet"):
         with undamaged(path):
             there = pq.read_schema(path).names
         column_of = {name: objects_column(there) if name == OBJECTS else name for name in names}

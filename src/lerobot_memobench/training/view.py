@@ -40,7 +40,7 @@ from lerobot_memobench.datasets.statistics import recorded
 from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import cache_folder, explaining_disk_errors, write_file
+from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import LerobotArguments
 from lerobot_memobench.training.configuration import check_environment, read_config
@@ -179,7 +179,7 @@ def described(choice: Choice) -> str:
 def view_hash(root: Path, choice: Choice) -> str:
     """Return a hash of a dataset's path, tables and metadata, and of the choice."""
     digest = hashlib.blake2b(f"{root.resolve()} {choice}".encode(), digest_size=8)
-    for path in (*sorted((root / "meta").rglob("*.*")), *sorted((root / "data").rglob("*.parquet"))):
+    for path in (*files_below(root / "meta"), *files_below(root / "data", ".parquet")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -202,11 +202,11 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
     build = out.with_name(f".{out.name}.{os.getpid()}")
     with explaining_disk_errors(out):
         shutil.rmtree(build, ignore_errors=True)
-        for path in sorted((root / "data").rglob("*.parquet")):
+        for path in files_below(root / "data", ".parquet"):
             with undamaged(path):
                 rows = pq.read_table(path)
             _write_table(_part_of(rows, kept, wanted, left_out, info["fps"]), build / path.relative_to(root))
-        for path in sorted((root / EPISODES_FOLDER).rglob("*.parquet")):
+        for path in files_below(root / EPISODES_FOLDER, ".parquet"):
             with undamaged(path):
                 rows = pq.read_table(path)
             _write_table(_episodes_of(rows, ends, left_out / info["fps"]), build / path.relative_to(root))
@@ -217,7 +217,7 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
         write_file(build / STATS_FILE, json.dumps({kept[name]: one for name, one in stats.items() if name in kept}))
         shutil.copyfile(root / TASKS_FILE, build / TASKS_FILE)
         for camera in cameras_of(features):
-            for path in sorted((root / "videos" / camera).rglob("*.mp4")):
+            for path in files_below(root / "videos" / camera, ".mp4"):
                 _link(path.resolve(), build / path.relative_to(root))
         build.rename(out)
 

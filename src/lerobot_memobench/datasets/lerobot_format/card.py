@@ -14,6 +14,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import read_info, undamage
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, list_episodes
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import files_below
 from lerobot_memobench.paper import raw_tables
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES
@@ -344,7 +345,7 @@ def _prompts(infos: Sequence[dict[str, Any]]) -> str:
 def _size(folder: Path) -> int:
     """Return the bytes of a dataset, without its card and manifest."""
     kept = [folder / part for part in ("data", "meta", "states", "videos")]
-    return sum(path.stat().st_size for part in kept for path in part.rglob("*") if path.is_file())
+    return sum(path.stat().st_size for part in kept for path in files_below(part))
 
 
 def ordered_types(infos: Sequence[Mapping[str, Any]]) -> list[str]:

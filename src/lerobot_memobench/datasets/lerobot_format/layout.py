@@ -23,7 +23,9 @@ from lerobot_memobench.io import (
     cache_folder,
     check_fetched,
     count_of,
+    files_below,
     read_json,
+    refuse_links,
     refusing,
 )
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
@@ -68,6 +70,7 @@ def check_destination(out: Path) -> None:
         raise MemobenchError(f"{out} contains a colon, which Arrow reads as an address; use an absolute path")
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
+    refuse_links(*(out / name for name in (STAGING, *TOP_LEVEL)))
     # Files of an interrupted move next to the staging folder are replaced.
     strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
     if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
@@ -79,8 +82,7 @@ def check_destination(out: Path) -> None:
 def dataset_files(folder: Path) -> list[str]:
     """Return the paths of a dataset's files below ``folder``, without card, manifest and caches."""
     folders = [folder / name for name in TOP_LEVEL if not Path(name).suffix]
-    found = [path for part in folders for path in part.rglob("*") if path.is_file()]
-    return sorted(path.relative_to(folder).as_posix() for path in found)
+    return sorted(path.relative_to(folder).as_posix() for part in folders for path in files_below(part))
 
 
 # --- columns ---
@@ -195,7 +197,7 @@ def _row_count(folder: Path) -> int:
     import pyarrow.parquet as pq
 
     rows = 0
-    for path in sorted(folder.rglob("*.parquet")):
+    for path in files_below(folder, ".parquet"):
         with undamaged(path):
             rows += pq.read_metadata(path).num_rows
     return rows
@@ -318,7 +320,7 @@ def _video_lengths(folder: Path, info: dict[str, Any], cameras: list[str]) -> di
     import pyarrow.parquet as pq
 
     found: dict[Path, int] = {}
-    for table in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
+    for table in files_below(folder / "meta" / "episodes", ".parquet"):
         for camera in cameras:
             parts = ("chunk_index", "file_index", "to_timestamp")
             with undamaged(table):
@@ -352,8 +354,8 @@ def _check_video(path: Path, frames: int) -> None:
 
 def damaged_file(folder: Path) -> str | None:
     """Read a whole dataset; return a message that names the first unreadable file, None if all can be read."""
-    tables = sorted([*folder.glob("data/**/*.parquet"), *folder.glob("meta/**/*.parquet")])
-    for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *sorted(folder.glob("videos/**/*.mp4"))]:
+    tables = [path for part in ("data", "meta") for path in files_below(folder / part, ".parquet")]
+    for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *files_below(folder / "videos", ".mp4")]:
         try:
             if not path.is_file():
                 return f"{path} is missing; {ADVICE}"

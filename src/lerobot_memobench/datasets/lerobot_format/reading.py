@@ -26,7 +26,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     undamaged,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Number, Whole, first_fault, parsed
+from lerobot_memobench.io import Count, Malformed, Number, Whole, files_below, first_fault, parsed
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, World
 
@@ -350,7 +350,7 @@ def _read(folder: Path, names: tuple[str, ...] | None, chosen: list[tuple[str, s
     import pyarrow.parquet as pq
 
     tables = []
-    for path in sorted(folder.rglob("*.parquet")):
+    for path in files_below(folder, ".parquet"):
         with undamaged(path):
             there = pq.read_schema(path).names
             columns = None if names is None else [name for name in names if name in there]
