@@ -209,7 +209,7 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Pro
                 identity = [name, info.file_size, info.CRC]
                 files.append(SourceFile(name, info.file_size, unpacked / name, identity, info))
     else:
-        paths = [source] if source.is_file() else files_below(source, *SUFFIXES)
+        paths = files_below(source, *SUFFIXES) if source.is_dir() else [source]
         for path in paths:
             name, stat = path.name if path == source else path.relative_to(source).as_posix(), path.stat()
             files.append(SourceFile(name, stat.st_size, path, [name, stat.st_size, stat.st_mtime_ns]))
