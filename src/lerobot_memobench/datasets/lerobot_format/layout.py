@@ -10,9 +10,11 @@ import traceback
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
+import numpy as np
 from annotated_types import Ge, Le
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
@@ -27,8 +29,12 @@ from lerobot_memobench.io import (
     read_json,
     refuse_links,
     refusing,
+    short,
 )
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, CONTROL_HZ, PROPRIO_DIM
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 STAGING = ".staging"
 """Folder of an unfinished run within its destination."""
@@ -37,6 +43,12 @@ MANIFEST_FILE = "manifest.json"
 INFO_FILE = Path("meta") / "info.json"
 STATS_FILE = Path("meta") / "stats.json"
 TASKS_FILE = Path("meta") / "tasks.parquet"
+EPISODES = "meta/episodes"
+EPISODES_FILE = EPISODES + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+PLACES = ("index", "_timestamp", "timestamp", "length", "tasks")
+"""Ends of the names of columns that place episodes and frames."""
+TOLERANCE = 1e-3
+"""Largest difference of times, s or frames."""
 TOP_LEVEL = ("videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
 """In the order in which they are moved into place; with `meta` the folder becomes a dataset."""
 EPISODE_INFO = "episode_info"
@@ -294,41 +306,87 @@ def undamaged(folder: Path) -> AbstractContextManager[None]:
 
 
 def check_whole(folder: Path) -> None:
-    """Check that a dataset has all of its frames, without reading them.
+    """Check that a dataset has all of its frames, at the places that its metadata names, without decoding videos.
 
-    The check covers ends and row counts of tables, and boxes and frame counts of videos.
+    The check covers ends and row counts of tables, totals, numbers of tasks, bounds and files of episodes, the
+    numbering of frames, and boxes and frame counts of videos.
 
     Raises:
-        MemobenchError: naming the first file that is truncated or missing, or the table with missing rows.
+        MemobenchError: naming the first truncated or missing file, or the first number that differs.
     """
-    info = read_info(folder)
-    counts = {"data": info.get("total_frames"), "meta/episodes": info["total_episodes"]}
+    with undamaged(folder):
+        _check_bounds(folder, read_info(folder))
+
+
+def _check_bounds(folder: Path, info: dict[str, Any]) -> None:
+    import pandas as pd
+
+    check_fetched(folder / TASKS_FILE)
+    rows, frames, tasks = _table(folder, EPISODES), _table(folder, "data"), pd.read_parquet(folder / TASKS_FILE)
+    totals = {"total_episodes": len(rows), "total_frames": len(frames), "total_tasks": len(tasks)}
+    for key, total in totals.items():
+        expect(INFO_FILE, key, [info.get(key, total)], [total])
     if (folder / "states").is_dir():
-        counts["states"] = info.get("total_frames")
-    for part, expected in counts.items():
-        rows = _row_count(folder / part)
-        if expected is not None and rows != expected:
-            raise MemobenchError(f"{folder / part} holds {rows} rows, {INFO_FILE} names {expected}; {ADVICE}")
-    cameras = [key for key, feature in info["features"].items() if feature.get("dtype") == "video"]
-    for path, frames in _video_lengths(folder, info, cameras).items():
-        with undamaged(path):
-            _check_video(path, frames)
+        expect("states", "number of rows", [_row_count(folder / "states")], [len(frames)])
+    expect(TASKS_FILE, "task_index", tasks["task_index"], range(len(tasks)))
+    episodes = np.arange(len(rows))
+    lengths = frames["episode_index"].value_counts().reindex(episodes, fill_value=0).to_numpy()
+    ends, of_frame = np.cumsum(lengths), np.repeat(episodes, lengths)
+    starts, index = ends - lengths, np.arange(len(of_frame))
+    within = index - starts[of_frame]
+    bounds = {"episode_index": episodes, "length": lengths, "dataset_from_index": starts, "dataset_to_index": ends}
+    for key, wanted in bounds.items():
+        expect(EPISODES, key, rows[key], wanted)
+    times = within / info.get("fps", CONTROL_HZ)
+    numbers = {"episode_index": of_frame, "index": index, "frame_index": within, "timestamp": times}
+    files = _paths(EPISODES_FILE, rows, EPISODES) if f"{EPISODES}/file_index" in rows else rows["path"]
+    expect(EPISODES, "file", files, rows["path"])
+    for key, wanted in (numbers | {"path": _paths(info["data_path"], rows, "data")[of_frame]}).items():
+        expect("data", key, frames[key], wanted)
+    texts = [{tasks.index[k] for k in set(part)} for part in np.split(frames["task_index"].to_numpy(), ends[:-1])]
+    expect(EPISODES, "tasks", [set(each) for each in rows["tasks"]], texts)
+    for camera in (key for key, feature in info["features"].items() if feature["dtype"] == "video"):
+        times = rows[[f"videos/{camera}/from_timestamp", f"videos/{camera}/to_timestamp"]].to_numpy() * info["fps"]
+        expect(EPISODES, f"length of {camera}", np.diff(times)[:, 0], rows["length"])
+        paths = _paths(info["video_path"].replace("{video_key}", camera), rows, f"videos/{camera}")
+        for path in dict.fromkeys(paths):
+            begins, stops = times[paths == path].T
+            if not (folder / path).is_file() or (begins < np.append(0, stops[:-1]) - TOLERANCE).any():
+                raise MemobenchError(f"{EPISODES} names {path}, which is missing, or where episodes overlap; {ADVICE}")
+            with undamaged(folder / path):
+                _check_video(folder / path, round(stops[-1]))
 
 
-def _video_lengths(folder: Path, info: dict[str, Any], cameras: list[str]) -> dict[Path, int]:
-    """Return the number of frames of each video, according to meta/episodes."""
+def expect(where: Path | str, key: str, found: Any, wanted: Any) -> None:
+    """Raise `MemobenchError` at the first difference of two sequences of numbers, texts or sets."""
+    found, wanted = np.asarray(found), np.asarray(wanted)
+    if found.shape == wanted.shape:
+        is_number = wanted.dtype.kind in "iuf"
+        differs = np.flatnonzero(~(abs(found - wanted) <= TOLERANCE) if is_number else found != wanted)
+        if not differs.size:
+            return
+        found, wanted, key = found[differs[:1]], wanted[differs[:1]], f"{key} of row {differs[0]}"
+    raise MemobenchError(f"{where}: {key} is {short(found.tolist())}, expected {short(wanted.tolist())}; {ADVICE}")
+
+
+def _table(folder: Path, part: str) -> pd.DataFrame:
+    """Return numbering and bounds in a folder's tables, and the file of each row as ``path``."""
+    import pandas as pd
     import pyarrow.parquet as pq
 
-    found: dict[Path, int] = {}
-    for table in files_below(folder / "meta" / "episodes", ".parquet"):
-        for camera in cameras:
-            parts = ("chunk_index", "file_index", "to_timestamp")
-            with undamaged(table):
-                columns = pq.read_table(table, columns=[f"videos/{camera}/{part}" for part in parts]).to_pydict()
-                for chunk, file, end in zip(*columns.values(), strict=True):
-                    place = info["video_path"].format(video_key=camera, chunk_index=int(chunk), file_index=int(file))
-                    found[folder / place] = max(found.get(folder / place, 0), round(end * info["fps"]))
-    return found
+    tables = []
+    for path in files_below(folder / part, ".parquet"):
+        with undamaged(path):
+            names = [name for name in pq.read_schema(path).names if name.endswith(PLACES)]
+            table = pq.read_table(path, columns=names).to_pandas()
+        tables.append(table.assign(path=path.relative_to(folder).as_posix()))
+    return pd.concat(tables, ignore_index=True)
+
+
+def _paths(template: str, rows: pd.DataFrame, prefix: str) -> NDArray:
+    """Return the file of each episode by its numbers in meta/episodes."""
+    numbers = zip(rows[f"{prefix}/chunk_index"], rows[f"{prefix}/file_index"], strict=True)
+    return np.array([template.format(chunk_index=int(chunk), file_index=int(file)) for chunk, file in numbers])
 
 
 def _check_video(path: Path, frames: int) -> None:
