@@ -164,6 +164,13 @@ def test_earlier_format_is_named_with_its_converter(synthetic, copy, tmp_path, c
     assert f"convert_dataset_v21_to_v30 --repo-id=local/converted --root={root}" in capsys.readouterr().err
 
 
+def test_a_dataset_is_no_log(synthetic, copy):
+    root = copy(synthetic)
+    (root / "meta" / "episodes.jsonl").write_text('{"episode_index": 0}')  # as LeRobot's format v2.1 has it
+    with pytest.raises(MemobenchError, match="is a LeRobotDataset, expected the folder of an evaluation"):
+        read_log(root)
+
+
 @pytest.mark.parametrize("name", ["episodes.jsonl", "episodes.jsonl.gz", "weights"])
 def test_pointers_to_logs_and_weights_are_named(tmp_path, name):
     if name == "weights":

@@ -66,7 +66,6 @@ PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", 
 ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
 ADVICE = "the dataset is damaged; generate it or take it from its source again"
 NO_MANIFEST = "this package did not write it like that; take the dataset from its source again"
-EARLIER_FORMATS = ("v1.6", "v2.0", "v2.1")
 
 
 def is_dataset(folder: Path) -> bool:
@@ -181,7 +180,7 @@ def read_info(folder: Path) -> dict[str, Any]:
         found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
     except FileNotFoundError:
         raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
-    if found["codebase_version"] in EARLIER_FORMATS:
+    if not found["codebase_version"].startswith("v3."):
         raise MemobenchError(
             f"{folder} is in LeRobot's format {found['codebase_version']}, expected v3.0; convert it in place, from "
             f"v2.1: python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/converted "
