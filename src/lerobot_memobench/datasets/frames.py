@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS, MEMORY_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import (
     OBJECTS,
     check_clock,
@@ -30,8 +31,6 @@ from lerobot_memobench.protocol import OBS_PHASE
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-LEVEL_COLUMNS = {"coarse": "coarse_subgoal", "intermediate": "simple_subgoal", "fine": "grounded_subgoal"}
-MEMORY_COLUMN = "memory"
 _PLACE = ("index", "episode_index", "frame_index")
 TOLERANCE = 1e-4
 """Largest difference of a decoded frame to its time, s."""
@@ -83,8 +82,9 @@ def read_frame_table(root: Path) -> FrameTable:
 def holds_texts(root: Path, column: str) -> bool:
     """Return whether a column of texts exists and has a text that is not empty."""
     for path in files_below(root / "data", ".parquet"):
-        if column in pq.read_schema(path).names and any(_texts(pq.read_table(path, columns=[column]), column)):
-            return True
+        for name in pq.read_schema(path).names:
+            if EARLIER_COLUMNS.get(name, name) == column and any(_texts(pq.read_table(path, columns=[name]), name)):
+                return True
     return False
 
 
@@ -96,12 +96,14 @@ def _read_columns(root: Path, optional: list[str]) -> pa.Table:
     with undamaged(files[0]):
         present = pq.read_schema(files[0]).names
     check_clock(present, root)
-    columns = [*_PLACE, *(name for name in optional if name in present)]
+    own = {EARLIER_COLUMNS.get(name, name): name for name in present}
+    kept = {name: own[name] for name in (*_PLACE, *optional) if name in own}
     tables = []
     for path in files:
         with undamaged(path):
-            tables.append(pq.read_table(path, columns=columns))
-    return pa.concat_tables(tables, promote_options="permissive").sort_by("index")
+            tables.append(pq.read_table(path, columns=[*kept.values()]))
+    table = pa.concat_tables(tables, promote_options="permissive").sort_by("index")
+    return table.rename_columns([*kept])
 
 
 def _episodes(root: Path, table: pa.Table) -> np.ndarray:

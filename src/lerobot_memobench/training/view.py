@@ -24,6 +24,7 @@ from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
+from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.lerobot_format.layout import (
     INFO_FILE,
@@ -47,8 +48,6 @@ from lerobot_memobench.training.configuration import check_environment, read_con
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
-OURS = {*CLOCK, "simple_subgoal"}
-"""Columns that identify a dataset of the benchmark; a phase alone may have another meaning."""
 EPISODES_FOLDER = Path("meta") / "episodes"
 
 
@@ -161,10 +160,15 @@ def choice_for(policy: Any, features: Mapping[str, Any], prompt_frames: bool | N
     return Choice(prompts, obs_type)
 
 
+def _is_ours(features: Mapping[str, Any]) -> bool:
+    """Return whether a dataset is the benchmark's, by its texts too: a phase alone may have another meaning."""
+    return {*CLOCK, LEVEL_COLUMNS["intermediate"]} <= {EARLIER_COLUMNS.get(name, name) for name in features}
+
+
 def needs_view(features: Mapping[str, Any], choice: Choice) -> bool:
     """Return whether a dataset differs from its view."""
     kept = choice.columns(features)
-    return (set(features) >= OURS and not choice.prompts) or kept != {name: name for name in features}
+    return (_is_ours(features) and not choice.prompts) or kept != {name: name for name in features}
 
 
 def described(choice: Choice) -> str:
@@ -195,7 +199,7 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
     info, table = read_info(root), read_frame_table(root)
     kept = choice.columns(info["features"])
     wanted = np.ones(len(table.phase), dtype=bool)
-    if set(info["features"]) >= OURS and not choice.prompts:
+    if _is_ours(info["features"]) and not choice.prompts:
         wanted = table.phase == EXECUTION
     ends = np.concatenate([[0], np.cumsum(wanted)])[table.episodes]
     left_out = np.diff(table.episodes) - np.diff(ends)

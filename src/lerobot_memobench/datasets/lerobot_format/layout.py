@@ -17,7 +17,12 @@ from annotated_types import Ge, Le
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
+from lerobot_memobench.datasets.demonstration import (
+    INSTRUCTION_COLUMN,
+    LEVEL_COLUMNS,
+    MAX_CHECKPOINTS,
+    MEMORY_COLUMN,
+)
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -128,7 +133,7 @@ def check_clock(names: Collection[str], where: Path | str) -> None:
 
 def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns; ``image_size`` is (height, width), None without images."""
-    from lerobot_memobench.sim.object_layout import SIZE
+    from lerobot_memobench.sim.object_layout import NAMES, SIZE
 
     def feature(dtype: str, shape: tuple[int, ...] = (1,), names: list[str] | None = None) -> dict[str, Any]:
         return {"dtype": dtype, "shape": shape, "names": names}
@@ -137,21 +142,18 @@ def dataset_features(image_size: tuple[int, int] | None) -> dict[str, dict[str, 
     if image_size is not None:
         for camera in CAMERAS:
             features[image_key(camera)] = feature("video", (*image_size, 3), ["height", "width", "channels"])
-    features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,))
+    features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,), NAMES)
     completed = [f"checkpoint_{k}" for k in range(MAX_CHECKPOINTS)]
     return features | {
         "observation.state": feature("float32", (PROPRIO_DIM,), PROPRIO_NAMES),
         "action": feature("float32", (ACTION_DIM,), ACTION_NAMES),
         EXECUTED_ACTION: feature("float32", (ACTION_DIM,), ACTION_NAMES),
-        **dict.fromkeys(CLOCK, feature("float32")),
-        "checkpoint.index": feature("int64"),
-        "checkpoint.operation": feature("int64"),
+        **{name: feature("float32", names=[name.rpartition(".")[2]]) for name in CLOCK},
+        "checkpoint.index": feature("int64", names=["completed_in_order"]),
+        "checkpoint.operation": feature("int64", names=["0_storage_1_update_2_compression_-1_none"]),
         "checkpoint.completed": feature("bool", (MAX_CHECKPOINTS,), completed),
-        "checkpoint.event": feature("bool"),
-        "simple_subgoal": feature("string"),
-        "grounded_subgoal": feature("string"),
-        "coarse_subgoal": feature("string"),
-        "memory": feature("string"),
+        "checkpoint.event": feature("bool", names=["satisfied_first"]),
+        **dict.fromkeys((*LEVEL_COLUMNS.values(), INSTRUCTION_COLUMN, MEMORY_COLUMN), feature("string")),
         "language_persistent": feature("language"),
         EPISODE_INFO: feature("string"),
     }

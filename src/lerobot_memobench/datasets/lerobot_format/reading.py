@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS
 from lerobot_memobench.datasets.lerobot_format.layout import (
     EPISODE_INFO,
     EXECUTED_ACTION,
@@ -368,7 +369,7 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
     for name in table.column_names:
         values = table.column(name).to_pylist()
         is_text = name == LANGUAGE or isinstance(values[0], str)
-        columns[name] = values if is_text else np.array(values)
+        columns[EARLIER_COLUMNS.get(name, name)] = values if is_text else np.array(values)
     for name in ("action", EXECUTED_ACTION, "observation.state", OBJECTS, PRIVILEGED):
         if name in columns:
             columns[name] = columns[name].astype(np.float32)
