@@ -50,7 +50,7 @@ STATS_FILE = Path("meta") / "stats.json"
 TASKS_FILE = Path("meta") / "tasks.parquet"
 EPISODES = "meta/episodes"
 EPISODES_FILE = EPISODES + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-PLACES = ("index", "_timestamp", "timestamp", "length", "tasks")
+PLACES = ("index", "timestamp", "length", "tasks")
 """Ends of the names of columns that place episodes and frames."""
 TOLERANCE = 1e-3
 """Largest difference of times, s or frames."""
@@ -197,23 +197,12 @@ def episode_count(folder: Path) -> int:
     Raises:
         MemobenchError: they cannot be read, or disagree.
     """
-    count, rows = int(read_info(folder)["total_episodes"]), _row_count(folder / "meta" / "episodes")
+    count, rows = int(read_info(folder)["total_episodes"]), len(_table(folder, EPISODES))
     if rows != count:
         raise MemobenchError(
             f"{folder / INFO_FILE} has {count_of(count, 'episode')}, {folder}/meta/episodes {rows}; {ADVICE}"
         )
     return count
-
-
-def _row_count(folder: Path) -> int:
-    """Return the number of rows of the tables in a folder, by their footers."""
-    import pyarrow.parquet as pq
-
-    rows = 0
-    for path in files_below(folder, ".parquet"):
-        with undamaged(path):
-            rows += pq.read_metadata(path).num_rows
-    return rows
 
 
 class Asked(TypedDict):
@@ -328,7 +317,7 @@ def _check_bounds(folder: Path, info: dict[str, Any]) -> None:
     for key, total in totals.items():
         expect(INFO_FILE, key, [info.get(key, total)], [total])
     if (folder / "states").is_dir():
-        expect("states", "number of rows", [_row_count(folder / "states")], [len(frames)])
+        expect("states", "number of rows", [len(_table(folder, "states"))], [len(frames)])
     expect(TASKS_FILE, "task_index", tasks["task_index"], range(len(tasks)))
     episodes = np.arange(len(rows))
     lengths = frames["episode_index"].value_counts().reindex(episodes, fill_value=0).to_numpy()
@@ -381,6 +370,8 @@ def _table(folder: Path, part: str) -> pd.DataFrame:
             names = [name for name in pq.read_schema(path).names if name.endswith(PLACES)]
             table = pq.read_table(path, columns=names).to_pandas()
         tables.append(table.assign(path=path.relative_to(folder).as_posix()))
+    if not tables:
+        raise MemobenchError(f"{folder / part} holds no table; {ADVICE}")
     return pd.concat(tables, ignore_index=True)
 
 
