@@ -70,8 +70,8 @@ def write_file(path: Path, content: str | bytes, *, durable: bool = False) -> Pa
 
 
 def remove_drafts(folder: Path) -> None:
-    """Remove the drafts of killed processes from a folder to which no other process writes, unless it is a link."""
-    for draft in () if folder.is_symlink() else folder.glob(f".*-*{DRAFT}*"):
+    """Remove the temporary files of killed processes from a folder to which no other process writes."""
+    for draft in folder.glob(f".*-*{DRAFT}*"):
         draft.unlink(missing_ok=True)
 
 

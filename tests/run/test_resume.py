@@ -201,3 +201,18 @@ def test_a_full_disk_is_named_with_folder_and_command(
     assert "out cannot be written (No space left on device; " in last
     assert "finished episodes stay; resume with: lerobot eval" in last
     assert "resume=true output_dir=out" in last
+
+
+@pytest.mark.parametrize("name", ["videos", "memory_reads"])
+def test_files_of_another_evaluation_are_not_written_through_a_link(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    other, out = tmp_path / "other", Path("out")
+    other.mkdir()
+    out.mkdir()
+    draft = other / ".7-abcd.part.film.mp4"  # of an evaluation that runs
+    draft.touch()
+    (out / name).symlink_to(other)
+    assert evaluate("output_dir=out") == 2
+    assert f"out/{name} is a link to {other}" in capsys.readouterr().err
+    assert draft.exists()

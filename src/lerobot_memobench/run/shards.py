@@ -23,7 +23,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreement
 from lerobot_memobench.evaluation.records import read_protocol
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.io import draft_of
+from lerobot_memobench.io import draft_of, refuse_links
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm
@@ -266,6 +266,7 @@ def merge(out: Path, folders: Sequence[Path]) -> list[tuple[str, int]]:
     wanted = [] if card is None else _wanted(card)
     stored = [*map(protocol_of, sources)]
 
+    refuse_links(out / VIDEOS, out / MEMORY_READS)
     out.mkdir(parents=True, exist_ok=True)
     for source in folders:
         if source != out:
