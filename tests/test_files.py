@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import lerobot_memobench
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     as_path,
@@ -17,10 +18,44 @@ from lerobot_memobench.io import (
     draft_of,
     explaining_disk_errors,
     file_name,
+    files_below,
     remove_drafts,
     write_file,
 )
 from lerobot_memobench.tasks.catalogue import task_names
+
+
+def test_folders_are_read_through_links_once(tmp_path: Path) -> None:
+    tree, elsewhere = tmp_path / "tree", tmp_path / "elsewhere"
+    for file in (tree / "b.hdf5", tree / "sub" / "A.HDF5", tree / "notes.txt", elsewhere / "deep" / "c.h5"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    (tree / "linked").symlink_to(elsewhere)
+    (elsewhere / "deep" / "circle").symlink_to(tree)
+    (tree / "sub" / "again").symlink_to(elsewhere)
+    names = [path.relative_to(tree).as_posix() for path in files_below(tree, ".hdf5", ".h5")]
+    assert names == ["b.hdf5", "linked/deep/c.h5", "sub/A.HDF5"]
+    assert len(files_below(tree)) == 4
+    assert files_below(tmp_path / "absent") == []
+    os.mkfifo(elsewhere / "pipe.h5")
+    for name in ("pipe.h5", "broken.h5"):
+        with pytest.raises(MemobenchError, match=f"linked/{name} is a pipe, a device or a broken link"):
+            files_below(tree, ".h5")
+        assert len(files_below(tree, ".txt")) == 1
+        (elsewhere / name).unlink()
+        (elsewhere / "broken.h5").symlink_to("nothing")
+
+
+def test_every_tree_is_read_by_the_one_function() -> None:
+    source = Path(lerobot_memobench.__file__).parent
+    used = [
+        f"{path.relative_to(source).as_posix()}: {line.strip()}"
+        for path in source.rglob("*.py")
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if "rglob(" in line or 'glob("**' in line or "/**/" in line or "os.walk(" in line
+    ]
+    expected = ["io.py", "run/run.py", "training/resume.py"]  # these remove empty folders, and look for one own file
+    assert sorted({each.split(":")[0] for each in used}) == expected, used
 
 
 @pytest.mark.parametrize("durable", [False, True])

@@ -75,6 +75,13 @@ def remove_drafts(folder: Path) -> None:
         draft.unlink(missing_ok=True)
 
 
+def refuse_links(*folders: Path) -> None:
+    """Raise `MemobenchError` if a folder is a link: writing or removing files there would change other results."""
+    for folder in folders:
+        if folder.is_symlink():
+            raise MemobenchError(f"{folder} is a link to {os.readlink(folder)}, expected a folder; remove the link")
+
+
 def file_name(text: object, what: str) -> str:
     """Return a name read from data after checking that it names a file in one folder.
 
@@ -97,6 +104,41 @@ def file_name(text: object, what: str) -> str:
             f"{what} is {str(text)[:80]!r}, which names no file; expected letters, digits, spaces and _-,.+ only"
         )
     return text
+
+
+def files_below(folder: Path, *endings: str) -> list[Path]:
+    """Return the sorted files below a folder whose names end in one of ``endings``, in any letter case; none: all.
+
+    Links to folders are followed. Each folder is read once, so links in a circle end.
+
+    Raises:
+        MemobenchError: one of them is a pipe, a device or a broken link, which would block or end its reader.
+    """
+    found: list[Path] = []
+    seen: set[tuple[int, int]] = set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        there = os.stat(place)
+        if (there.st_dev, there.st_ino) in seen:
+            folders.clear()
+            continue
+        seen.add((there.st_dev, there.st_ino))
+        folders.sort()
+        found += [Path(place, name) for name in names if not endings or name.lower().endswith(endings)]
+    for path in found:
+        check_regular(path)
+    return sorted(found)
+
+
+def spelled(path: Path) -> Path:
+    """Return the path of a file, whose name may have other letter case on the disk."""
+    names = os.listdir(path.parent) if not path.exists() and path.parent.is_dir() else []
+    return path.with_name(next((name for name in sorted(names) if name.lower() == path.name.lower()), path.name))
+
+
+def check_regular(path: Path) -> None:
+    """Raise `MemobenchError` if a path exists, but is a pipe, a device or a broken link."""
+    if os.path.lexists(path) and not path.is_file() and not path.is_dir():
+        raise MemobenchError(f"{path} is a pipe, a device or a broken link, expected a file; remove it")
 
 
 def cache_folder() -> Path:
@@ -269,7 +311,7 @@ def check_fetched(path: Path) -> None:
         MemobenchError: naming the first pointer.
         OSError: a file cannot be read.
     """
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+    for file in files_below(path) if path.is_dir() else [path]:
         if not file.is_file() or file.stat().st_size > LARGEST_POINTER:
             continue
         with file.open("rb") as content:

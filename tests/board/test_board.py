@@ -344,6 +344,10 @@ def test_submission_replaces_an_earlier_one_only(with_controls: Path, evaluated:
     with pytest.raises(MemobenchError, match="holds no submission"):
         write_submission(evaluated, About(**ABOUT), {"": evaluated})
     assert (evaluated / CARD).read_bytes() == before
+    (folder / "pauses").symlink_to(evaluated)
+    with pytest.raises(MemobenchError, match="pauses is a link to"):
+        write_submission(folder, About(**ABOUT), {"": evaluated, "pauses": with_controls / "pauses"})
+    assert (evaluated / CARD).read_bytes() == before
 
 
 def test_other_pull_requests_may_change_any_file() -> None:

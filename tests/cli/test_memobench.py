@@ -103,8 +103,14 @@ def test_tasks_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     (tmp_path / "lacking" / "task_config.meta.json").unlink()
     assert main(["tasks", "--dir", str(tmp_path)]) == 1
     printed = capsys.readouterr()
-    assert printed.out.startswith("1 task of")
+    assert printed.out.splitlines()[0].strip() == "1 task", "the tasks of a user's folder are of no suite"
     assert "lacking/task_config.meta.json is missing" in printed.err
+    file = tmp_path / "temporal" / TASK / "task_config.bddl"
+    file.write_text(file.read_text().replace("flat_stove_1 - flat_stove", "flat_stove_1 - flat_oven"))
+    assert main(["tasks", "--dir", str(file.parent), "--json"]) == 1
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == []
+    assert f"{file.parent}: " in printed.err
 
 
 # --- generate ---

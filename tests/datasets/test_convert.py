@@ -18,7 +18,7 @@ import pytest
 from lerobot_memobench.cli.data import convert as command
 from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets import restore as restore_module
-from lerobot_memobench.datasets.convert import convert
+from lerobot_memobench.datasets.convert import convert, find_files
 from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.datasets.hdf5 import Extras, PublishedFile, Unusable
@@ -110,9 +110,62 @@ def attribute(name, value):
     return change
 
 
+def test_files_are_found_behind_links_and_in_capitals(tmp_path):
+    folder, elsewhere = tmp_path / "folder", tmp_path / "elsewhere"
+    folder.mkdir()
+    elsewhere.mkdir()
+    (elsewhere / "B.HDF5").touch()
+    (folder / "a.H5").touch()
+    (folder / "linked").symlink_to(elsewhere)
+    with zipfile.ZipFile(tmp_path / "packed.ZIP", "w") as file:
+        file.writestr("A.HDF5", "")
+    found = {source.name: [file.name for file in find_files(source, tmp_path)[0]] for source in tmp_path.iterdir()}
+    assert found == {"folder": ["a.H5", "linked/B.HDF5"], "elsewhere": ["B.HDF5"], "packed.ZIP": ["A.HDF5"]}
+
+
+def external(group):
+    group["obs"].create_dataset("other", (8,), np.uint8, external=[("/etc/hostname", 0, 8)])
+
+
+def virtual(group):
+    layout = h5py.VirtualLayout((7, 7), np.float64)
+    layout[:] = h5py.VirtualSource("elsewhere.hdf5", "actions", (7, 7))
+    del group["actions"]
+    group.create_virtual_dataset("actions", layout)
+
+
+def linked(group):
+    del group["actions"]
+    group["actions"] = h5py.SoftLink("/aside/actions")
+    group.file["aside"] = h5py.ExternalLink("elsewhere.hdf5", "/")
+
+
+@pytest.mark.parametrize(
+    ("change", "name"), [(external, "data/demo_1/obs/other"), (virtual, "data/demo_1/actions"), (linked, "aside")]
+)
+def test_arrays_of_other_files_are_refused(path, tmp_path, change, name):
+    with h5py.File(tmp_path / "elsewhere.hdf5", "w") as file:
+        file["actions"] = np.zeros((7, 7))
+    with h5py.File(path, "a") as file:
+        change(file["data/demo_1"])
+    with pytest.raises(Unusable, match=f"'{name}' is read from another file"):
+        PublishedFile(path)
+
+
+def filtered(group):
+    """Store actions as a filter does that is not installed here."""
+    del group["actions"]
+    layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    layout.set_chunk((7, 7))
+    layout.set_filter(32_999, h5py.h5z.FLAG_OPTIONAL)
+    space = h5py.h5s.create_simple((7, 7))
+    h5py.h5d.create(group.id, b"actions", h5py.h5t.NATIVE_DOUBLE, space, layout).write_direct_chunk((0, 0), b"packed")
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
+        (filtered, "actions is compressed by the HDF5 filter 32999"),
         (delete("states"), "'states' is missing"),
         (delete("obs/robot0_eye_in_hand_image"), "'obs/robot0_eye_in_hand_image' is missing"),
         (put("actions", lambda old: old[:-1]), "states 7, actions 6"),
@@ -143,6 +196,7 @@ def test_files_that_cannot_be_opened(path, tmp_path):
     with h5py.File(tmp_path / "link.hdf5", "w") as file:
         file.create_group("data").attrs.update(bddl_file_name="a", bddl_file_content="b")
         file["data/demo_0"] = h5py.ExternalLink("elsewhere.hdf5", "/demo_0")
+    os.mkfifo(tmp_path / "pipe.hdf5")
     with h5py.File(path, "a") as file:
         del file["data"].attrs["bddl_file_content"]
     for name, reason in {
@@ -150,7 +204,8 @@ def test_files_that_cannot_be_opened(path, tmp_path):
         "text.hdf5": "no HDF5 file",
         "pointer.hdf5": "git lfs pull",
         "empty.hdf5": r"no group 'data' \(found episodes\)",
-        "link.hdf5": "link into the file 'elsewhere.hdf5'",
+        "link.hdf5": "'data/demo_0' is read from another file",
+        "pipe.hdf5": "is a pipe",
         "hdf5/synthetic_task_demo.hdf5": "'bddl_file_content' is missing",
         "absent.hdf5": "no such file",
     }.items():

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import reduce
 from pathlib import Path
 
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
@@ -13,7 +17,7 @@ from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import check_whole
 from lerobot_memobench.datasets.publish import describe
-from lerobot_memobench.datasets.validate import validate
+from lerobot_memobench.datasets.validate import check_description, validate
 from lerobot_memobench.envs.episode_log import read_log
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_folder
@@ -160,6 +164,13 @@ def test_earlier_format_is_named_with_its_converter(synthetic, copy, tmp_path, c
     assert f"convert_dataset_v21_to_v30 --repo-id=local/converted --root={root}" in capsys.readouterr().err
 
 
+def test_a_dataset_is_no_log(synthetic, copy):
+    root = copy(synthetic)
+    (root / "meta" / "episodes.jsonl").write_text('{"episode_index": 0}')  # as LeRobot's format v2.1 has it
+    with pytest.raises(MemobenchError, match="is a LeRobotDataset, expected the folder of an evaluation"):
+        read_log(root)
+
+
 @pytest.mark.parametrize("name", ["episodes.jsonl", "episodes.jsonl.gz", "weights"])
 def test_pointers_to_logs_and_weights_are_named(tmp_path, name):
     if name == "weights":
@@ -170,3 +181,106 @@ def test_pointers_to_logs_and_weights_are_named(tmp_path, name):
     path.write_text(POINTER)
     with pytest.raises(MemobenchError, match=f"{path.name} is a Git LFS pointer.*git lfs pull"):
         check_checkpoint(str(checkpoint)) if name == "weights" else read_log(tmp_path)
+
+
+# --- numbers of the metadata ---
+
+IMAGE = "observation.images.image"
+PLACES = [f"{part}/{kind}_index" for part in ("data", "meta/episodes", f"videos/{IMAGE}") for kind in ("chunk", "file")]
+TIMES = [f"videos/{IMAGE}/from_timestamp", f"videos/{IMAGE}/to_timestamp"]
+NUMBERS = ["dataset_from_index", "dataset_to_index", "length", "episode_index", "tasks", *PLACES, *TIMES]
+INFO = [
+    (("total_episodes",), 3),
+    (("total_frames",), 13),
+    (("total_tasks",), 2),
+    (("fps",), 10),
+    (("splits", "train"), "0:1"),
+    (("data_path",), "data/{chunk_index:03d}-{file_index:03d}.parquet"),
+    (("video_path",), "videos/{video_key}/{chunk_index}-{file_index}.mp4"),
+    (("features", "action", "shape"), [6]),
+    (("features", "action", "dtype"), "float64"),
+    (("features", "action", "names"), ["x", "y"]),
+    (("features", "action"), None),
+    (("features", "gripper"), {"dtype": "float32", "shape": [1], "names": None}),
+    (("features", "checkpoint.index", "dtype"), "int32"),
+    (("features", "episode_info", "dtype"), "bool"),
+    (("features", IMAGE, "shape"), [32, 64, 3]),
+    (("features", IMAGE, "info", "video.height"), 64),
+    (("features", IMAGE, "info", "video.fps"), 30),
+]
+
+
+def noticed(folder: Path) -> str:
+    """Return the message of the first check of numbers that fails."""
+    for check in (check_whole, check_description):
+        try:
+            check(folder)
+        except MemobenchError as error:
+            return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("row", [0, 1])
+@pytest.mark.parametrize("name", [*NUMBERS, "both times"])
+def test_other_bounds_and_places_are_found(simulated, copy, name, row):
+    folder = copy(simulated)
+    assert noticed(folder) == ""
+    (path,) = folder.glob("meta/episodes/**/*.parquet")
+    table = pd.read_parquet(path)
+    for column in TIMES if name == "both times" else [name]:
+        values = table[column].tolist()
+        values[row] = ["another task"] if name == "tasks" else values[row] + (0.05 if "timestamp" in column else 1)
+        table[column] = values
+    table.to_parquet(path)
+    assert "meta/episodes" in noticed(folder) or path.name in noticed(folder)
+
+
+@pytest.mark.parametrize("name", ["episode_index", "frame_index", "index", "task_index", "timestamp"])
+def test_other_numbers_of_frames_are_found(simulated, copy, name):
+    folder = copy(simulated)
+    (path,) = folder.glob("data/**/*.parquet")
+    table = pq.read_table(path)
+    changed = table.column(name).to_numpy().copy()
+    changed[4] += 1
+    place = table.schema.get_field_index(name)
+    pq.write_table(table.set_column(place, name, pa.array(changed)), path)
+    assert noticed(folder)
+
+
+@pytest.mark.parametrize(("keys", "value"), INFO, ids=[".".join(keys) for keys, _ in INFO])
+def test_other_descriptions_are_found(simulated, copy, keys, value):
+    folder = copy(simulated)
+    path = folder / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    part = reduce(dict.__getitem__, keys[:-1], info)
+    if value is None:
+        del part[keys[-1]]
+    else:
+        part[keys[-1]] = value
+    path.write_text(json.dumps(info))
+    assert noticed(folder)
+
+
+def test_task_numbers_are_places(simulated, copy):
+    """LeRobot takes the text of a task by its place in the table."""
+    folder = copy(simulated)
+    path = folder / "meta" / "tasks.parquet"
+    tasks = pd.read_parquet(path)
+    pd.concat([tasks.rename(index={tasks.index[0]: "another task"}), tasks + 1]).to_parquet(path)
+    assert "total_tasks" in noticed(folder)
+    (tasks + 1).to_parquet(path)
+    assert "task_index" in noticed(folder)
+
+
+@pytest.mark.usefixtures("files_only")
+def test_validate_compares_bounds_and_columns(simulated, copy):
+    folder = copy(simulated)
+    (folder / "manifest.json").unlink()
+    (path,) = folder.glob("meta/episodes/**/*.parquet")
+    table = pd.read_parquet(path)
+    table.loc[0, "dataset_to_index"] += 60
+    table.to_parquet(path)
+    info = folder / "meta" / "info.json"
+    info.write_text(info.read_text().replace('"float32"', '"float64"', 1))
+    found = [verdict.disagreement for verdict in validate(folder) if verdict.subject == "meta/info.json"]
+    assert ["dataset_to_index" in found[0], "type of the column" in found[1]] == [True, True]

@@ -10,6 +10,7 @@ import pytest
 import torch
 from huggingface_hub import DatasetCard
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble, numeric_stats, write_dataset
@@ -55,12 +56,25 @@ def test_frames_are_equal_after_loading(dataset, demos):
         position += len(demo)
 
 
+def test_every_number_has_a_name(dataset):
+    for name, feature in dataset.features.items():
+        if feature["dtype"] not in ("string", "language") and name not in DEFAULT_FEATURES:
+            width = 3 if feature["dtype"] == "video" else feature["shape"][0]
+            assert len(set(feature["names"])) == width, name
+
+
+def test_instructions_are_in_the_present_tense(stove):
+    columns = labels(stove).columns()
+    assert set(columns["subgoal.instruction"]) == {"switch the stove on", "switch the stove off again"}
+    assert "switched the stove on" in columns["subgoal.intermediate"]
+
+
 def test_batches_of_lerobot(dataset):
     from lerobot.utils.collate import lerobot_collate_fn
 
     loader = torch.utils.data.DataLoader(dataset, batch_size=4, shuffle=True, collate_fn=lerobot_collate_fn)
     batch = next(iter(loader))
-    for name in ("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory", "task"):
+    for name in ("subgoal.intermediate", "subgoal.fine", "subgoal.coarse", "oracle_memory", "task"):
         assert all(isinstance(text, str) for text in batch[name])
     assert (batch["checkpoint.completed"].shape, batch["checkpoint.completed"].dtype) == ((4, 6), torch.bool)
     assert all(batch[name].shape == (4,) and batch[name].dtype == torch.float32 for name in CLOCK)
@@ -76,7 +90,7 @@ def test_statistics(dataset, demos):
     np.testing.assert_allclose(stats["action"]["mean"], actions.mean(0), rtol=1e-6)
     assert stats["action"]["count"] == [len(dataset)]
     assert stats["checkpoint.completed"]["max"].tolist() == [1, 1, 0, 0, 0, 0]
-    assert not {"memory", *CLOCK} & set(stats)
+    assert not {"oracle_memory", *CLOCK} & set(stats)
     assert not [name for name in dataset.meta.episodes.column_names if name.startswith("stats/observation.step")]
 
     reference, ours = get_feature_stats(demos[0].actions, axis=0, keepdims=False), numeric_stats(demos[0].actions)
@@ -166,6 +180,13 @@ def test_refused_destinations_and_episodes(synthetic, demos, make_demo, tmp_path
             write_dataset(demos, folder)
     assert hashes(synthetic) == before
     assert [path.name for path in other.iterdir()] == ["thesis.tex"]
+    linked = tmp_path / "linked"
+    linked.mkdir()
+    (linked / ".staging").symlink_to(tmp_path)  # `episodes` in it would be removed
+    (tmp_path / "episodes").mkdir()
+    with pytest.raises(MemobenchError, match=r"\.staging is a link"):
+        write_dataset(demos, linked)
+    assert (tmp_path / "episodes").is_dir()
     with pytest.raises(MemobenchError, match="some episodes"):
         write_dataset([make_demo(["01"]), make_demo(["01"], size=16)], tmp_path / "mixed")
     assert not is_dataset(tmp_path / "mixed")

@@ -102,7 +102,7 @@ def test_merged(ours, demos, tmp_path):
 
 @pytest.mark.slow
 def test_removed_columns(ours, demos, tmp_path):
-    operation = tool.RemoveFeatureConfig(feature_names=["coarse_subgoal", "observation.state"])
+    operation = tool.RemoveFeatureConfig(feature_names=["subgoal.coarse", "observation.state"])
     check(edit(ours, tmp_path / "edited", operation), demos, tmp_path / "out")
 
 

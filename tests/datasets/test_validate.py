@@ -18,6 +18,8 @@ import pytest
 from lerobot.datasets.io_utils import load_tasks, write_tasks
 
 from lerobot_memobench.cli import data as commands
+from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS
+from lerobot_memobench.datasets.frames import holds_texts, read_frame_table
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import image_key, read_info
 from lerobot_memobench.datasets.lerobot_format.reading import check_idling, read_episode
@@ -25,6 +27,8 @@ from lerobot_memobench.datasets.statistics import check_statistics, complete, la
 from lerobot_memobench.datasets.validate import Verdict, images_of, replay, validate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.task import LEVELS
+from lerobot_memobench.training.view import Choice, needs_view
 from tests.datasets.conftest import FRAMES
 from tests.support.short_demonstrations import drawn_steps
 from tests.support.videos import encode_video
@@ -74,18 +78,19 @@ COLUMNS = {
             "checkpoint.operation",
             "checkpoint.completed",
             "checkpoint.event",
-            "coarse_subgoal",
+            "subgoal.coarse",
             "episode_info",
             "frame_index",
-            "grounded_subgoal",
+            "subgoal.fine",
             "index",
             "language_persistent",
-            "memory",
+            "oracle_memory",
             "observation.state",
             "observation.phase",
             "observation.step",
             "privileged.environment_state",
-            "simple_subgoal",
+            "subgoal.instruction",
+            "subgoal.intermediate",
             "timestamp",
         )
     ),
@@ -114,6 +119,26 @@ def test_every_column_is_compared(simulated, copy):
     tasks = load_tasks(folder)
     write_tasks(tasks.rename(index={tasks.index[0]: "put the milk into the bowl"}), folder)
     assert difference(folder).startswith("task at frame 0: recorded 'put the milk into the bowl'")
+
+
+def test_columns_of_earlier_versions_are_read(simulated, copy):
+    folder, renamed = copy(simulated), {new: old for old, new in EARLIER_COLUMNS.items()}
+    (path,) = (folder / "data").rglob("*.parquet")
+    table = pq.read_table(path).drop_columns(["subgoal.instruction"])
+    pq.write_table(table.rename_columns([renamed.get(name, name) for name in table.column_names]), path)
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    info["features"] = {renamed.get(name, name): feature for name, feature in info["features"].items()}
+    del info["features"]["subgoal.instruction"]
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    present, earlier = read_frame_table(simulated), read_frame_table(folder)
+    assert earlier.subgoals == present.subgoals
+    assert set(earlier.subgoals) == set(LEVELS)
+    assert earlier.memory == present.memory
+    assert needs_view(info["features"], Choice(obs_type="pixels"))
+    assert [verdict.disagreement for verdict in validate(folder)] == [None] * len(validate(folder))
+    change(folder, "data/**/*.parquet", "grounded_subgoal", FRAMES + FRAME)
+    assert difference(folder).startswith(f"subgoal.fine at frame {FRAME}")
+    assert holds_texts(folder, "subgoal.fine")
 
 
 def decoded(path: Path) -> np.ndarray:

@@ -241,6 +241,27 @@ def test_an_earlier_report_is_replaced(run: Path, tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out" / "videos").rglob("*.*")] == ["mine.txt"]
 
 
+def test_videos_behind_links_stay(run: Path, tmp_path: Path) -> None:
+    """A user may save room by links to the videos of an evaluation."""
+    out = tmp_path / "out"
+    write_html([run], out)
+    shutil.rmtree(out / "videos" / "run")
+    (out / "videos" / "run").symlink_to(run / "videos")
+    kept = film(run / "videos" / "kept.mp4", 3)
+    other = evaluation(tmp_path / "other", [record(episode=5)])
+    before = {path: path.read_bytes() for path in (run / "videos").iterdir()}
+    (note,) = write_html([other], out).notes
+    assert str(out / "videos" / "run") in note
+    with pytest.raises(MemobenchError, match=r"videos/run is a link to .*; remove the link"):
+        write_html([run], out)
+    shutil.rmtree(out / "videos")
+    (out / "videos").symlink_to(run.parent)
+    with pytest.raises(MemobenchError, match="out/videos is a link to "):
+        write_html([other], out)
+    assert {path: path.read_bytes() for path in (run / "videos").iterdir()} == before
+    assert kept.is_file()
+
+
 def test_an_unfinished_report_can_be_made_again(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules[write_html.__module__]
     place = module.place_videos  # type: ignore[attr-defined]

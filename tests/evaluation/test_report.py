@@ -149,6 +149,9 @@ def test_first_line(tmp_path: Path) -> None:
     short = replace(runs[1], records=runs[1].records[:1])
     other = STRICT.replace("seeds 7 to 8, 2 episodes", "seed 7, 1 episode")
     assert headline([runs[0], short]).endswith(f"({STRICT}); two: B, {seen} ({other})")
+    file = tmp_path / "a" / EVALUATION_FILE
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"settings": {"env": {"task_dir": "mine"}}}))
+    assert ": own tasks, suite=strict, referent" in headline(read_runs([tmp_path / "a"]))
 
 
 # --- formats ---

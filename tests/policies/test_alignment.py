@@ -111,9 +111,9 @@ def test_retrieval_accuracy() -> None:
 @pytest.mark.parametrize(
     ("align", "level", "column"),
     [
-        ("semantic", "coarse", "coarse_subgoal"),
-        ("framewise", "intermediate", "simple_subgoal"),
-        ("semantic", "fine", "grounded_subgoal"),
+        ("semantic", "coarse", "subgoal.coarse"),
+        ("framewise", "intermediate", "subgoal.intermediate"),
+        ("semantic", "fine", "subgoal.fine"),
     ],
 )
 def test_subgoal_level_chooses_the_column(root: Path, align: str, level: str, column: str) -> None:

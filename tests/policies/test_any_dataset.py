@@ -127,8 +127,8 @@ def test_memory_camera_is_an_input() -> None:
     ("extra", "flag", "named"),
     [
         ({}, "align=contrastive", "policy.align"),
-        ({"simple_subgoal": ""}, "align=framewise", "simple_subgoal"),
-        ({"coarse_subgoal": "fold"}, "align=semantic", "policy.subgoal_level"),
+        ({"subgoal.intermediate": ""}, "align=framewise", "subgoal.intermediate"),
+        ({"subgoal.coarse": "fold"}, "align=semantic", "policy.subgoal_level"),
         ({}, "oracle_memory=true", "policy.oracle_memory"),
     ],
 )

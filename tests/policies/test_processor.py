@@ -95,7 +95,7 @@ def test_oracle_memory_is_read_in_training_and_in_rollouts(root: Path, tmp_path:
         root, size="small", perception="objects", memory="none", oracle_memory=True
     )
     batch = before(batch_of(dataset, [10, 50]))
-    memory = dataset.hf_dataset[10]["memory"]
+    memory = dataset.hf_dataset[10]["oracle_memory"]
     assert f"memory : {memory}" in prompt_of(before, batch, 0)
     for part in (policy, before, after):
         part.save_pretrained(tmp_path / "it")

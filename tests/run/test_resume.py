@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -184,3 +186,33 @@ def test_a_run_without_episodes_leaves_no_folder(fake_loop: FakeLoop) -> None:
             evaluate(f"output_dir={out}")
     assert not Path("outputs").exists()
     assert sorted(path.name for path in Path("kept").iterdir()) == ["own", "videos"]
+
+
+def test_a_full_disk_is_named_with_folder_and_command(
+    fake_loop: FakeLoop, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write raises it, without a path
+
+    with monkeypatch.context() as patch:
+        patch.setattr("lerobot_memobench.run.run.write_report", full)
+        assert evaluate("output_dir=out") == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "out cannot be written (No space left on device; " in last
+    assert "finished episodes stay; resume with: lerobot eval" in last
+    assert "resume=true output_dir=out" in last
+
+
+@pytest.mark.parametrize("name", ["videos", "memory_reads"])
+def test_files_of_another_evaluation_are_not_written_through_a_link(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    other, out = tmp_path / "other", Path("out")
+    other.mkdir()
+    out.mkdir()
+    draft = other / ".7-abcd.part.film.mp4"  # of an evaluation that runs
+    draft.touch()
+    (out / name).symlink_to(other)
+    assert evaluate("output_dir=out") == 2
+    assert f"out/{name} is a link to {other}" in capsys.readouterr().err
+    assert draft.exists()

@@ -63,7 +63,7 @@ def make_object_dataset(
             objects: number | {"shape": (SLOTS * WIDTH,)},
             "action": number | {"shape": (7,)},
             **{name: {"dtype": "float32", "shape": (1,), "names": None} for name in CLOCK},
-            **dict.fromkeys(("simple_subgoal", "grounded_subgoal", "coarse_subgoal", "memory"), string),
+            **dict.fromkeys(("subgoal.intermediate", "subgoal.fine", "subgoal.coarse", "oracle_memory"), string),
             **({EPISODE_INFO: string} if records else {}),
         },
     )
@@ -79,10 +79,10 @@ def make_object_dataset(
                 objects: slots_at(rng, places, lit if t < prompt else None),
                 "action": np.array([*way, 0, 0, 0, 1 if t % 2 else -1], np.float32) * (t >= prompt),
                 **clock_at(t, prompt),
-                "simple_subgoal": f"reach thing {lit}" if t >= prompt else "",
-                "grounded_subgoal": f"reach thing {lit} at {places[lit][0]:.1f}",
-                "coarse_subgoal": "reach",
-                "memory": f"thing {lit} was lit",
+                "subgoal.intermediate": f"reach thing {lit}" if t >= prompt else "",
+                "subgoal.fine": f"reach thing {lit} at {places[lit][0]:.1f}",
+                "subgoal.coarse": "reach",
+                "oracle_memory": f"thing {lit} was lit",
                 "task": task,
             }
             if records:

@@ -51,10 +51,10 @@ def make_dataset(
             "observation.state": {"dtype": "float32", "shape": (8,), "names": None},
             "action": {"dtype": "float32", "shape": (7,), "names": None},
             **{name: {"dtype": "float32", "shape": (1,), "names": None} for name in CLOCK},
-            "simple_subgoal": string,
-            "grounded_subgoal": string,
-            "coarse_subgoal": string,
-            "memory": string,
+            "subgoal.intermediate": string,
+            "subgoal.fine": string,
+            "subgoal.coarse": string,
+            "oracle_memory": string,
         },
     )
     rng = np.random.default_rng(seed)
@@ -74,10 +74,10 @@ def make_dataset(
                     "action": np.tanh(drift + np.sin(t / 5 + np.arange(7))).astype(np.float32),
                     **clock_at(t, prompt),
                     # Some frames carry no text: the cache then looks at the next that does.
-                    "simple_subgoal": "" if t % 7 == 3 else subgoals[k],
-                    "grounded_subgoal": subgoals[k] + " at (0.1, 0.2)",
-                    "coarse_subgoal": subgoals[k].split()[0] + " it",
-                    "memory": "; ".join(subgoals[:k]),
+                    "subgoal.intermediate": "" if t % 7 == 3 else subgoals[k],
+                    "subgoal.fine": subgoals[k] + " at (0.1, 0.2)",
+                    "subgoal.coarse": subgoals[k].split()[0] + " it",
+                    "oracle_memory": "; ".join(subgoals[:k]),
                     "task": task,
                 }
             )

@@ -14,7 +14,7 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.bddl import Region, parse_bddl
-from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
+from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, task_names
 from lerobot_memobench.tasks.formula import And, Atom, Not, format_formula
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Prompt
@@ -240,6 +240,19 @@ def test_memory_type_and_prompt_are_inferred(
     task = load_task(write_task(bddl.replace(LANGUAGE, language).replace(GOAL, goal)))
     assert (task.memory_type, task.prompt) == (memory_type, prompt)
     assert load_task(write_task(bddl.replace(LANGUAGE, language), parent="spatial")).memory_type == "spatial"
+
+
+def test_trees_of_tasks(write_task: Write, tmp_path: Path) -> None:
+    elsewhere = write_task(parent="elsewhere/temporal")
+    for name in ("task_config.bddl", "task_config.meta.json"):
+        (elsewhere / name).rename(elsewhere / name.upper())
+    (tmp_path / "tree").mkdir()
+    (tmp_path / "tree" / "linked").symlink_to(elsewhere.parent)
+    (found,) = find_tasks(tmp_path / "tree")
+    assert load_task(found).name == "my_task"
+    write_task(parent="tree/spatial")
+    with pytest.raises(MemobenchError, match=r"linked/my_task and .*spatial/my_task hold tasks of one name"):
+        find_tasks(tmp_path / "tree")
 
 
 # --- damaged files ---

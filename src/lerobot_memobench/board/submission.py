@@ -29,7 +29,7 @@ from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, EpisodeRecor
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run, asked_for
-from lerobot_memobench.io import PACKED, Malformed, checked, in_words, parsed, write_file
+from lerobot_memobench.io import PACKED, Malformed, checked, in_words, parsed, refuse_links, write_file
 from lerobot_memobench.run.card import write_card
 
 CARD, LOG = EVALUATION_FILE, MERGED_FILE + PACKED
@@ -272,6 +272,7 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
     """
     if folder.exists() and ABOUT not in read_evaluation(folder):
         raise MemobenchError(f"{folder} exists and holds no submission; choose another --out or --name")
+    refuse_links(*(folder / control for control in CONTROLS))
     for control in {*CONTROLS} - {*evaluations}:
         shutil.rmtree(folder / control, ignore_errors=True)
     for control, source in evaluations.items():

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_memobench.cli.console import WITH_PARENT, console, counting, note, run_command, say
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import as_path
+from lerobot_memobench.io import as_path, explaining_disk_errors
 from lerobot_memobench.jobs.processes import adding_resume_hint
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 from lerobot_memobench.run.arguments import (
@@ -104,7 +104,11 @@ def evaluate(given: Arguments, command: Sequence[str]) -> int:
 
     options, given = take_run_options(given)
     plan = make_plan(read_settings(given), options, command)
-    with adding_resume_hint("lerobot", lambda: f"resume with: {plan.resuming_command}"):
+    hint = f"resume with: {plan.resuming_command}"
+    with (
+        adding_resume_hint("lerobot", lambda: hint),
+        explaining_disk_errors(plan.output, f"finished episodes stay; {hint}"),
+    ):
         return evaluate_in_parts(plan) if options.shards else evaluate_here(plan)
 
 

@@ -67,8 +67,13 @@ def tasks(
     if as_json:
         from lerobot_memobench.sim.simulation import Simulation
 
-        # State sizes come from the compiled models.
-        print(json.dumps([task_record(task, Simulation(task).state_dim) for task in found], indent=1))
+        records = []
+        for task in found:
+            try:
+                records.append(task_record(task, Simulation(task).state_dim))  # of the compiled model
+            except MemobenchError as error:
+                problems.append(f"{task.folder}: {error}")
+        print(json.dumps(records, indent=1))
     else:
         console().print(Unbroken(task_table(found), column=1), crop=False)
     for problem in problems:
@@ -100,8 +105,8 @@ def task_table(found: Sequence[Task]) -> Table:
 
     ``gap``: the longest of the task's checkpoints, control steps.
     """
-    suites = {task.suite for task in found}
-    title = count_of(len(found), "task") + (f" of the {suites.pop()} suite" if len(suites) == 1 else "")
+    suites = {task.suite if CATALOGUE_DIR in task.folder.parents else "" for task in found}
+    title = count_of(len(found), "task") + (f" of the {suites.pop()} suite" if len(suites) == 1 and all(suites) else "")
     table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
     for name in ("no.", "task", "memory type", "checkpoints", "gap", "demonstration prompt", "instruction"):
         table.add_column(name, justify="right" if name in ("no.", "gap") else "left")

@@ -62,6 +62,7 @@ from lerobot_memobench.io import (
     draft_of,
     explaining_disk_errors,
     file_name,
+    files_below,
     free_bytes,
     in_words,
     read_json,
@@ -219,11 +220,7 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Pro
                 identity = [name, info.file_size, info.CRC]
                 files.append(SourceFile(name, info.file_size, unpacked / name, identity, info))
     else:
-        paths = (
-            [source]
-            if source.is_file()
-            else sorted(path for path in source.rglob("*") if path.suffix in SUFFIXES and path.is_file())
-        )
+        paths = files_below(source, *SUFFIXES) if source.is_dir() else [source]
         for path in paths:
             name, stat = path.name if path == source else path.relative_to(source).as_posix(), path.stat()
             files.append(SourceFile(name, stat.st_size, path, [name, stat.st_size, stat.st_mtime_ns]))
@@ -244,7 +241,7 @@ def _entries(archive: Path) -> list[zipfile.ZipInfo]:
         raise MemobenchError(
             f"{archive} is no zip archive, or was not downloaded completely ({first_line(error)}); download it again"
         ) from None
-    found = [e for e in entries if Path(e.filename).suffix in SUFFIXES and not e.filename.startswith(MACOS_FOLDER)]
+    found = [e for e in entries if e.filename.lower().endswith(SUFFIXES) and not e.filename.startswith(MACOS_FOLDER)]
     return sorted(found, key=lambda entry: entry.filename)
 
 
@@ -270,7 +267,7 @@ def _report_size(files: Sequence[SourceFile], folder: Path, out: Path, notify: C
     """Report the size of the dataset, and of the largest unpacked file, before either is made."""
     total, largest = sum(file.size for file in files), max((file.size for file in files), default=0)
     size = run_size(total // UNPACKED_FRAME, IMAGE_SIZE)
-    there = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    there = sum(path.stat().st_size for path in files_below(folder))
     work, extra = f"{count_of(len(files), 'file')} of {in_words(total)}", 0
     if any(file.member is not None for file in files):
         work, extra = f"{work}, unpacked one by one (up to {in_words(largest)})", largest

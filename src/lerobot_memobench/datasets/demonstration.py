@@ -34,6 +34,17 @@ MAX_CHECKPOINTS = 6
 MIN_FRAMES_BETWEEN_ROWS = 5
 """LeRobot's ``emitted_at`` searches 0.1 s to either side and raises if it finds two rows of a style, so rows of one
 style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
+LEVEL_COLUMNS = {level: f"subgoal.{level}" for level in LEVELS}
+"""Level of a checkpoint's text -> column with its text at every frame."""
+INSTRUCTION_COLUMN, MEMORY_COLUMN = "subgoal.instruction", "oracle_memory"
+EARLIER_COLUMNS = {
+    "coarse_subgoal": LEVEL_COLUMNS["coarse"],
+    "simple_subgoal": LEVEL_COLUMNS["intermediate"],
+    "grounded_subgoal": LEVEL_COLUMNS["fine"],
+    "memory": MEMORY_COLUMN,
+}
+"""Column of datasets before version 0.3 -> its present name. Version 0.3 reads both, and the second and third are those
+of RoboMME's datasets too."""
 NOT_HASHED = ("step", "coarse_subgoal", "subtask")
 """Labels that are not part of an episode's hash."""
 LanguageRow = dict[str, Any]
@@ -154,7 +165,7 @@ class Labels:
         grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
         memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
             "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
-        subtask: T strings, the present checkpoint as an instruction; used in LeRobot's language rows only.
+        subtask: T strings, the intermediate-level text of the present checkpoint as an instruction.
         key_frames: (K,) int64, frame at which checkpoint k was completed in order, -1 if it never was.
     """
 
@@ -180,10 +191,11 @@ class Labels:
             "checkpoint.operation": self.operation,
             "checkpoint.completed": self.completed,
             "checkpoint.event": self.event,
-            "simple_subgoal": self.simple_subgoal,
-            "grounded_subgoal": self.grounded_subgoal,
-            "coarse_subgoal": self.coarse_subgoal,
-            "memory": self.memory,
+            LEVEL_COLUMNS["coarse"]: self.coarse_subgoal,
+            LEVEL_COLUMNS["intermediate"]: self.simple_subgoal,
+            LEVEL_COLUMNS["fine"]: self.grounded_subgoal,
+            INSTRUCTION_COLUMN: self.subtask,
+            MEMORY_COLUMN: self.memory,
         }
 
 

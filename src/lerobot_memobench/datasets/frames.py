@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS, MEMORY_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import (
     OBJECTS,
     check_clock,
@@ -24,13 +25,12 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     without_pattern,
 )
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import files_below
 from lerobot_memobench.protocol import OBS_PHASE
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-LEVEL_COLUMNS = {"coarse": "coarse_subgoal", "intermediate": "simple_subgoal", "fine": "grounded_subgoal"}
-MEMORY_COLUMN = "memory"
 _PLACE = ("index", "episode_index", "frame_index")
 TOLERANCE = 1e-4
 """Largest difference of a decoded frame to its time, s."""
@@ -81,26 +81,29 @@ def read_frame_table(root: Path) -> FrameTable:
 
 def holds_texts(root: Path, column: str) -> bool:
     """Return whether a column of texts exists and has a text that is not empty."""
-    for path in sorted((root / "data").rglob("*.parquet")):
-        if column in pq.read_schema(path).names and any(_texts(pq.read_table(path, columns=[column]), column)):
-            return True
+    for path in files_below(root / "data", ".parquet"):
+        for name in pq.read_schema(path).names:
+            if EARLIER_COLUMNS.get(name, name) == column and any(_texts(pq.read_table(path, columns=[name]), name)):
+                return True
     return False
 
 
 def _read_columns(root: Path, optional: list[str]) -> pa.Table:
     """Return each frame's indices, and the existing ones among the optional columns."""
-    files = sorted((root / "data").rglob("*.parquet"))
+    files = files_below(root / "data", ".parquet")
     if not files:
         raise MemobenchError(f"{root} holds no frames: there is no parquet file below {root / 'data'}.")
     with undamaged(files[0]):
         present = pq.read_schema(files[0]).names
     check_clock(present, root)
-    columns = [*_PLACE, *(name for name in optional if name in present)]
+    own = {EARLIER_COLUMNS.get(name, name): name for name in present}
+    kept = {name: own[name] for name in (*_PLACE, *optional) if name in own}
     tables = []
     for path in files:
         with undamaged(path):
-            tables.append(pq.read_table(path, columns=columns))
-    return pa.concat_tables(tables, promote_options="permissive").sort_by("index")
+            tables.append(pq.read_table(path, columns=[*kept.values()]))
+    table = pa.concat_tables(tables, promote_options="permissive").sort_by("index")
+    return table.rename_columns([*kept])
 
 
 def _episodes(root: Path, table: pa.Table) -> np.ndarray:
@@ -296,7 +299,7 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
     table = read_frame_table(root)
     frames = int(table.episodes[-1])
     columns: dict[str, np.ndarray] = {}
-    for path in sorted((root / "data").rglob("*.parquet")):
+    for path in files_below(root / "data", ".parquet"):
         with undamaged(path):
             there = pq.read_schema(path).names
         column_of = {name: objects_column(there) if name == OBJECTS else name for name in names}

@@ -34,7 +34,17 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Json
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Number, Whole, check_fetched, checked, parsed, refusing
+from lerobot_memobench.io import (
+    Count,
+    Malformed,
+    Number,
+    Whole,
+    check_fetched,
+    check_regular,
+    checked,
+    parsed,
+    refusing,
+)
 from lerobot_memobench.protocol import ACTION_DIM
 
 if TYPE_CHECKING:
@@ -115,10 +125,14 @@ class PublishedFile:
 
         self.path = path
         try:
+            check_regular(path)
             self._file: h5py.File = h5py.File(path, "r")
+        except MemobenchError as error:
+            raise Unusable(str(error)) from None
         except OSError as error:
             raise Unusable(_open_error(path, error)) from None
         try:
+            _check_own(self._file)
             data = self._file.get("data")
             if not isinstance(data, h5py.Group):
                 raise Unusable(f"it has no group 'data' (found {', '.join(self._file) or 'none'})")
@@ -182,13 +196,13 @@ class PublishedFile:
 
         group = self._data.get(name)
         if group is None:
-            raise Unusable(f"the group {_missing(self._data, name)}")
+            raise Unusable(f"the group {name!r} is missing")
         if demo_number(name) is None or not isinstance(group, h5py.Group):
             raise Unusable("it is no group demo_<number>")
         states = array(group, "states", (None, None), np.float64)
         actions = array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
         if not isinstance(group.get("obs"), h5py.Group):
-            raise Unusable(f"the group {_missing(group, 'obs')}")
+            raise Unusable("the group 'obs' is missing")
         images = {
             image: array(group, f"obs/{image}", (None, None, None, 3), np.uint8)
             for image in image_names(group["obs"]).values()
@@ -242,14 +256,17 @@ def _open_error(path: Path, error: OSError) -> str:
     return f"it is no HDF5 file, or was cut off ({first_line(error)})"
 
 
-def _missing(group: h5py.Group, name: str) -> str:
-    """Return the reason why an array or group is missing."""
+def _check_own(file: h5py.File) -> None:
+    """Refuse a file with content of others: HDF5 would read any file that its external links and arrays name."""
     import h5py
 
-    link = group.get(name, getlink=True)
-    if isinstance(link, h5py.ExternalLink):
-        return f"{name!r} is a link into the file {link.filename!r}, which cannot be opened; put it next to this file"
-    return f"{name!r} is missing"
+    def outside(name: str, found: Any) -> str | None:
+        is_array = isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)
+        return name if is_array or isinstance(found, h5py.ExternalLink) else None
+
+    name = file.visititems_links(outside) or file.visititems(outside)
+    if name:
+        raise Unusable(f"{name!r} is read from another file (a link, external storage or a virtual array); copy it in")
 
 
 def _check_layout(data: h5py.Group) -> None:
@@ -332,13 +349,20 @@ def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: 
 
     found = group.get(name)
     if not isinstance(found, h5py.Dataset):
-        raise Unusable(f"the array {_missing(group, name)}")
+        raise Unusable(f"the array {name!r} is missing")
     if found.dtype not in [np.dtype(dtype) for dtype in dtypes]:
         expected = " or ".join(str(np.dtype(dtype)) for dtype in dtypes)
         raise Unusable(f"{name} has type {found.dtype}, expected {expected}")
     if len(found.shape) != len(shape) or any(n not in (None, m) for n, m in zip(shape, found.shape, strict=True)):
         expected = ", ".join("any" if n is None else str(n) for n in shape)
         raise Unusable(f"{name} has shape {found.shape}, expected ({expected})")
+    stored = found.id.get_create_plist()
+    for number, _, _, label in (stored.get_filter(k) for k in range(stored.get_nfilters())):
+        if not h5py.h5z.filter_avail(number):
+            raise Unusable(
+                f"{name} is compressed by the HDF5 filter {number} {label.decode(errors='replace')!r}, which is not "
+                "installed; set HDF5_PLUGIN_PATH to the folder of its plugin, or rewrite it with `h5repack -f NONE`"
+            )
     return found
 
 

@@ -24,6 +24,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
     EXECUTED_ACTION,
     INFO_FILE,
+    LANGUAGE,
     MANIFEST_FILE,
     OBJECTS,
     STATS_FILE,
@@ -32,6 +33,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     check_whole,
     dataset_files,
     episode_count,
+    expect,
     image_key,
     is_dataset,
     objects_column,
@@ -50,7 +52,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import (
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
-from lerobot_memobench.io import check_fetched, cut, file_hash, refusing
+from lerobot_memobench.io import check_fetched, cut, file_hash, files_below, refusing
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
@@ -201,6 +203,7 @@ def _file_checks(folder: Path) -> Iterator[_Check]:
     if written is None:
         yield of(MANIFEST_FILE, partial(str, NO_HASHES))
     yield of(INFO_FILE, partial(check_whole, folder))
+    yield of(INFO_FILE, partial(check_description, folder))
     names = measured(read_info(folder)["features"])
     cameras = [name for name in names if name.startswith(image_key(""))]
     for chosen in ([name for name in names if name not in cameras], *([camera] for camera in cameras)):
@@ -257,6 +260,46 @@ def check_file(path: Path, written: Written | None) -> str | None:
             "from its source again, or generate it"
         )
     return f"encoded or written again after {MANIFEST_FILE}: its content was checked, its hash was not"
+
+
+def check_description(folder: Path) -> None:
+    """Compare the features, frame rate and splits of ``meta/info.json`` with the columns and videos.
+
+    Raises:
+        MemobenchError: naming the first difference.
+    """
+    import av
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    import pyarrow.parquet as pq
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    info = read_info(folder)
+    features = {name: {**feature, "shape": tuple(feature["shape"])} for name, feature in info["features"].items()}
+    wanted = {field.name: field.type for field in get_hf_features_from_features(features).arrow_schema}
+    splits = {"train": f"0:{info['total_episodes']}"}
+    expect(INFO_FILE, "splits", [info.get("splits", splits)], [splits])
+    for path in files_below(folder / "data", ".parquet"):
+        found = {field.name: field.type for field in pq.read_schema(path)}
+        for name, kind in {**dict.fromkeys(found), **wanted}.items():
+            there = found.get(name)
+            if name == LANGUAGE and there is not None:
+                continue  # LeRobot's tools write the fields of its rows in several types
+            if isinstance(there, pa.ListType) and isinstance(kind, pa.FixedSizeListType):  # as LeRobot's tools write it
+                (size,) = pc.list_value_length(pq.read_table(path, columns=[name])[name]).unique().to_pylist()
+                there = pa.list_(there.value_type, size)
+            expect(path.relative_to(folder), f"type of the column {name}", [there], [kind])
+    for name, feature in features.items():
+        is_video, names = feature["dtype"] == "video", feature.get("names")
+        if isinstance(names, list):
+            expect(INFO_FILE, f"number of names of {name}", [len(names)], [3] if is_video else feature["shape"])
+        for path in files_below(folder / "videos" / name, ".mp4") if is_video else ():
+            with av.open(str(path)) as container:
+                video = container.streams.video[0]
+                sizes = [video.height, video.width, 3, float(video.average_rate or 0)]
+            stated = [feature.get("info", {}).get(f"video.{key}") for key in ("height", "width", "channels", "fps")]
+            for there in ([*feature["shape"], info["fps"]], stated):
+                expect(INFO_FILE, f"size and rate of {name}", there, sizes)
 
 
 def check_manifest(folder: Path) -> None:

@@ -405,6 +405,10 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
         hint = f", such as {directory.parent}" if directory.is_file() and _log_files(directory.parent) else ""
         raise MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written{hint}")
     files = _log_files(directory)
+    if not files and (directory / "meta" / "info.json").is_file():
+        raise MemobenchError(
+            f"{directory} is a LeRobotDataset, expected the folder of an evaluation; read it by `memobench describe`"
+        )
     if not files:
         nested = (file for depth in ("*", "*/*") for file in sorted(directory.glob(f"{depth}/{MERGED_FILE}*")))
         first = next(nested, None)

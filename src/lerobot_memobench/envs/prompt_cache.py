@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
-from lerobot_memobench.io import cache_folder, draft_of
+from lerobot_memobench.io import cache_folder, draft_of, files_below
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import Simulation, Snapshot
@@ -155,7 +155,7 @@ def _code() -> tuple[str, ...]:
     """Return the sources, library versions and Python version that compute a prompt."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256((package / "protocol.py").read_bytes())
-    for source in sorted(file for part in SOURCES for file in (package / part).rglob("*.py")):
+    for source in sorted(file for part in SOURCES for file in files_below(package / part, ".py")):
         digest.update(source.relative_to(package).as_posix().encode() + source.read_bytes())
     return digest.hexdigest(), *(metadata.version(name) for name in PACKAGES), sys.version
 

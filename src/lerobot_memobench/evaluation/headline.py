@@ -45,9 +45,11 @@ def policy_name(run: Run) -> str:
 
 def protocol_phrases(run: Run) -> list[str]:
     """Return suite, world, referent, seeds, episodes per task, replan interval and controls of an evaluation."""
-    records = run.records
+    records, suite = run.records, of_all(run.records, "suite")
     return [
-        f"{of_all(records, 'suite')} suite",
+        f"own tasks, suite={suite}"
+        if run.card.get("settings", {}).get("env", {}).get("task_dir")
+        else f"{suite} suite",
         *(
             f"{key} {value}"
             for key in ("world", "difficulty", "protocol", "convention")

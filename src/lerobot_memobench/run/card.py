@@ -21,7 +21,7 @@ from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, FORMAT
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
-from lerobot_memobench.io import file_hash, read_json, write_file
+from lerobot_memobench.io import file_hash, files_below, read_json, write_file
 from lerobot_memobench.jobs.threads import cores, cpu_model
 from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, TrainConfig, local_folder, portable_path
 from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, tree_hash
@@ -154,7 +154,7 @@ def training_facts(folder: Path) -> dict[str, Any] | None:
     found["steps"] = config.get("steps")
     root = Path(str(found["root"] or ""))
     if found["root"] and os.path.isdir(root / "meta"):  # pathlib raises at names that are too long
-        files = sorted(path for path in [*(root / "meta").rglob("*"), root / "manifest.json"] if path.is_file())
+        files = sorted(path for path in [*files_below(root / "meta"), root / "manifest.json"] if path.is_file())
         found["sha256"] = tree_hash({str(path.relative_to(root)): file_hash(path) for path in files})
     return found
 

@@ -13,7 +13,7 @@ from lerobot_memobench.envs.settings import SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.io import count_of, remove_drafts
+from lerobot_memobench.io import count_of, refuse_links, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
@@ -185,10 +185,14 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
     """Make and lock the folders of an evaluation and of its log, see `made`.
 
     Drafts of a killed run are removed. A run that ends before its first episode leaves no evaluation file.
+
+    Raises:
+        MemobenchError: another run writes there, or the folder of videos or memory reads is a link.
     """
     with ExitStack() as stack:
         for folder in {folder.absolute(): folder for folder in (plan.output, plan.log)}.values():
             stack.enter_context(made(folder))
+        refuse_links(plan.log / VIDEOS, plan.log / MEMORY_READS)
         for folder in (plan.log, plan.log / VIDEOS, plan.log / MEMORY_READS):
             remove_drafts(folder)
         file = plan.log / EVALUATION_FILE

@@ -24,7 +24,7 @@ from lerobot_memobench.evaluation.agreement import disagreement
 from lerobot_memobench.evaluation.asked import check_lines, extent_of
 from lerobot_memobench.evaluation.records import Run, read_protocol
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.io import draft_of
+from lerobot_memobench.io import draft_of, refuse_links
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm
@@ -265,6 +265,7 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
     card = _joined_card(sources)
     stored = [*map(protocol_of, sources)]
 
+    refuse_links(out / VIDEOS, out / MEMORY_READS)
     out.mkdir(parents=True, exist_ok=True)
     for source in folders:
         if source != out:

@@ -31,6 +31,14 @@ WIDTH = sum(FIELDS.values())
 SIZE = SLOTS * WIDTH
 """Length of the observation."""
 
+NAMES = [
+    f"object_{slot}.{name}" + (f"_{k}" if size > 1 else "")
+    for slot in range(SLOTS)
+    for name, size in FIELDS.items()
+    for k in range(size)
+]
+"""Name of each number."""
+
 STARTS = dict(zip(FIELDS, itertools.accumulate(FIELDS.values(), initial=0), strict=False))
 """Field -> offset in its slot."""
 

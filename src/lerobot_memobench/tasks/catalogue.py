@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
+from lerobot_memobench.io import files_below, spelled
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
 from lerobot_memobench.tasks.gap import gaps
@@ -221,14 +222,19 @@ def find_tasks(folder: str | Path) -> list[Path]:
     """Return the sorted task folders in a tree, the folder itself included.
 
     Raises:
-        MemobenchError: the folder does not exist or contains no task.
+        MemobenchError: the folder does not exist or contains no task, or two tasks have one name.
     """
     root = Path(folder)
     if not root.is_dir():
         raise MemobenchError(f"{root} is not a folder; expected one that holds {BDDL_FILE}, or a tree of such folders")
-    found = sorted(path.parent for path in root.rglob(BDDL_FILE))
+    found = [path.parent for path in files_below(root, BDDL_FILE) if path.name.lower() == BDDL_FILE]
     if not found:
         raise MemobenchError(f"found no {BDDL_FILE} in {root} or below it; expected a task in the published format")
+    named: dict[str, Path] = {}
+    for place in found:
+        other = named.setdefault(place.resolve().name, place)
+        if other != place:
+            raise MemobenchError(f"{other} and {place} hold tasks of one name; results are kept by name, so rename one")
     return found
 
 
@@ -249,9 +255,9 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
     folder = Path(folder).resolve()
     if not folder.is_dir():
         raise MemobenchError(f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}")
-    text = read_text(folder / BDDL_FILE, "the scene, instruction and goal in BDDL")
-    problem = parse_bddl(text, folder / BDDL_FILE)
-    path = folder / METADATA_FILE
+    bddl, path = spelled(folder / BDDL_FILE), spelled(folder / METADATA_FILE)
+    text = read_text(bddl, "the scene, instruction and goal in BDDL")
+    problem = parse_bddl(text, bddl)
     metadata = Metadata(path, problem, present=require_metadata or path.exists())
     data, checkpoints = metadata.data, metadata.checkpoints()
     memory_type = data.get("memory_type") or _infer_memory_type(folder, problem)

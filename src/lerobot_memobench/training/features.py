@@ -28,7 +28,7 @@ from torch import Tensor
 from lerobot_memobench.datasets.frames import FrameReader, frame_reader, read_frame_table, read_recorded
 from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words, write_file
+from lerobot_memobench.io import explaining_disk_errors, files_below, free_bytes, in_words, write_file
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.perception.visual_encoder import GRID, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
@@ -209,10 +209,10 @@ def dataset_fingerprint(root: Path, camera: str) -> str:
             f"{root} is not a LeRobotDataset (meta/info.json is missing); name the folder of meta, data and videos"
         )
     digest = hashlib.blake2b(digest_size=12)
-    for path in sorted((root / "data").rglob("*.parquet")):
+    for path in files_below(root / "data", ".parquet"):
         digest.update(str(path.relative_to(root)).encode())
         digest.update(path.read_bytes())
-    for path in sorted((root / "videos" / camera).rglob("*.mp4")):
+    for path in files_below(root / "videos" / camera, ".mp4"):
         size = path.stat().st_size
         digest.update(f"{path.relative_to(root)}{size}".encode())
         with path.open("rb") as file:

@@ -24,6 +24,7 @@ from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
+from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.lerobot_format.layout import (
     INFO_FILE,
@@ -40,15 +41,13 @@ from lerobot_memobench.datasets.statistics import recorded
 from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import cache_folder, explaining_disk_errors, write_file
+from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import LerobotArguments
 from lerobot_memobench.training.configuration import check_environment, read_config, with_features
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
-OURS = {*CLOCK, "simple_subgoal"}
-"""Columns that identify a dataset of the benchmark; a phase alone may have another meaning."""
 EPISODES_FOLDER = Path("meta") / "episodes"
 
 
@@ -175,10 +174,15 @@ def choice_for(policy: Any, features: Mapping[str, Any], prompt_frames: bool | N
     return Choice(prompts, obs_type)
 
 
+def _is_ours(features: Mapping[str, Any]) -> bool:
+    """Return whether a dataset is the benchmark's, by its texts too: a phase alone may have another meaning."""
+    return {*CLOCK, LEVEL_COLUMNS["intermediate"]} <= {EARLIER_COLUMNS.get(name, name) for name in features}
+
+
 def needs_view(features: Mapping[str, Any], choice: Choice) -> bool:
     """Return whether a dataset differs from its view."""
     kept = choice.columns(features)
-    return (set(features) >= OURS and not choice.prompts) or kept != {name: name for name in features}
+    return (_is_ours(features) and not choice.prompts) or kept != {name: name for name in features}
 
 
 def described(choice: Choice) -> str:
@@ -193,7 +197,7 @@ def described(choice: Choice) -> str:
 def view_hash(root: Path, choice: Choice) -> str:
     """Return a hash of a dataset's path, tables and metadata, and of the choice."""
     digest = hashlib.blake2b(f"{root.resolve()} {choice}".encode(), digest_size=8)
-    for path in (*sorted((root / "meta").rglob("*.*")), *sorted((root / "data").rglob("*.parquet"))):
+    for path in (*files_below(root / "meta"), *files_below(root / "data", ".parquet")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -209,18 +213,18 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
     info, table = read_info(root), read_frame_table(root)
     kept = choice.columns(info["features"])
     wanted = np.ones(len(table.phase), dtype=bool)
-    if set(info["features"]) >= OURS and not choice.prompts:
+    if _is_ours(info["features"]) and not choice.prompts:
         wanted = table.phase == EXECUTION
     ends = np.concatenate([[0], np.cumsum(wanted)])[table.episodes]
     left_out = np.diff(table.episodes) - np.diff(ends)
     build = out.with_name(f".{out.name}.{os.getpid()}")
     with explaining_disk_errors(out):
         shutil.rmtree(build, ignore_errors=True)
-        for path in sorted((root / "data").rglob("*.parquet")):
+        for path in files_below(root / "data", ".parquet"):
             with undamaged(path):
                 rows = pq.read_table(path)
             _write_table(_part_of(rows, kept, wanted, left_out, info["fps"]), build / path.relative_to(root))
-        for path in sorted((root / EPISODES_FOLDER).rglob("*.parquet")):
+        for path in files_below(root / EPISODES_FOLDER, ".parquet"):
             with undamaged(path):
                 rows = pq.read_table(path)
             _write_table(_episodes_of(rows, ends, left_out / info["fps"]), build / path.relative_to(root))
@@ -231,7 +235,7 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
         write_file(build / STATS_FILE, json.dumps({kept[name]: one for name, one in stats.items() if name in kept}))
         shutil.copyfile(root / TASKS_FILE, build / TASKS_FILE)
         for camera in cameras_of(features):
-            for path in sorted((root / "videos" / camera).rglob("*.mp4")):
+            for path in files_below(root / "videos" / camera, ".mp4"):
                 _link(path.resolve(), build / path.relative_to(root))
         build.rename(out)
 

@@ -42,7 +42,7 @@ from lerobot_memobench.datasets.staging import (
 )
 from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_hash, write_file
+from lerobot_memobench.io import file_hash, files_below, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
 from lerobot_memobench.sim.convention import UPRIGHT
@@ -187,7 +187,7 @@ def _written_files(folder: Path) -> dict[str, Written]:
 def _move(build: Path, out: Path) -> None:
     """Move the finished build into ``out``, which becomes a dataset with the last move."""
     out.mkdir(parents=True, exist_ok=True)
-    flush_to_disk(path for path in build.rglob("*") if path.is_file())
+    flush_to_disk(files_below(build))
     for name in TOP_LEVEL:
         target = out / name
         if target.is_dir():

@@ -14,6 +14,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import read_info, undamage
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, list_episodes
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import files_below
 from lerobot_memobench.paper import raw_tables
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
@@ -66,10 +67,11 @@ COLUMNS = {
     "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
     "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",
     "checkpoint.event": "a checkpoint is satisfied for the first time at this frame",
-    "simple_subgoal": "text of the present checkpoint, intermediate level",
-    "grounded_subgoal": "the same at the fine level; after the last checkpoint its text remains",
-    "coarse_subgoal": "the same at the coarse level",
-    "memory": "the checkpoints completed in order before this frame, as text (oracle memory); empty at the start",
+    "subgoal.coarse": "the state that the present checkpoint reaches; after the last checkpoint its text remains",
+    "subgoal.intermediate": "the event of the present checkpoint, in the past tense",
+    "subgoal.fine": "the same in more detail, in the past tense",
+    "subgoal.instruction": "the intermediate text as an instruction, in the present tense",
+    "oracle_memory": "the intermediate texts of the checkpoints completed in order so far; empty at the start",
     "language_persistent": "LeRobot's language rows for its training recipes: style `subtask`, the next step as an "
     "instruction; style `memory`, the completed steps",
     "episode_info": "JSON at an episode's first frame, else empty: the fields of the table below, and versions, "
@@ -351,7 +353,7 @@ def _prompts(infos: Sequence[dict[str, Any]]) -> str:
 def _size(folder: Path) -> int:
     """Return the bytes of a dataset, without its card and manifest."""
     kept = [folder / part for part in ("data", "meta", "states", "videos")]
-    return sum(path.stat().st_size for part in kept for path in part.rglob("*") if path.is_file())
+    return sum(path.stat().st_size for part in kept for path in files_below(part))
 
 
 def ordered_types(infos: Sequence[Mapping[str, Any]]) -> list[str]:

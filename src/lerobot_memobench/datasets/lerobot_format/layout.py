@@ -10,12 +10,19 @@ import traceback
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
+import numpy as np
 from annotated_types import Ge, Le
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from lerobot_memobench.datasets.demonstration import MAX_CHECKPOINTS
+from lerobot_memobench.datasets.demonstration import (
+    INSTRUCTION_COLUMN,
+    LEVEL_COLUMNS,
+    MAX_CHECKPOINTS,
+    MEMORY_COLUMN,
+)
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -23,11 +30,17 @@ from lerobot_memobench.io import (
     cache_folder,
     check_fetched,
     count_of,
+    files_below,
     read_json,
+    refuse_links,
     refusing,
+    short,
 )
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, PROPRIO_DIM
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, CONTROL_HZ, PROPRIO_DIM
 from lerobot_memobench.sim.convention import MIRRORED
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 STAGING = ".staging"
 """Folder of an unfinished run within its destination."""
@@ -36,6 +49,12 @@ MANIFEST_FILE = "manifest.json"
 INFO_FILE = Path("meta") / "info.json"
 STATS_FILE = Path("meta") / "stats.json"
 TASKS_FILE = Path("meta") / "tasks.parquet"
+EPISODES = "meta/episodes"
+EPISODES_FILE = EPISODES + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+PLACES = ("index", "timestamp", "length", "tasks")
+"""Ends of the names of columns that place episodes and frames."""
+TOLERANCE = 1e-3
+"""Largest difference of times, s or frames."""
 TOP_LEVEL = ("videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
 """In the order in which they are moved into place; with `meta` the folder becomes a dataset."""
 EPISODE_INFO = "episode_info"
@@ -53,7 +72,6 @@ PROPRIO_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", 
 ACTION_NAMES = ["x", "y", "z", "axis_angle_x", "axis_angle_y", "axis_angle_z", "gripper"]
 ADVICE = "the dataset is damaged; generate it or take it from its source again"
 NO_MANIFEST = "this package did not write it like that; take the dataset from its source again"
-EARLIER_FORMATS = ("v1.6", "v2.0", "v2.1")
 
 
 def is_dataset(folder: Path) -> bool:
@@ -69,6 +87,7 @@ def check_destination(out: Path) -> None:
         raise MemobenchError(f"{out} contains a colon, which Arrow reads as an address; use an absolute path")
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
+    refuse_links(*(out / name for name in (STAGING, *TOP_LEVEL)))
     # Files of an interrupted move next to the staging folder are replaced.
     strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
     if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
@@ -80,8 +99,7 @@ def check_destination(out: Path) -> None:
 def dataset_files(folder: Path) -> list[str]:
     """Return the paths of a dataset's files below ``folder``, without card, manifest and caches."""
     folders = [folder / name for name in TOP_LEVEL if not Path(name).suffix]
-    found = [path for part in folders for path in part.rglob("*") if path.is_file()]
-    return sorted(path.relative_to(folder).as_posix() for path in found)
+    return sorted(path.relative_to(folder).as_posix() for part in folders for path in files_below(part))
 
 
 # --- columns ---
@@ -118,7 +136,7 @@ def dataset_features(
     image_size: tuple[int, int] | None, cameras: Collection[str] = tuple(CAMERAS)
 ) -> dict[str, dict[str, Any]]:
     """Return LeRobot's description of the columns; ``image_size`` is (height, width), None without images."""
-    from lerobot_memobench.sim.object_layout import SIZE
+    from lerobot_memobench.sim.object_layout import NAMES, SIZE
 
     def feature(dtype: str, shape: tuple[int, ...] = (1,), names: list[str] | None = None) -> dict[str, Any]:
         return {"dtype": dtype, "shape": shape, "names": names}
@@ -128,21 +146,18 @@ def dataset_features(
     if image_size is not None:
         for camera in cameras:
             features[image_key(camera)] = feature("video", (*image_size, 3), ["height", "width", "channels"]) | stated
-    features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,))
+    features[OBJECTS if image_size is None else PRIVILEGED] = feature("float32", (SIZE,), NAMES)
     completed = [f"checkpoint_{k}" for k in range(MAX_CHECKPOINTS)]
     return features | {
         "observation.state": feature("float32", (PROPRIO_DIM,), PROPRIO_NAMES),
         "action": feature("float32", (ACTION_DIM,), ACTION_NAMES),
         EXECUTED_ACTION: feature("float32", (ACTION_DIM,), ACTION_NAMES),
-        **dict.fromkeys(CLOCK, feature("float32")),
-        "checkpoint.index": feature("int64"),
-        "checkpoint.operation": feature("int64"),
+        **{name: feature("float32", names=[name.rpartition(".")[2]]) for name in CLOCK},
+        "checkpoint.index": feature("int64", names=["completed_in_order"]),
+        "checkpoint.operation": feature("int64", names=["0_storage_1_update_2_compression_-1_none"]),
         "checkpoint.completed": feature("bool", (MAX_CHECKPOINTS,), completed),
-        "checkpoint.event": feature("bool"),
-        "simple_subgoal": feature("string"),
-        "grounded_subgoal": feature("string"),
-        "coarse_subgoal": feature("string"),
-        "memory": feature("string"),
+        "checkpoint.event": feature("bool", names=["satisfied_first"]),
+        **dict.fromkeys((*LEVEL_COLUMNS.values(), INSTRUCTION_COLUMN, MEMORY_COLUMN), feature("string")),
         "language_persistent": feature("language"),
         EPISODE_INFO: feature("string"),
     }
@@ -171,7 +186,7 @@ def read_info(folder: Path) -> dict[str, Any]:
         found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
     except FileNotFoundError:
         raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
-    if found["codebase_version"] in EARLIER_FORMATS:
+    if not found["codebase_version"].startswith("v3."):
         raise MemobenchError(
             f"{folder} is in LeRobot's format {found['codebase_version']}, expected v3.0; convert it in place, from "
             f"v2.1: python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/converted "
@@ -186,23 +201,12 @@ def episode_count(folder: Path) -> int:
     Raises:
         MemobenchError: they cannot be read, or disagree.
     """
-    count, rows = int(read_info(folder)["total_episodes"]), _row_count(folder / "meta" / "episodes")
+    count, rows = int(read_info(folder)["total_episodes"]), len(_table(folder, EPISODES))
     if rows != count:
         raise MemobenchError(
             f"{folder / INFO_FILE} has {count_of(count, 'episode')}, {folder}/meta/episodes {rows}; {ADVICE}"
         )
     return count
-
-
-def _row_count(folder: Path) -> int:
-    """Return the number of rows of the tables in a folder, by their footers."""
-    import pyarrow.parquet as pq
-
-    rows = 0
-    for path in sorted(folder.rglob("*.parquet")):
-        with undamaged(path):
-            rows += pq.read_metadata(path).num_rows
-    return rows
 
 
 class Asked(TypedDict):
@@ -296,41 +300,89 @@ def undamaged(folder: Path) -> AbstractContextManager[None]:
 
 
 def check_whole(folder: Path) -> None:
-    """Check that a dataset has all of its frames, without reading them.
+    """Check that a dataset has all of its frames, at the places that its metadata names, without decoding videos.
 
-    The check covers ends and row counts of tables, and boxes and frame counts of videos.
+    The check covers ends and row counts of tables, totals, numbers of tasks, bounds and files of episodes, the
+    numbering of frames, and boxes and frame counts of videos.
 
     Raises:
-        MemobenchError: naming the first file that is truncated or missing, or the table with missing rows.
+        MemobenchError: naming the first truncated or missing file, or the first number that differs.
     """
-    info = read_info(folder)
-    counts = {"data": info.get("total_frames"), "meta/episodes": info["total_episodes"]}
+    with undamaged(folder):
+        _check_bounds(folder, read_info(folder))
+
+
+def _check_bounds(folder: Path, info: dict[str, Any]) -> None:
+    import pandas as pd
+
+    check_fetched(folder / TASKS_FILE)
+    rows, frames, tasks = _table(folder, EPISODES), _table(folder, "data"), pd.read_parquet(folder / TASKS_FILE)
+    totals = {"total_episodes": len(rows), "total_frames": len(frames), "total_tasks": len(tasks)}
+    for key, total in totals.items():
+        expect(INFO_FILE, key, [info.get(key, total)], [total])
     if (folder / "states").is_dir():
-        counts["states"] = info.get("total_frames")
-    for part, expected in counts.items():
-        rows = _row_count(folder / part)
-        if expected is not None and rows != expected:
-            raise MemobenchError(f"{folder / part} holds {rows} rows, {INFO_FILE} names {expected}; {ADVICE}")
-    cameras = [key for key, feature in info["features"].items() if feature.get("dtype") == "video"]
-    for path, frames in _video_lengths(folder, info, cameras).items():
-        with undamaged(path):
-            _check_video(path, frames)
+        expect("states", "number of rows", [len(_table(folder, "states"))], [len(frames)])
+    expect(TASKS_FILE, "task_index", tasks["task_index"], range(len(tasks)))
+    episodes = np.arange(len(rows))
+    lengths = frames["episode_index"].value_counts().reindex(episodes, fill_value=0).to_numpy()
+    ends, of_frame = np.cumsum(lengths), np.repeat(episodes, lengths)
+    starts, index = ends - lengths, np.arange(len(of_frame))
+    within = index - starts[of_frame]
+    bounds = {"episode_index": episodes, "length": lengths, "dataset_from_index": starts, "dataset_to_index": ends}
+    for key, wanted in bounds.items():
+        expect(EPISODES, key, rows[key], wanted)
+    times = within / info.get("fps", CONTROL_HZ)
+    numbers = {"episode_index": of_frame, "index": index, "frame_index": within, "timestamp": times}
+    files = _paths(EPISODES_FILE, rows, EPISODES) if f"{EPISODES}/file_index" in rows else rows["path"]
+    expect(EPISODES, "file", files, rows["path"])
+    for key, wanted in (numbers | {"path": _paths(info["data_path"], rows, "data")[of_frame]}).items():
+        expect("data", key, frames[key], wanted)
+    texts = [{tasks.index[k] for k in set(part)} for part in np.split(frames["task_index"].to_numpy(), ends[:-1])]
+    expect(EPISODES, "tasks", [set(each) for each in rows["tasks"]], texts)
+    for camera in (key for key, feature in info["features"].items() if feature["dtype"] == "video"):
+        times = rows[[f"videos/{camera}/from_timestamp", f"videos/{camera}/to_timestamp"]].to_numpy() * info["fps"]
+        expect(EPISODES, f"length of {camera}", np.diff(times)[:, 0], rows["length"])
+        paths = _paths(info["video_path"].replace("{video_key}", camera), rows, f"videos/{camera}")
+        for path in dict.fromkeys(paths):
+            begins, stops = times[paths == path].T
+            if not (folder / path).is_file() or (begins < np.append(0, stops[:-1]) - TOLERANCE).any():
+                raise MemobenchError(f"{EPISODES} names {path}, which is missing, or where episodes overlap; {ADVICE}")
+            with undamaged(folder / path):
+                _check_video(folder / path, round(stops[-1]))
 
 
-def _video_lengths(folder: Path, info: dict[str, Any], cameras: list[str]) -> dict[Path, int]:
-    """Return the number of frames of each video, according to meta/episodes."""
+def expect(where: Path | str, key: str, found: Any, wanted: Any) -> None:
+    """Raise `MemobenchError` at the first difference of two sequences of numbers, texts or sets."""
+    found, wanted = np.asarray(found), np.asarray(wanted)
+    if found.shape == wanted.shape:
+        is_number = wanted.dtype.kind in "iuf"
+        differs = np.flatnonzero(~(abs(found - wanted) <= TOLERANCE) if is_number else found != wanted)
+        if not differs.size:
+            return
+        found, wanted, key = found[differs[:1]], wanted[differs[:1]], f"{key} of row {differs[0]}"
+    raise MemobenchError(f"{where}: {key} is {short(found.tolist())}, expected {short(wanted.tolist())}; {ADVICE}")
+
+
+def _table(folder: Path, part: str) -> pd.DataFrame:
+    """Return numbering and bounds in a folder's tables, and the file of each row as ``path``."""
+    import pandas as pd
     import pyarrow.parquet as pq
 
-    found: dict[Path, int] = {}
-    for table in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
-        for camera in cameras:
-            parts = ("chunk_index", "file_index", "to_timestamp")
-            with undamaged(table):
-                columns = pq.read_table(table, columns=[f"videos/{camera}/{part}" for part in parts]).to_pydict()
-                for chunk, file, end in zip(*columns.values(), strict=True):
-                    place = info["video_path"].format(video_key=camera, chunk_index=int(chunk), file_index=int(file))
-                    found[folder / place] = max(found.get(folder / place, 0), round(end * info["fps"]))
-    return found
+    tables = []
+    for path in files_below(folder / part, ".parquet"):
+        with undamaged(path):
+            names = [name for name in pq.read_schema(path).names if name.endswith(PLACES)]
+            table = pq.read_table(path, columns=names).to_pandas()
+        tables.append(table.assign(path=path.relative_to(folder).as_posix()))
+    if not tables:
+        raise MemobenchError(f"{folder / part} holds no table; {ADVICE}")
+    return pd.concat(tables, ignore_index=True)
+
+
+def _paths(template: str, rows: pd.DataFrame, prefix: str) -> NDArray:
+    """Return the file of each episode by its numbers in meta/episodes."""
+    numbers = zip(rows[f"{prefix}/chunk_index"], rows[f"{prefix}/file_index"], strict=True)
+    return np.array([template.format(chunk_index=int(chunk), file_index=int(file)) for chunk, file in numbers])
 
 
 def _check_video(path: Path, frames: int) -> None:
@@ -356,8 +408,8 @@ def _check_video(path: Path, frames: int) -> None:
 
 def damaged_file(folder: Path) -> str | None:
     """Read a whole dataset; return a message that names the first unreadable file, None if all can be read."""
-    tables = sorted([*folder.glob("data/**/*.parquet"), *folder.glob("meta/**/*.parquet")])
-    for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *sorted(folder.glob("videos/**/*.mp4"))]:
+    tables = [path for part in ("data", "meta") for path in files_below(folder / part, ".parquet")]
+    for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *files_below(folder / "videos", ".mp4")]:
         try:
             if not path.is_file():
                 return f"{path} is missing; {ADVICE}"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS
 from lerobot_memobench.datasets.lerobot_format.layout import (
     EPISODE_INFO,
     EXECUTED_ACTION,
@@ -26,7 +27,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     undamaged,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Number, Whole, first_fault, parsed
+from lerobot_memobench.io import Count, Malformed, Number, Whole, files_below, first_fault, parsed
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, World
 
@@ -350,7 +351,7 @@ def _read(folder: Path, names: tuple[str, ...] | None, chosen: list[tuple[str, s
     import pyarrow.parquet as pq
 
     tables = []
-    for path in sorted(folder.rglob("*.parquet")):
+    for path in files_below(folder, ".parquet"):
         with undamaged(path):
             there = pq.read_schema(path).names
             columns = None if names is None else [name for name in names if name in there]
@@ -368,7 +369,7 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
     for name in table.column_names:
         values = table.column(name).to_pylist()
         is_text = name == LANGUAGE or isinstance(values[0], str)
-        columns[name] = values if is_text else np.array(values)
+        columns[EARLIER_COLUMNS.get(name, name)] = values if is_text else np.array(values)
     for name in ("action", EXECUTED_ACTION, "observation.state", OBJECTS, PRIVILEGED):
         if name in columns:
             columns[name] = columns[name].astype(np.float32)

@@ -26,7 +26,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import episode_id, page_data, task_source
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.evaluation.records import Run, read_runs
-from lerobot_memobench.io import draft_of, file_name, write_file
+from lerobot_memobench.io import draft_of, file_name, refuse_links, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.memory_reads import Chunk, find_reads
 
@@ -72,7 +72,8 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
         task_dir: task folders in the published format whose texts are shown, in addition to the catalogue.
 
     Raises:
-        MemobenchError: a folder holds no log, or ``out`` holds something that is no report.
+        MemobenchError: a folder holds no log, ``out`` holds something that is no report, or a folder of its videos is a
+            link.
     """
     out = Path(out)
     _check_target(out)
@@ -89,6 +90,7 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
         read, misfits = find_reads(run.folder, run.records, run.protocol)
         reads.append(read)
         runs.append(replace(run, notes=(*run.notes, *notes, *misfits)))
+    refuse_links(out / VIDEOS, *(target.parent for target in chosen))
     text = page(page_data(runs, addresses, task_source(task_dir), reads), title=", ".join(run.name for run in runs))
     out.mkdir(parents=True, exist_ok=True)
     with locked(out, out):
@@ -96,12 +98,12 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
             write_file(out / PAGE, UNFINISHED)  # marks the folder as a report
         place_videos(chosen)
         write_file(out / PAGE, text)
-        _remove_other_videos(out, chosen)
+        linked = _remove_other_videos(out, chosen)
     return Written(
         page=out / PAGE,
         rollouts=sum(len(run.records) for run in runs),
         videos=len(chosen),
-        notes=[f"{run.name}: {note}" for run in runs for note in run.notes],
+        notes=[*linked, *(f"{run.name}: {note}" for run in runs for note in run.notes)],
     )
 
 
@@ -132,14 +134,21 @@ def _check_target(out: Path) -> None:
         raise MemobenchError(f"--out {out} holds files that are no earlier report; name a new or an empty folder")
 
 
-def _remove_other_videos(out: Path, placed: Collection[Path]) -> None:
-    """Remove videos of an earlier report, and folders that this leaves empty."""
-    for path in (out / VIDEOS).glob(f"*/*{VIDEO}"):
-        if path not in placed:
-            path.unlink()
-    for folder in (*(out / VIDEOS).glob("*/"), out / VIDEOS):
-        if folder.is_dir() and not any(folder.iterdir()):
+def _remove_other_videos(out: Path, placed: Collection[Path]) -> list[str]:
+    """Remove videos of an earlier report and folders that this leaves empty; return notes on links, which stay."""
+    notes = []
+    for folder in sorted((out / VIDEOS).glob("*/")):
+        if folder.is_symlink():
+            notes.append(f"{folder} is a link to a folder; it and the files behind it were left as they are")
+            continue
+        for path in folder.glob(f"*{VIDEO}"):
+            if path not in placed:
+                path.unlink()
+        if not any(folder.iterdir()):
             folder.rmdir()
+    if (out / VIDEOS).is_dir() and not any((out / VIDEOS).iterdir()):
+        (out / VIDEOS).rmdir()
+    return notes
 
 
 # --- videos ---
