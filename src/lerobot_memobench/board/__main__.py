@@ -11,6 +11,7 @@ from pathlib import Path
 
 from lerobot_memobench.board.check import check_paths, read_board
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.start import prepare_process
 
 
 def main(words: list[str]) -> int:
@@ -31,4 +32,5 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    prepare_process()
     sys.exit(main(sys.argv[1:]))

@@ -22,6 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from lerobot_memobench.errors import MemobenchError, chain
 from lerobot_memobench.io import disk_refusal
 from lerobot_memobench.jobs.processes import adding_resume_hint
+from lerobot_memobench.jobs.start import prepare_process, reader_has_left
 from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, PUBLISHED, STRICT
 
 USAGE_ERROR = 2
@@ -147,13 +148,17 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
         again: how to resume, printed when SIGTERM ends it or a worker process is killed.
     """
     try:
+        prepare_process()
         with adding_resume_hint(program, lambda: again):
             result = call()
+            sys.stdout.flush()
     except (typer.Abort, KeyboardInterrupt):
         return 130
     except typer.Exit as stop:
         return stop.exit_code
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and reader_has_left():
+            return 1
         message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
         if message is not None and type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
             print(message())
