@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lerobot_memobench.errors import MemobenchError, chain
 from lerobot_memobench.io import disk_refusal
-from lerobot_memobench.jobs.processes import adding_resume_hint
+from lerobot_memobench.jobs.processes import NO_LOCKS, adding_resume_hint
 from lerobot_memobench.jobs.start import prepare_process, reader_has_left
 from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, PUBLISHED, STRICT
 
@@ -186,6 +186,11 @@ def one_sentence(error: BaseException) -> str | None:
         return _line(errors[0])  # LeRobot's own words for a missing extra
     if isinstance(errors[0], FileExistsError):
         return _line(errors[0])
+    if isinstance(error, OSError) and error.errno in NO_LOCKS and _came_through(error, "filelock"):
+        return (
+            f"the disk of Hugging Face's caches cannot lock files ({error.strerror}): set HF_HOME, or "
+            "HF_DATASETS_CACHE alone, to a folder on another disk, such as one in /tmp"
+        )
     refusal = disk_refusal(error)
     if refusal is not None:
         named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)
