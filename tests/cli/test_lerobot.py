@@ -360,6 +360,8 @@ def test_settings_that_differ_from_the_checkpoints_are_noted(
         (["policy=act", "dataset=stuff"], "meta/info.json"),
         (["policy=act", "--dataset.repo_id=local/stuff", "--dataset.root=stuff"], "meta/info.json"),
         (["policy=act", "dataset=missing"], "memobench generate"),
+        (["policy=act", "--dataset.repo_id=outputs/missing"], "outputs/missing"),
+        (["policy=act", "device=cuda:99"], "cuda:99"),
         (["resume=true"], "output_dir="),
         (["resume=true", "output_dir=nowhere"], "nowhere does not exist"),
         (["resume=true", "output_dir=empty"], "no complete checkpoint"),

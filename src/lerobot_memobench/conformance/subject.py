@@ -22,7 +22,7 @@ from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import SHORT_FORMS, policy_config, read_arguments, split_arguments
 from lerobot_memobench.run.rollout import has_planned_action, needs_observation
@@ -153,6 +153,7 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
         made = write_streams(folder / "streams", task=task_of_texts(known or {}))
         given = type(given)([*given.pairs, ("dataset", str(made))], given.flags)
     arguments = read_arguments("train", given)
+    check_device(arguments.get("policy.device"))
     if not torch.cuda.is_available():
         arguments = arguments.default("policy.device", "cpu")
     if "n_action_steps" in getattr(arguments.chosen.get("policy"), "__dataclass_fields__", ()):
