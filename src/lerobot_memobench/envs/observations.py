@@ -240,7 +240,7 @@ class Observer:
         """Return the pictures and objects of the observation, see `observation_space`."""
         found: dict[str, Any] = {}
         if self._has_pictures:
-            found["pixels"] = dict(self._images)
+            found["pixels"] = {name: image.copy() for name, image in self._images.items()}  # as objects below
         if self._has_objects:
             found["environment_state"] = self._objects.copy()  # may be returned again
         return found
