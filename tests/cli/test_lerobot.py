@@ -97,7 +97,7 @@ def test_help_explains_every_short_form(
     command: str, theirs: Called, training: Called, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([command, "--help"]) == 0
-    assert (theirs if command == "eval" else training).flags == ["--help"]
+    assert (theirs if command == "eval" else training).flags is None  # LeRobot's import takes ten seconds
     text = capsys.readouterr().out
     explained = {word for line in text.splitlines() if line.endswith("=") for word in line.strip().split(", ")}
     assert {f"{word}=" for word in (*SHORT_FORMS[command], *OPTIONS[command], "policy")} <= explained
