@@ -32,6 +32,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.video import VideoRecorder
+from lerobot_memobench.jobs.processes import adding_resume_hint
 
 BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
 TASKS = (
@@ -198,4 +199,5 @@ def read_video(path: Path) -> list[Frame]:
 
 
 if __name__ == "__main__":
-    main()
+    with adding_resume_hint("demo", lambda: "the same command resumes"):  # SIGTERM ends the children
+        main()

@@ -17,6 +17,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from lerobot_memobench.jobs.processes import adding_resume_hint
+
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 POLICIES = {"memory": (), "no_memory": ("policy.memory=none",)}
 """Name -> settings of its training, in addition to the shared ones."""
@@ -79,4 +81,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with adding_resume_hint("train_in_ten_minutes", lambda: "the same command resumes"):  # SIGTERM ends the children
+        main()

@@ -6,13 +6,16 @@ import codecs
 import contextlib
 import errno
 import functools
+import getpass
 import gzip
 import hashlib
 import os
 import re
 import secrets
 import shutil
+import stat
 import sys
+import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
@@ -143,7 +146,49 @@ def check_regular(path: Path) -> None:
 
 def cache_folder() -> Path:
     """Return the folder of caches."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_memobench"
+    return cache_base() / "lerobot_memobench"
+
+
+def cache_base() -> Path:
+    """Return the folder in which this package and its libraries (numba, torch, Hugging Face) keep caches."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+
+
+def choose_caches() -> None:
+    """Set variables of the environment for a user without a name or a writable home, as in many containers.
+
+    Call it before numba, torch or Hugging Face is imported. Child processes inherit the variables.
+    """
+    if sys.platform == "win32":
+        return
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):  # torch names a folder by the user
+        os.environ["USER"] = f"user-{os.getuid()}"
+    base = cache_base()
+    while not os.path.exists(base) and base != base.parent:
+        base = base.parent
+    if not (base.is_absolute() and os.path.isdir(base) and os.access(base, os.W_OK | os.X_OK)):
+        with contextlib.suppress(OSError):
+            folder = private_folder(tempfile.gettempdir()) / "cache"
+            os.environ["XDG_CACHE_HOME"] = str(folder)
+            os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
+            if os.path.expanduser("~") == "~":
+                os.environ["HOME"] = str(folder.parent)
+
+
+def private_folder(shared: str) -> Path:
+    """Return this user's own folder in a folder that all users share, such as ``/tmp``; it is made if it is missing.
+
+    Raises:
+        OSError: it cannot be made, or others may write to it. Caches hold code, so it must not be another user's.
+    """
+    folder = Path(shared) / f"memobench-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise PermissionError(errno.EPERM, "others may write to this folder", str(folder))
+    return folder
 
 
 def as_path(word: str) -> str:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 from collections.abc import Callable
 from multiprocessing import Pipe
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from filelock import FileLock
 from huggingface_hub.errors import LocalEntryNotFoundError, OfflineModeIsEnabled
 from rich.console import Console, RenderableType
 
@@ -115,3 +119,16 @@ def test_a_killed_worker_ends_a_command_with_the_way_to_resume(call: Callable[[]
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert all(part in error for part in ("memory", "batch_size", "resume with: that"))
+
+
+def test_a_librarys_lock_on_a_disk_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fcntl = pytest.importorskip("fcntl")
+
+    def flock(descriptor: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises(OSError, match="locks") as caught, FileLock(tmp_path / "lock"):
+        pass
+    assert "HF_DATASETS_CACHE" in (one_sentence(caught.value) or "")
+    assert one_sentence(OSError(errno.ENOLCK, "elsewhere")) is None

@@ -97,7 +97,7 @@ def test_help_explains_every_short_form(
     command: str, theirs: Called, training: Called, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([command, "--help"]) == 0
-    assert (theirs if command == "eval" else training).flags == ["--help"]
+    assert (theirs if command == "eval" else training).flags is None  # LeRobot's import takes ten seconds
     text = capsys.readouterr().out
     explained = {word for line in text.splitlines() if line.endswith("=") for word in line.strip().split(", ")}
     assert {f"{word}=" for word in (*SHORT_FORMS[command], *OPTIONS[command], "policy")} <= explained
@@ -360,6 +360,8 @@ def test_settings_that_differ_from_the_checkpoints_are_noted(
         (["policy=act", "dataset=stuff"], "meta/info.json"),
         (["policy=act", "--dataset.repo_id=local/stuff", "--dataset.root=stuff"], "meta/info.json"),
         (["policy=act", "dataset=missing"], "memobench generate"),
+        (["policy=act", "--dataset.repo_id=outputs/missing"], "outputs/missing"),
+        (["policy=act", "device=cuda:99"], "cuda:99"),
         (["resume=true"], "output_dir="),
         (["resume=true", "output_dir=nowhere"], "nowhere does not exist"),
         (["resume=true", "output_dir=empty"], "no complete checkpoint"),

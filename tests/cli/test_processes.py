@@ -395,3 +395,11 @@ def forget(out: Path, rng: random.Random) -> None:
     write_episodes(out, kept)
     for record in lost:
         (out / "videos" / f"{record['task']}.{record['episode']}.mp4").unlink()
+
+
+@pytest.mark.parametrize("words", [["eval", "--help"], ["train", "--help"], ["eval", "env=memobench", "tasks=stov"]])
+def test_a_mistyped_task_and_help_import_no_torch(words: list[str]) -> None:
+    code = (
+        f"import sys; from lerobot_memobench.cli.lerobot import main; main({words}); sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

@@ -159,3 +159,13 @@ def test_exit_status_and_table() -> None:
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capture.get().splitlines() if "│" in line]
     assert rows == [["a", "ok", "x"], ["b", "warning", "[y]"], ["", "", "fix: do z"]]
     assert json.dumps([asdict(finding) for finding in findings])
+
+
+def test_caches_in_a_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "other"))
+    assert examination.caches().status == "ok"
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    found = examination.caches()
+    assert (found.status, str(tmp_path / "cache") in found.detail) == ("warning", True)
+    assert "XDG_CACHE_HOME" in found.fix

@@ -5,12 +5,13 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
-from lerobot_memobench.envs.observations import check_obs_type, obs_type_of, policy_inputs
+from lerobot_memobench.envs.observations import Observer, check_obs_type, obs_type_of, policy_inputs
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.baselines.configuration_baselines import (
@@ -87,3 +88,11 @@ def test_observation_kind_must_contain_the_inputs(policy: Any, needed: str | Non
         else:
             with pytest.raises(MemobenchError, match=f"obs_type is {obs_type}.*{BOTH}"):
                 check_obs_type(policy, obs_type)
+
+
+def test_a_picture_may_be_changed_in_place() -> None:
+    """A scene at rest is rendered once, and each observation has arrays of its own."""
+    observer = Observer(PIXELS)
+    observer._images = {"image": np.ones((2, 2, 3), np.uint8)}
+    observer.observation()["pixels"]["image"][:] = 0
+    assert observer.observation()["pixels"]["image"].all()

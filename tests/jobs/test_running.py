@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +12,7 @@ import pytest
 from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs import processes
 from lerobot_memobench.jobs.processes import Advance, locked, taking_turns
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.slurm import Needs, Slurm, read_options, run_part
@@ -129,6 +132,29 @@ def test_one_run_at_a_time_in_a_folder(tmp_path: Path, monkeypatch: pytest.Monke
         assert list(tmp_path.iterdir()) == []
     monkeypatch.setattr(sys, "platform", "win32")
     with pytest.raises(MemobenchError, match="WSL2"), locked(tmp_path, tmp_path):
+        pass
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows locks files by another call")
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
+def test_a_disk_without_locks_is_noted_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], number: int
+) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    reason = [number]
+
+    def flock(descriptor: int, operation: int) -> None:
+        raise OSError(reason[0], os.strerror(reason[0]))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    processes.note_missing_locks.cache_clear()
+    for _ in range(2):
+        with locked(tmp_path, tmp_path), taking_turns(tmp_path / "lock"):
+            pass
+    err = capsys.readouterr().err
+    assert (err.count("\n"), os.strerror(number) in err) == (1, True)
+    reason[0] = errno.EBADF
+    with pytest.raises(OSError, match="descriptor"), locked(tmp_path, tmp_path):
         pass
 
 

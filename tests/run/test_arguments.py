@@ -108,6 +108,7 @@ def test_other_commands_get_their_arguments_as_typed() -> None:
         ("eval", ["env=memobench", "align=semantic"], "policy="),
         ("eval", ["policy=act", "env.horizon=3"], "needs env="),
         ("eval", ["env=memobench", "policy=./nowhere"], "does not exist"),
+        ("eval", ["env=memobench", "policy=outputs/none"], "does not exist"),
         ("eval", ["env=memobench", "policy=folder"], "no config.json"),
         ("eval", ["env=memobench", "env.horizon.x=1"], "'env.horizon.x'"),
         ("eval", ["env=memobench", "policy=act", "policy.type.x=1"], "'policy.type.x'"),
@@ -121,7 +122,10 @@ def test_other_commands_get_their_arguments_as_typed() -> None:
         ("eval", ["--config_path=broken.yaml"], "neither YAML nor JSON"),
         ("eval", ["--config_path=number.yaml"], "expected a name"),
         ("train", ["policy=act", "optimizer.lr=1e-3"], "needs optimizer="),
-        *(("train", ["policy=act", f"dataset={name}"], "no such folder") for name in ("./nowhere", "nowhere", "/a/b")),
+        *(
+            ("train", ["policy=act", f"dataset={name}"], "no such folder")
+            for name in ("./nowhere", "outputs/no", "no", "/a/b")
+        ),
         ("train", ["policy=act", "job_name=include x"], "include"),
     ],
 )

@@ -125,6 +125,13 @@ def test_hostile_settings_are_refused_by_name(named: str, changes: dict[str, Any
     assert "\n" not in str(caught.value)
 
 
+def test_the_device_of_a_card_may_be_missing_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there in (True, False):
+        monkeypatch.setattr("lerobot_memobench.run.rerun.has_device", lambda device, there=there: there)
+        asked = allowed(env={"tasks": STOVE}, policy={"type": "memobench_random", "device": "cuda"})
+        assert ("device" in asked.policy) == there
+
+
 FLAGS = ["--env.type=memobench", f"--env.tasks={STOVE}", "--policy.type=memobench_random"]
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from lerobot_memobench.board.check import check_author, check_paths, read_board
 from lerobot_memobench.board.submission import BOARD
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.start import prepare_process
 
 
 def main(words: list[str]) -> int:
@@ -35,4 +36,5 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    prepare_process()
     sys.exit(main(sys.argv[1:]))

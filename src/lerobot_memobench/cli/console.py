@@ -21,7 +21,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lerobot_memobench.errors import MemobenchError, chain
 from lerobot_memobench.io import disk_refusal
-from lerobot_memobench.jobs.processes import adding_resume_hint
+from lerobot_memobench.jobs.processes import NO_LOCKS, adding_resume_hint
+from lerobot_memobench.jobs.start import prepare_process, reader_has_left
 from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, PUBLISHED, STRICT
 
 USAGE_ERROR = 2
@@ -147,13 +148,17 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
         again: how to resume, printed when SIGTERM ends it or a worker process is killed.
     """
     try:
+        prepare_process()
         with adding_resume_hint(program, lambda: again):
             result = call()
+            sys.stdout.flush()
     except (typer.Abort, KeyboardInterrupt):
         return 130
     except typer.Exit as stop:
         return stop.exit_code
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and reader_has_left():
+            return 1
         message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
         if message is not None and type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
             print(message())
@@ -181,6 +186,11 @@ def one_sentence(error: BaseException) -> str | None:
         return _line(errors[0])  # LeRobot's own words for a missing extra
     if isinstance(errors[0], FileExistsError):
         return _line(errors[0])
+    if isinstance(error, OSError) and error.errno in NO_LOCKS and _came_through(error, "filelock"):
+        return (
+            f"the disk of Hugging Face's caches cannot lock files ({error.strerror}): set HF_HOME, or "
+            "HF_DATASETS_CACHE alone, to a folder on another disk, such as one in /tmp"
+        )
     refusal = disk_refusal(error)
     if refusal is not None:
         named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)

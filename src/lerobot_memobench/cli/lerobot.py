@@ -32,6 +32,8 @@ from lerobot_memobench.run.arguments import (
     read_arguments,
     split_arguments,
 )
+from lerobot_memobench.tasks.catalogue import resolve_tasks
+from lerobot_memobench.tasks.task import PUBLISHED
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.records import Run
@@ -58,7 +60,10 @@ def run(line: Sequence[str]) -> int:
     if name not in commands:
         raise MemobenchError(f"there is no command {name!r}, {nearest(name, commands)}")
     if given.wants_help and name in SHORT_FORMS:
-        print(Path(__file__).with_name(f"lerobot_{name}.txt").read_text(), flush=True)
+        print(Path(__file__).with_name(f"lerobot_{name}.txt").read_text(encoding="utf-8"), flush=True)
+        if not given.pairs:
+            print(f"all settings: `lerobot {name} --help` with env= or policy=, which imports LeRobot")
+            return 0
     if name == "train":
         from lerobot_memobench.training.command import train
 
@@ -99,6 +104,7 @@ def evaluate(given: Arguments, command: Sequence[str]) -> int:
     Args:
         command: the whole command line, for the card.
     """
+    check_tasks(given)
     from lerobot_memobench.run.plan import make_plan, take_run_options
     from lerobot_memobench.run.settings import read_settings
 
@@ -110,6 +116,14 @@ def evaluate(given: Arguments, command: Sequence[str]) -> int:
         explaining_disk_errors(plan.output, f"finished episodes stay; {hint}"),
     ):
         return evaluate_in_parts(plan) if options.shards else evaluate_here(plan)
+
+
+def check_tasks(given: Arguments) -> None:
+    """Refuse unknown tasks before LeRobot is imported, which takes ten seconds."""
+    tasks = given.value("tasks") or given.value("env.tasks")
+    suite = given.value("suite") or given.value("env.suite") or PUBLISHED
+    if tasks is not None and given.value("config_path") is None:
+        resolve_tasks(tasks, suite)
 
 
 def read_other(given: Arguments) -> LerobotArguments:

@@ -24,7 +24,7 @@ from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.policies.convention import check_convention, trained_convention
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import CLOCK, EXECUTION
 from lerobot_memobench.run.arguments import SHORT_FORMS, policy_config, read_arguments, split_arguments
 from lerobot_memobench.run.rollout import has_planned_action, needs_observation
@@ -169,6 +169,7 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
         made = write_streams(folder / "streams", task=task, convention=convention or UPRIGHT)
         given = type(given)([*given.pairs, ("dataset", str(made))], given.flags)
     arguments = read_arguments("train", given)
+    check_device(arguments.get("policy.device"))
     if not torch.cuda.is_available():
         arguments = arguments.default("policy.device", "cpu")
     if "n_action_steps" in getattr(arguments.chosen.get("policy"), "__dataclass_fields__", ()):

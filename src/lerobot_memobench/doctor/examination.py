@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -16,6 +18,7 @@ from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.doctor.golden import TOLERANCE, difference, read_golden, render_golden
 from lerobot_memobench.errors import MemobenchError, unsupported_system
+from lerobot_memobench.io import cache_base
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.libero.files import check_assets
@@ -61,6 +64,7 @@ def examine() -> list[Finding]:
         physics(),
         opencv(),
         plugin(),
+        caches(),
         golden_frame(),
         paper_world(),
         ffmpeg(),
@@ -191,6 +195,16 @@ def _installed(name: str) -> str | None:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
+
+
+def caches() -> Finding:
+    """Return the folder of caches, which is a temporary one if the home folder cannot be written."""
+    folder, own = cache_base(), os.environ.get("NUMBA_CACHE_DIR")
+    found = f"in {folder}" + (f"; numba's in {own}" if own else "")
+    if folder.is_relative_to(tempfile.gettempdir()):
+        fix = "set XDG_CACHE_HOME to a folder that you can write; otherwise each machine or container compiles again"
+        return Finding("caches", "warning", f"{found}, a temporary folder", fix)
+    return Finding("caches", "ok", found)
 
 
 def golden_frame() -> Finding:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import functools
 import multiprocessing
 import os
 import signal
@@ -229,11 +231,36 @@ def locked(staging: Path, out: Path) -> Iterator[None]:
         raise MemobenchError(unsupported_system())
     descriptor = os.open(staging, os.O_RDONLY if staging.is_dir() else os.O_RDWR)
     try:
-        if not (lock_descriptor(descriptor, blocking=False) and _is_at(staging, descriptor)):
+        if not (_lock(descriptor) and _is_at(staging, descriptor)):
             raise HeldError(f"another run is writing to {out}; wait for it to end or name another folder")
         yield
     finally:
         os.close(descriptor)
+
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of `flock` on disks without locks, as some clusters mount them."""
+
+
+def _lock(descriptor: int, blocking: bool = False) -> bool:
+    """Lock an open file or folder; return whether no other process holds the lock. A disk may have no locks."""
+    try:
+        return lock_descriptor(descriptor, blocking=blocking)
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        note_missing_locks(os.strerror(error.errno))
+        return True
+
+
+@functools.cache
+def note_missing_locks(reason: str) -> None:
+    """Print once that the disk has no locks."""
+    print(
+        f"note: the disk cannot lock files ({reason}), so two commands could write to one folder at once: start one "
+        "command per folder",
+        file=sys.stderr,
+    )
 
 
 def _is_at(folder: Path, descriptor: int) -> bool:
@@ -251,7 +278,7 @@ def taking_turns(path: Path, wait: Callable[[], None] = lambda: None) -> Iterato
     The file stays; a killed process releases its lock.
     """
     with path.open("w") as file:
-        if not lock_descriptor(file.fileno(), blocking=False):
+        if not _lock(file.fileno()):
             wait()
-            lock_descriptor(file.fileno())
+            _lock(file.fileno(), blocking=True)
         yield

@@ -19,6 +19,7 @@ from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import Job, adding_resume_hint, check_finished
+from lerobot_memobench.jobs.start import prepare_process
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 MAKE, FINISH = "make", "finish"
@@ -139,6 +140,7 @@ def run_part(part: str, logs: Path) -> None:
 if __name__ == "__main__":
     use_threads(ACTING)
     try:
+        prepare_process()
         with adding_resume_hint("memobench", lambda: PREEMPTED):
             run_part(sys.argv[1], Path(sys.argv[2]))
     except MemobenchError as error:

@@ -81,8 +81,12 @@ class TrainConfig(TypedDict):
 
 
 def looks_local(text: str) -> bool:
-    """Return whether a name can only be a path of this machine, never a repository ``user/name``."""
-    return text.startswith((".", "/", "~")) or text.count("/") > 1 or text.endswith("/")
+    """Return whether a name is a path of this machine and not a repository ``user/name``.
+
+    Paths begin with ``.``, ``/``, ``~`` or ``outputs/``, end with a slash or have several. Another folder does not make
+    ``lerobot/act`` a path: many users have a copy of LeRobot in the current folder.
+    """
+    return text.startswith((".", "/", "~", "outputs/")) or text.count("/") > 1 or text.endswith("/")
 
 
 def shipped_policies() -> dict[str, Path]:
@@ -154,9 +158,15 @@ def local_folder(path: str) -> Path | None:
 
 
 def checkpoint_type(path: str) -> str | None:
-    """Return the policy type of a checkpoint folder; None if the folder does not exist."""
+    """Return the policy type of a checkpoint folder; None for a repository.
+
+    Raises:
+        MemobenchError: the folder does not exist, or its configuration names no type.
+    """
     folder = Path(path).expanduser()
     if not folder.is_dir():
+        if looks_local(path):
+            raise MemobenchError(f"the checkpoint folder {path} does not exist")
         return None
     config = read_json(folder / CONFIG_FILE)
     name = config.get("type")
@@ -198,12 +208,9 @@ def check_checkpoint(path: str) -> None:
         MemobenchError: weights, processors or normalisation statistics are missing.
     """
     folder = Path(path).expanduser()
-    if not folder.is_dir():
-        if looks_local(path):
-            raise MemobenchError(f"the checkpoint folder {path} does not exist")
+    if checkpoint_type(path) is None:
         check_processors(path)
         return  # a repository: LeRobot fetches the rest
-    checkpoint_type(path)
     if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
         raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
     for weights in folder.glob("*.safetensors"):

@@ -83,6 +83,32 @@ def _integers(value: Any, name: str = "") -> Iterator[tuple[str, int]]:
         yield name, value
 
 
+def has_device(device: str) -> bool:
+    """Return whether this machine has a device of torch, such as ``cuda:1``."""
+    import torch
+    from lerobot.utils.device_utils import is_torch_device_available
+
+    try:
+        found = torch.device(device)
+        there = is_torch_device_available(found.type)
+    except (RuntimeError, ValueError):  # there is no such type
+        return False
+    return there and (found.type != "cuda" or (found.index or 0) < torch.cuda.device_count())
+
+
+def check_device(device: str | None) -> None:
+    """Refuse a device that the user names and the machine lacks. LeRobot would run on another one.
+
+    Raises:
+        MemobenchError: the machine has no such device.
+    """
+    if device is not None and device not in ("", "null", "~") and not has_device(device):
+        raise MemobenchError(
+            f"this machine has no device {device!r} that torch can use; leave the device out to use the best one, or "
+            "name cpu"
+        )
+
+
 # --- identity ---
 
 

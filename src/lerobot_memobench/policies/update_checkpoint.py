@@ -21,6 +21,7 @@ from safetensors.torch import save
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
+from lerobot_memobench.jobs.start import prepare_process
 from lerobot_memobench.policies.checkpoint import (
     ADAPTER_FILE,
     CONFIG_FILE,
@@ -168,4 +169,5 @@ def main(names: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
+    prepare_process()
     main(sys.argv[1:])

@@ -23,7 +23,7 @@ from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
 from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.policies.convention import check_convention
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import (
     EVALUATION_EPISODES,
     EVALUATION_SEED,
@@ -304,9 +304,14 @@ def with_device(asked: EvaluationSettings, options: RunOptions) -> EvaluationSet
     """Return settings with the CPU as the policy's device where the machine has no other.
 
     Parts decide on their own machine: this machine may be a login node.
+
+    Raises:
+        MemobenchError: the user named a device that this machine lacks.
     """
     import torch
 
+    if not options.shards:
+        check_device(asked.policy.get("device"))
     if options.shards or "device" in asked.policy or torch.cuda.is_available() or torch.backends.mps.is_available():
         return asked
     return replace(asked, policy={**asked.policy, "device": "cpu"})

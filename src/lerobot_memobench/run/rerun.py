@@ -30,7 +30,7 @@ from lerobot_memobench.evaluation.agreement import SCENES, disagreements
 from lerobot_memobench.evaluation.records import other_hashes
 from lerobot_memobench.io import Malformed, checked, count_of, parsed
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
+from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
 from lerobot_memobench.protocol import HORIZON, SEALED
 from lerobot_memobench.run.arguments import (
     PLAIN,
@@ -313,6 +313,8 @@ def _allowed_policy(policy: dict[str, str], server: str | None) -> dict[str, str
     for name, value in policy.items():
         if name not in ("path", "type"):
             policy[name] = _checked(known, name, value)
+    if not has_device(policy.get("device", "cpu")):
+        del policy["device"]  # a result does not depend on it
     return policy if server is None else {**policy, "servers": server}
 
 

@@ -1,1 +1,5 @@
 """How does a task move and look? The scene, the arm, pictures; predicates answered by physics."""
+
+from lerobot_memobench.io import choose_caches
+
+choose_caches()  # before robosuite and this package import numba, in programs that use none of the commands

@@ -29,8 +29,15 @@ from lerobot_memobench.io import check_fetched
 from lerobot_memobench.jobs.processes import adding_resume_hint, locked
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_CONFIG
-from lerobot_memobench.policies.checkpoint import as_trained, check_weights, differing, local_folder, read_json
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.checkpoint import (
+    as_trained,
+    check_weights,
+    differing,
+    local_folder,
+    looks_local,
+    read_json,
+)
+from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.run.arguments import (
     CONFIG_FILE,
     TRAINING_OPTIONS,
@@ -179,6 +186,7 @@ def complete_training(arguments: LerobotArguments, notify: Callable[[str], None]
         named = arguments.has("policy.type") or arguments.has("policy.path")
         if named and not arguments.has("policy.repo_id"):  # LeRobot would require one
             arguments = arguments.default("policy.push_to_hub", False)
+    check_device(arguments.get("policy.device"))
     check_numbers(arguments)
     check_dataset(arguments)
     check_same_training(arguments)
@@ -253,11 +261,15 @@ def check_numbers(arguments: LerobotArguments) -> None:
 
 def check_dataset(arguments: LerobotArguments) -> None:
     """Refuse a folder that is not a dataset; a folder that does not exist may be one to download into."""
-    root = arguments.get("dataset.root")
+    root, repository = arguments.get("dataset.root"), arguments.get("dataset.repo_id")
     if root is None:
+        if repository is not None and looks_local(repository):
+            raise MemobenchError(
+                f"dataset.repo_id={repository} is a folder's path; name the folder by dataset=<folder>"
+            )
         return
     folder = Path(root).expanduser()
-    if not folder.exists() and not (arguments.get("dataset.repo_id") or "").startswith("local/"):
+    if not folder.exists() and not (repository or "").startswith("local/"):
         return
     if not (folder / INFO_FILE).is_file():
         problem = f"is not a LeRobot dataset ({INFO_FILE} is missing)" if folder.is_dir() else "does not exist"
