@@ -325,7 +325,7 @@ def test_a_study_killed_at_ten_random_moments_has_the_same_results(tmp_path: Pat
 def rollout_of(episode: int, evidence: bool, solved: int) -> dict[str, Any]:
     """Return one of ten rollouts: the first ``solved`` succeed; of two variants four scenes in five choose rightly."""
     variant, right = episode % 2, episode < 8
-    more: dict[str, Any] = {"wall_s": 1.0, "steps": 80, "prompt_steps": 20}
+    more: dict[str, Any] = {"wall_s": 1.0, "steps": 80, "prompt_steps": 20, "referent": "drawn"}
     if evidence:
         more |= {"seed": 7 + episode // 2, "variant": variant, "choice": variant if right else None}
         more |= {"variants": 2, "chance": 0.5}

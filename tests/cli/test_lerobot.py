@@ -116,7 +116,7 @@ def test_the_installed_program(tmp_path: Path) -> None:
 
 
 def test_an_evaluation_writes_and_prints_its_report(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
-    surplus = logs.record(STOVE, 3, seed=10)
+    surplus = logs.record(STOVE, 3, seed=10, replan_steps=None)
     fake_loop.before = lambda plan: EpisodeLog(plan.log).append(surplus)  # as plain lerobot-eval does
     assert main(["eval", "env=memobench", f"tasks={STOVE}", "episodes=2", "output_dir=out"]) == 0
     average = json.loads(Path("out/report.json").read_text())["average"]

@@ -21,6 +21,7 @@ from lerobot_memobench.policies.baselines.configuration_baselines import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
+from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.object_layout import SIZE
 
 STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
@@ -93,6 +94,6 @@ def test_observation_kind_must_contain_the_inputs(policy: Any, needed: str | Non
 def test_a_picture_may_be_changed_in_place() -> None:
     """A scene at rest is rendered once, and each observation has arrays of its own."""
     observer = Observer(PIXELS)
-    observer._images = {"image": np.ones((2, 2, 3), np.uint8)}
+    observer._images = {name: np.ones((2, 2, 3), np.uint8) for name in CAMERAS}
     observer.observation()["pixels"]["image"][:] = 0
     assert observer.observation()["pixels"]["image"].all()

@@ -75,7 +75,7 @@ class FakeLoop:
             "referent": "fixed",
             "replan_steps": None,
             "success": seed % 2 == 1,
-            "steps": 100 + seed,
+            "steps": 100 + seed % 1000,
             "checkpoints": [
                 {"operation": c.operation, "first_step": seed, "ordered_step": seed} for c in task.checkpoints
             ],
