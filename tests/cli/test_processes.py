@@ -214,6 +214,22 @@ def test_all_processes_end(tmp_path: Path) -> None:
     assert job.end() == "b: ended by SIGTERM; resume"
 
 
+@linux
+@pytest.mark.parametrize(
+    ("script", "waiting", "children"),
+    [("train_in_ten_minutes", "memobench", 1), ("train_in_ten_minutes", "lerobot", 2), ("demo", "lerobot", 1)],
+)
+def test_children_of_examples_end(tmp_path: Path, script: str, waiting: str, children: int) -> None:
+    for name in ("memobench", "lerobot"):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{'touch begun-$$; exec sleep 600' if name == waiting else ''}\n")
+        (tmp_path / name).chmod(0o755)
+    path = Path(__file__).parents[2] / "examples" / f"{script}.py"
+    code = f"import runpy, sys; sys.argv = ['example', '--out', '.']; sys.executable = {str(tmp_path / 'python')!r}; "
+    job = Job(["-c", f"{code}runpy.run_path({str(path)!r}, run_name='__main__')"], tmp_path)
+    job.wait_until(lambda: len(list(tmp_path.glob("begun-*"))) == children)
+    assert job.end(1 + children).endswith("the same command resumes")
+
+
 def test_another_handler_of_the_signal_is_kept(tmp_path: Path) -> None:
     code = (
         "import os, signal\n"
@@ -397,9 +413,28 @@ def forget(out: Path, rng: random.Random) -> None:
         (out / "videos" / f"{record['task']}.{record['episode']}.mp4").unlink()
 
 
-@pytest.mark.parametrize("words", [["eval", "--help"], ["train", "--help"], ["eval", "env=memobench", "tasks=stov"]])
-def test_a_mistyped_task_and_help_import_no_torch(words: list[str]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(["eval", "--help"], ["train", "--help"], ["eval", "env=memobench", "tasks=stov"]),
+        *(["eval", "env=memobench", "epsiodes=2"], ["train", "polciy=act"]),
+    ],
+)
+def test_mistyped_names_and_help_import_no_torch(words: list[str]) -> None:
     code = (
         f"import sys; from lerobot_memobench.cli.lerobot import main; main({words}); sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "status", "printed"),
+    [
+        ("memobench", ["tasks"], 0, "turn_on_the_stove_and_turn_it_off"),
+        ("memobench", ["--help"], 0, "Usage"),
+        ("lerobot", ["eval", "env=memobench"], 2, "lerobot: found python -OO"),
+    ],
+)
+def test_commands_without_docstrings(command: str, words: list[str], status: int, printed: str) -> None:
+    done = subprocess.run([sys.executable, "-OO", "-m", COMMANDS[command], *words], capture_output=True, text=True)
+    assert (done.returncode, printed in done.stdout + done.stderr, "Traceback" in done.stderr) == (status, True, False)
