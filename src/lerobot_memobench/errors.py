@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import sys
+import traceback
 from collections.abc import Iterable, Iterator, Sequence
 
 
@@ -22,6 +23,12 @@ def chain(error: BaseException) -> Iterator[BaseException]:
         seen.add(id(current))
         yield current
         current = current.__cause__ or (None if current.__suppress_context__ else current.__context__)
+
+
+def came_through(error: BaseException, package: str) -> bool:
+    """Return whether an error passed through a module of a package."""
+    frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
+    return any(str(frame.f_globals.get("__name__")).startswith(package) for frame in frames)
 
 
 def unsupported_system() -> str:

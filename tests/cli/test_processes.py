@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import os
 import random
@@ -29,6 +30,7 @@ from lerobot_memobench.run.card import new_card, run_facts, write_card
 from tests.support import logs, synthetic_dataset
 from tests.support.fake_loop import DRAWER, STOVE, results
 from tests.support.fork_server import Fork, ForkServer
+from tests.support.kills import hashes
 from tests.support.object_dataset import make_object_dataset
 
 COMMANDS = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
@@ -214,6 +216,22 @@ def test_all_processes_end(tmp_path: Path) -> None:
     assert job.end() == "b: ended by SIGTERM; resume"
 
 
+@linux
+@pytest.mark.parametrize(
+    ("script", "waiting", "children"),
+    [("train_in_ten_minutes", "memobench", 1), ("train_in_ten_minutes", "lerobot", 2), ("demo", "lerobot", 1)],
+)
+def test_children_of_examples_end(tmp_path: Path, script: str, waiting: str, children: int) -> None:
+    for name in ("memobench", "lerobot"):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{'touch begun-$$; exec sleep 600' if name == waiting else ''}\n")
+        (tmp_path / name).chmod(0o755)
+    path = Path(__file__).parents[2] / "examples" / f"{script}.py"
+    code = f"import runpy, sys; sys.argv = ['example', '--out', '.']; sys.executable = {str(tmp_path / 'python')!r}; "
+    job = Job(["-c", f"{code}runpy.run_path({str(path)!r}, run_name='__main__')"], tmp_path)
+    job.wait_until(lambda: len(list(tmp_path.glob("begun-*"))) == children)
+    assert job.end(1 + children).endswith("the same command resumes")
+
+
 def test_another_handler_of_the_signal_is_kept(tmp_path: Path) -> None:
     code = (
         "import os, signal\n"
@@ -397,9 +415,123 @@ def forget(out: Path, rng: random.Random) -> None:
         (out / "videos" / f"{record['task']}.{record['episode']}.mp4").unlink()
 
 
-@pytest.mark.parametrize("words", [["eval", "--help"], ["train", "--help"], ["eval", "env=memobench", "tasks=stov"]])
-def test_a_mistyped_task_and_help_import_no_torch(words: list[str]) -> None:
+# --- one evaluation in several ways, and kills of processes with children ---
+
+WAYS = {
+    "three rows": ["batch_size=3"],
+    "ten rows": ["batch_size=10"],
+    "processes": ["batch_size=3", "eval.use_async_envs=true"],
+    "parts": ["batch_size=2", "shards=2", "workers=2"],
+}
+SUITES = {
+    "published": STOVE,
+    "strict": "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate",
+}
+
+
+@pytest.fixture(scope="module")
+def alone(server: ForkServer, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return a function of a suite: the folder of an evaluation of single episodes."""
+
+    @functools.cache
+    def evaluated(suite: str) -> Path:
+        out = tmp_path_factory.mktemp("alone") / suite
+        assert start(server, out, evaluation(suite, ["batch_size=1"]), resume=False).wait() == 0
+        return out
+
+    return evaluated
+
+
+def evaluation(suite: str, way: list[str]) -> list[str]:
+    """Return settings of ten episodes of the random policy on objects."""
+    more = ["obs_type=environment_state_agent_pos", "episodes=10", "horizon=20", "env.videos=0"]
+    return [f"suite={suite}", f"tasks={SUITES[suite]}", "policy=memobench_random", *more, *way]
+
+
+def outcomes(out: Path) -> list[dict[str, Any]]:
+    """Return the lines of a log without what names the run or its time."""
+    changing = {"run", "wall_s", "finished"}
+    return [{key: value for key, value in line.items() if key not in changing} for line in read_episodes(out)]
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("suite", SUITES)
+def test_outcomes_do_not_depend_on_batches_parts_and_kills(
+    server: ForkServer, tmp_path: Path, alone: Callable[[str], Path], suite: str, way: str
+) -> None:
+    settings = evaluation(suite, WAYS[way])
+    for kill in range(3):
+        process = start(server, tmp_path / "out", settings)
+        while process.poll() is None and len([*tmp_path.rglob("episodes/*.jsonl")]) <= kill:
+            time.sleep(0.01)
+        if process.poll() is None:
+            process.kill()
+    deadline = time.monotonic() + 60
+    while (process := start(server, tmp_path / "out", settings)).wait() and time.monotonic() < deadline:
+        time.sleep(1)  # workers of the killed process hold the folder for a moment
+    assert outcomes(tmp_path / "out") == outcomes(alone(suite))
+
+
+@linux
+@pytest.mark.slow
+def test_a_generation_with_pictures_and_workers_is_killed_and_continued(tmp_path: Path) -> None:
+    words = ["-m", COMMANDS["memobench"], "generate", "--tasks", STOVE, "--episodes", "3", "--workers", "2", "--out"]
+    began = time.monotonic()
+    subprocess.run([sys.executable, *words, str(tmp_path / "whole")], check=True, capture_output=True)
+    whole_s = time.monotonic() - began
+    for share in (0.4, 0.6, 0.7, 0.8, 0.9, 0.95):
+        job = subprocess.Popen([sys.executable, *words, str(tmp_path / "killed")], start_new_session=True)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            job.wait(share * whole_s)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(job.pid, signal.SIGKILL)
+        job.wait()
+    subprocess.run([sys.executable, *words, str(tmp_path / "killed")], check=True, capture_output=True)
+    assert hashes(tmp_path / "killed") == hashes(tmp_path / "whole")
+
+
+@linux
+@pytest.mark.slow
+def test_compilation_is_killed_and_repeated(tmp_path: Path) -> None:
+    code = (
+        "from lerobot_memobench.doctor.golden import *; print(difference(render_golden(), read_golden()) < TOLERANCE)"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+    for files in (1, 2, 5, 8):
+        process = subprocess.Popen([sys.executable, "-c", code], env=environment)
+        while process.poll() is None and len([*tmp_path.rglob("*.nb*")]) < files:
+            time.sleep(0.001)
+        process.kill()
+        process.wait()
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"
+    assert len([*tmp_path.rglob("*.nbi")]) > 8
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(["eval", "--help"], ["train", "--help"], ["eval", "env=memobench", "tasks=stov"]),
+        *(["eval", "env=memobench", "epsiodes=2"], ["train", "polciy=act"]),
+    ],
+)
+def test_mistyped_names_and_help_import_no_torch(words: list[str]) -> None:
     code = (
         f"import sys; from lerobot_memobench.cli.lerobot import main; main({words}); sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "status", "printed"),
+    [
+        ("memobench", ["tasks"], 0, "turn_on_the_stove_and_turn_it_off"),
+        ("memobench", ["--help"], 0, "Usage"),
+        ("lerobot", ["eval", "env=memobench"], 2, "lerobot: found python -OO"),
+    ],
+)
+def test_commands_without_docstrings(command: str, words: list[str], status: int, printed: str) -> None:
+    done = subprocess.run([sys.executable, "-OO", "-m", COMMANDS[command], *words], capture_output=True, text=True)
+    assert (done.returncode, printed in done.stdout + done.stderr, "Traceback" in done.stderr) == (status, True, False)

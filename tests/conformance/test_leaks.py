@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -131,3 +132,7 @@ def test_the_file_stands_alone() -> None:
     tree = ast.parse(Path(leak_test.__file__).read_text())
     modules = [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     assert not any(str(module).startswith("lerobot_memobench") for module in modules)
+
+
+def test_no_check_is_an_assertion_that_optimisation_removes() -> None:
+    assert not [node for node in ast.walk(ast.parse(inspect.getsource(leak_test))) if isinstance(node, ast.Assert)]

@@ -8,6 +8,7 @@ import json
 import logging
 import os
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -556,6 +557,21 @@ def test_each_task_has_a_gymnasium_id() -> None:
     assert env.unwrapped.task == STOVE
     with pytest.raises(gym.error.NameNotFound, match=STOVE):
         gym.make("memobench/turn_on_the_stofe_and_turn_it_off-v0")
+
+
+@pytest.mark.parametrize("name", [STOVE, "check_the_top_drawer_a_given_number_of_times"])
+def test_gymnasium_prints_no_warning(name: str, recwarn: pytest.WarningsRecorder) -> None:
+    warnings.simplefilter("always")
+    settings = {"obs_type": BOTH, "expert_action": True}
+    for env in (
+        gym.make(f"memobench/{name}-v0", **settings),
+        gym.make_vec(f"memobench/{name}-v0", num_envs=2, vectorization_mode="sync", **settings),
+    ):
+        env.reset(seed=20_000)
+        for _ in range(2):
+            env.step(env.action_space.sample())
+        env.close()
+    assert [str(each.message) for each in recwarn] == []
 
 
 def test_calls_without_a_running_episode_raise_gymnasium_errors() -> None:

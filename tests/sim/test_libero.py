@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import mujoco
@@ -192,3 +193,31 @@ def test_records_made_again(kind: str, tmp_path: Path) -> None:
         assert set(kept) == set(made)
         for key in kept:
             assert np.array_equal(kept[key], made[key]), key
+
+
+# --- memory ---
+
+RESETS = """
+import numpy as np
+from pathlib import Path
+from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.tasks.catalogue import task_names
+
+names = task_names()[:14]
+for k in range(300):
+    env = MemobenchEnv(names[k % len(names)], world="libero", obs_type="both", demonstration_prompt=False)
+    env.reset(seed=20_000 + k)
+    env.step(np.zeros(7, np.float32))
+    env.close()
+    if k % 100 == 99:
+        print(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 // 2**20)
+"""
+
+
+@needs_assets
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read in /proc")
+def test_memory_levels_off_over_resets_of_many_scenes() -> None:
+    done = subprocess.run([sys.executable, "-c", RESETS], capture_output=True, text=True, check=True)
+    hundred, two_hundred, three_hundred = map(int, done.stdout.split())
+    assert max(two_hundred, three_hundred) < 1.1 * hundred < 1600, done.stdout

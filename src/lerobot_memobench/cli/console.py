@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import sys
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
@@ -19,9 +18,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lerobot_memobench.errors import MemobenchError, chain
+from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
-from lerobot_memobench.jobs.processes import NO_LOCKS, adding_resume_hint
+from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal
 from lerobot_memobench.jobs.start import prepare_process, reader_has_left
 from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, PUBLISHED, STRICT
 
@@ -186,18 +185,15 @@ def one_sentence(error: BaseException) -> str | None:
         return _line(errors[0])  # LeRobot's own words for a missing extra
     if isinstance(errors[0], FileExistsError):
         return _line(errors[0])
-    if isinstance(error, OSError) and error.errno in NO_LOCKS and _came_through(error, "filelock"):
-        return (
-            f"the disk of Hugging Face's caches cannot lock files ({error.strerror}): set HF_HOME, or "
-            "HF_DATASETS_CACHE alone, to a folder on another disk, such as one in /tmp"
-        )
+    if refusal := lock_refusal(error):
+        return refusal
     refusal = disk_refusal(error)
     if refusal is not None:
         named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)
         where = f"{os.fsdecode(named)} " if isinstance(named, str | bytes) else ""
         return f"{where}cannot be written ({refusal}): make room, or name another folder"
     fetched = next((found for found in errors if isinstance(found, FETCHING)), None)
-    if fetched is not None and _came_through(fetched, "torch.hub"):
+    if fetched is not None and came_through(fetched, "torch.hub"):
         return (
             "the pretrained weights of a backbone are not on this machine and could not be fetched "
             f"({_line(fetched)[:200]}); "
@@ -207,7 +203,7 @@ def one_sentence(error: BaseException) -> str | None:
     if hub is None:
         return None
     reason = f"{_address(errors)}{_line(hub)[:200]}"
-    if any(_came_through(found, "lerobot.datasets.") for found in errors):
+    if any(came_through(found, "lerobot.datasets.") for found in errors):
         return (
             f"the dataset is not on this machine and could not be fetched from the hub ({reason}); name a folder on "
             "this machine, dataset=<folder>, or make one: `memobench generate --tasks object --episodes 5 --out "
@@ -217,12 +213,6 @@ def one_sentence(error: BaseException) -> str | None:
         f"a repository is not on this machine and could not be fetched from the hub ({reason}); name a folder on this "
         "machine: dataset=<folder> or policy=<folder>"
     )
-
-
-def _came_through(error: BaseException, package: str) -> bool:
-    """Return whether an error passed through a module of a package."""
-    frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
-    return any(str(frame.f_globals.get("__name__")).startswith(package) for frame in frames)
 
 
 def _is_hub_error(error: BaseException) -> bool:

@@ -27,6 +27,7 @@ from lerobot_memobench.run.arguments import (
     Arguments,
     LerobotArguments,
     call_lerobot,
+    check_names,
     is_of_benchmark,
     lerobot_commands,
     read_arguments,
@@ -64,6 +65,10 @@ def run(line: Sequence[str]) -> int:
         if not given.pairs:
             print(f"all settings: `lerobot {name} --help` with env= or policy=, which imports LeRobot")
             return 0
+    if sys.flags.optimize > 1:
+        raise MemobenchError("found python -OO or PYTHONOPTIMIZE=2, and transformers reads docstrings; use -O or 1")
+    if name in SHORT_FORMS:
+        check_names(name, given)
     if name == "train":
         from lerobot_memobench.training.command import train
 

@@ -44,6 +44,12 @@ class EqualNoise(TorchFunctionMode):
         return found
 
 
+def check(passed: bool, problem: str) -> None:
+    """Raise an AssertionError for a problem, under ``python -O`` too."""
+    if not passed:
+        raise AssertionError(problem)
+
+
 class Subject:
     """A policy and episodes of random observations.
 
@@ -61,7 +67,7 @@ class Subject:
         self.episodes = [[observe(generator) for _ in range(LENGTH)] for generator in generators]
         self.alone = self.roll([self.episodes[0]])[:, 0]
         self.effect = float((self.roll([self.episodes[1]])[:, 0] - self.alone).abs().max())
-        assert self.effect > 0, "the actions do not depend on the observations; draw weights that are not zero"
+        check(self.effect > 0, "the actions do not depend on the observations; draw weights that are not zero")
 
     def roll(self, episodes: Sequence[Sequence[Frame]], policy: Any = None, between: Any = None) -> Tensor:
         """Reset the policy and return its actions (steps, rows, A) on episodes of equal length, one row each.
@@ -167,7 +173,7 @@ def test_reset_clears_the_state(subject: Subject) -> None:
     for before in ([two[:3]], [two[:10]], [three, two, one]):
         subject.roll(before)
         step = subject.changed(subject.roll([one])[:, 0])
-        assert step is None, f"step {step} differs after another episode: clear histories and action queues in reset()"
+        check(step is None, f"step {step} differs after another episode: clear histories and action queues in reset()")
 
 
 def test_rows_are_independent(subject: Subject) -> None:
@@ -175,7 +181,7 @@ def test_rows_are_independent(subject: Subject) -> None:
     one, two, three = subject.episodes
     for place, batch in ((0, [one, two]), (1, [two, one, three]), (2, [three, two, one])):
         step = subject.changed(subject.roll(batch)[:, place])
-        assert step is None, f"step {step} differs with other rows in the batch: keep a history for each row"
+        check(step is None, f"step {step} differs with other rows in the batch: keep a history for each row")
 
 
 def test_history_holds_the_frames_under_action_chunks(subject: Subject) -> None:
@@ -188,7 +194,9 @@ def test_history_holds_the_frames_under_action_chunks(subject: Subject) -> None:
     between = [step for step, plan in following.items() if plan is not None and step not in plans]
     if not kept or not between:
         pytest.skip("it remembers no frame, or plans at every step")
-    assert kept & {*between}, "only frames at which it plans are remembered: observe also while actions are queued"
+    check(
+        bool(kept & {*between}), "only frames at which it plans are remembered: observe also while actions are queued"
+    )
 
 
 def test_instances_share_no_state(make: Factory, subject: Subject) -> None:
@@ -201,4 +209,4 @@ def test_instances_share_no_state(make: Factory, subject: Subject) -> None:
     frames = iter(subject.episodes[1])
     found = subject.roll([subject.episodes[0]], between=lambda: subject._acted(other, [next(frames)]))[:, 0]
     step = subject.changed(found)
-    assert step is None, f"step {step} differs while another instance acts: keep no state in the class or module"
+    check(step is None, f"step {step} differs while another instance acts: keep no state in the class or module")

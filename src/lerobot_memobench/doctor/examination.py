@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 from typing import Literal
 
 from packaging.requirements import Requirement
@@ -25,7 +26,7 @@ from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
 from lerobot_memobench.tasks.task import LIBERO
 
-DISTRIBUTION = "lerobot_policy_memobench"
+DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"
 PLUGIN = "LeRobot plugin"
 RUN_WITH = "0.6.1"
 """The version of LeRobot with which all tests of this version ran."""
@@ -164,7 +165,7 @@ def plugin() -> Finding:
             PLUGIN,
             "failed",
             f"no installed distribution is named {DISTRIBUTION}, so LeRobot does not load it",
-            "run `make setup`, or `pip install .` in its folder; a source folder on PYTHONPATH is not enough",
+            "run `make setup`, or `pip install -e .` in its folder; a source folder on PYTHONPATH is not enough",
         )
     try:
         missing = not_registered()
@@ -172,8 +173,13 @@ def plugin() -> Finding:
         reason = f"importing it fails: {type(error).__name__}: {error}"
         return Finding(PLUGIN, "failed", reason, "fix the import error; LeRobot only logs it")
     if missing:
-        fix = "install it again: `pip install --force-reinstall --no-deps .` in its folder"
+        fix = "install it again: `pip install --force-reinstall --no-deps -e .` in its folder"
         return Finding(PLUGIN, "failed", f"imported, but not registered: {', '.join(missing)}", fix)
+    here, imported = Path.cwd(), Path(__file__).parents[2]
+    for folder in (here, *here.parents):
+        if (folder / "src" / PACKAGE).is_dir() and not imported.samefile(folder / "src"):
+            detail = f"commands run the copy in {imported}, not this checkout, {folder}"
+            return Finding(PLUGIN, "warning", detail, f"pip install --no-deps -e {folder}")
     return Finding(PLUGIN, "ok", "discovered: env memobench, policies memobench_mem, memobench_expert")
 
 

@@ -23,7 +23,7 @@ from typing import Protocol
 import psutil
 from filelock import lock_descriptor
 
-from lerobot_memobench.errors import MemobenchError, unsupported_system
+from lerobot_memobench.errors import MemobenchError, came_through, unsupported_system
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 
@@ -260,6 +260,16 @@ def note_missing_locks(reason: str) -> None:
         f"note: the disk cannot lock files ({reason}), so two commands could write to one folder at once: start one "
         "command per folder",
         file=sys.stderr,
+    )
+
+
+def lock_refusal(error: BaseException) -> str | None:
+    """Return a sentence on an error of Hugging Face's caches on a disk without locks, None for other errors."""
+    if not (isinstance(error, OSError) and error.errno in NO_LOCKS and came_through(error, "filelock")):
+        return None
+    return (
+        f"the disk of Hugging Face's caches cannot lock files ({error.strerror}): set HF_HOME, or "
+        "HF_DATASETS_CACHE alone, to a folder on another disk, such as one in /tmp"
     )
 
 

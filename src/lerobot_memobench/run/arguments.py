@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import sys
 import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -331,6 +332,20 @@ def quoted(key: str, text: str, known: Mapping[str, Any]) -> str:
 
 
 # --- from words to settings ---
+
+
+def check_names(command: str, given: Arguments) -> None:
+    """Refuse mistyped names without a dot before LeRobot is imported, which takes eight seconds.
+
+    LeRobot's own names are read from the source of its configuration, together with some that `translate` refuses.
+    """
+    source = Path(str(metadata.distribution("lerobot").locate_file(f"lerobot/configs/{command}.py")))
+    if source.is_file():
+        names = re.findall(r"^    (\w+):", source.read_text(encoding="utf-8"), re.MULTILINE)
+        known = [*SHORT_FORMS[command], *OPTIONS[command], RECIPE, CONFIG_FILE, *names]
+        for key, _ in given.pairs:
+            if "." not in key and key not in known:
+                raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, known)}")
 
 
 def read_arguments(command: str, given: Arguments) -> LerobotArguments:

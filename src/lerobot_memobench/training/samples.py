@@ -7,6 +7,7 @@ tensors and pictures are left out; all else of a sample equals LeRobot's to the 
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +20,8 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.scripts import lerobot_train
 from torch import Tensor
+
+from lerobot_memobench.jobs.processes import lock_refusal
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +108,12 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
 def main() -> None:
     """Run LeRobot's trainer by the words of the command line."""
     lerobot_train.make_train_eval_datasets = open_datasets
-    lerobot_train.main()
+    try:
+        lerobot_train.main()
+    except OSError as error:
+        if (refusal := lock_refusal(error)) is None:
+            raise
+        sys.exit(f"lerobot: {refusal}")
 
 
 if __name__ == "__main__":
