@@ -44,6 +44,12 @@ def remove_log_handlers() -> Iterator[None]:
 
 
 @pytest.fixture
+def short_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give each hold of strict tasks the shortest length, one control step without chunks."""
+    monkeypatch.setattr("lerobot_memobench.envs.episode.LONGEST_HOLD", 0)
+
+
+@pytest.fixture
 def gl() -> str:
     """Return the backend of MuJoCo's renderer; skip the test without its library."""
     backend = os.environ.get("MUJOCO_GL", "egl")

@@ -4,8 +4,8 @@
 
 The harness's own LeRobot server knows no demonstration prompts. This one hands them to the policy frame by frame, as
 ``lerobot-eval`` does: `observation.phase` is 0 in the prompt and 1 in the execution, `observation.step` counts the
-control steps of each. In strict tasks the robot idles in between and the step counts through: the frames in which it
-does look like the execution's first, and are not sent.
+control steps of each. In strict tasks the scene may rest in between: these frames look like the execution's first, and
+are not sent.
 """
 
 from __future__ import annotations

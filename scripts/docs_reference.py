@@ -211,8 +211,8 @@ def spaces_page() -> str:
         "pixels/image": "third-person camera, RGB, upright",
         "pixels/wrist_image": "wrist camera, RGB, upright",
         "agent_pos": "end-effector position 3 (m), axis-angle 3 (rad), fingers 2 (m)",
-        "phase": "0 demonstration prompt or idling, 1 execution",
-        "step": "control steps since the start of the phase; in strict tasks since the start of the episode",
+        "phase": "0 demonstration prompt and the rest after it, 1 execution",
+        "step": "control steps since the start of the phase; in the execution of strict tasks −1, and −2 at its end",
         "environment_state": f"{SLOTS} object slots, with `env.obs_type` of that name or `both`",
         "expert_action": "action of the scripted expert; with `env.expert_action=true`",
         "blind_action": "action of the published routine; with `env.blind_action=true`",
@@ -330,7 +330,7 @@ def typed_rows(kind: Any) -> list[list[str]]:
 
 
 PROTOCOL_ONLY = {
-    "idle": "maximum control steps of idling before the execution of a strict task",
+    "hold": "mean of the drawn holds of a strict task, control steps",
     "goals": "revision of the goals of strict tasks",
     "scene_hash_version": "version of `scene_hash`; hashes of different versions are not compared",
     "inputs": "inputs of the policy",
@@ -457,8 +457,7 @@ WITHOUT = {
     "published": "*Without a memory* is the best rate that was found for a policy that decides from pictures alone "
     "([how](../results/necessity.md)), with fixed and with random referents if they differ: a lower bound, because the "
     "hand's pose and a clock can reveal more.",
-    "strict": "*Without a memory* is the [ceiling](suites.md#ceilings) of policies that decide at every step by the "
-    "present observation.",
+    "strict": "*Without a memory* is the [ceiling](suites.md#ceilings) of policies without a memory and a clock.",
 }
 """Suite -> how the rate without a memory was found."""
 PROMPTS = {
@@ -502,8 +501,8 @@ def cards_page(suite: str, memory_type: str) -> str:
     ]
     if suite == "strict":
         parts.append(
-            "The robot [idles](protocol.md#idling) before each execution. [Limitations of this "
-            "suite](suites.md#limits-of-the-strict-suite)."
+            "The scene is [held](protocol.md#holds) at the start of each execution and at each return of the hand "
+            "home. [Limitations of this suite](suites.md#limits-of-the-strict-suite)."
         )
     for name in task_names(memory_type, suite):
         parts += task_parts(task_number(name), get_task(name), known.get(name, {}))

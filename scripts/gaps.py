@@ -31,7 +31,7 @@ HOME = Atom("handhome", ())
 
 
 def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
-    """Run the expert on one episode; return its success and the gap of each checkpoint, without the drawn idling.
+    """Run the expert on one episode; return its success and the gap of each checkpoint, without held steps.
 
     A gap is None if the checkpoint was not reached or nothing before it has to be remembered.
     """
@@ -42,9 +42,10 @@ def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
     scenes, homes = [_scene(episode)], [True]
     while not episode.done:
         episode.step(episode.expert_action())
+        if episode.rested:
+            continue
         scenes.append(_scene(episode))
         homes.append(episode.sim.holds(HOME))
-    idle = start - (episode.task.prompt_steps or 0) if episode.task.idles else 0
     gaps: list[int | None] = []
     before = 0
     for k, reached in enumerate(episode.progress.ordered_step):
@@ -53,7 +54,7 @@ def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
             continue
         use = max([before, *(step for step in range(before, reached) if homes[step])])
         if cue_in_prompt(episode.task, k):
-            gaps.append(start + use - cues[k] - idle)
+            gaps.append(start + use - cues[k])
         else:
             gaps.append(_since_change(scenes[: use + 1]))
         before = reached
@@ -61,7 +62,7 @@ def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
 
 
 def _prompt_cues(episode: Episode) -> list[int]:
-    """Play the prompt and idling; return for each checkpoint the last step of the prompt that shows its answer."""
+    """Play the prompt; return for each checkpoint its last step that shows the answer."""
     task, sim = episode.task, episode.sim
     shown, last, closed = Progress(task), 0, 0
     places = dict(task.prompt.places) if task.prompt else {}
@@ -69,7 +70,7 @@ def _prompt_cues(episode: Episode) -> list[int]:
     asked = next((places[name] for name in goals if name in places), None)
     while episode.phase == PROMPT:
         episode.step(np.zeros(7, np.float32))
-        if episode.phase != PROMPT or episode.idling:
+        if episode.phase != PROMPT:
             continue
         last = episode.step_index
         if asked is not None:

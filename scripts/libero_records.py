@@ -7,7 +7,7 @@ package's other requirements, and takes ten minutes on one core. `actions` runs 
 generates the actions and start states for `rollouts`. Records contain computed numbers only, no files of LIBERO.
 
 Stock LIBERO does not support the predicates of the goals, so goals are removed from the task files and evaluated atom
-by atom. The authors' scanned objects are replaced by boxes with the sizes in `sim.libero.classes`.
+by atom. The authors' scanned objects are replaced by boxes, the contact geoms of `sim/objects`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.libero.classes import SCANS
+from lerobot_memobench.sim.libero.files import OWN_OBJECTS
+from lerobot_memobench.sim.libero.mjcf import class_file, parse_numbers
+from lerobot_memobench.tasks.task import STRICT
 
 SEEDS = range(7, 57)
 CATALOGUE = Path(__file__).parents[1] / "src/lerobot_memobench/tasks/catalogue/published"
@@ -105,8 +107,10 @@ def prepare() -> None:
     MjSim.from_xml_string = classmethod(from_xml_string)
     from libero.libero.envs.base_object import OBJECTS_DICT
 
-    for name, half in SCANS.items():
-        OBJECTS_DICT[name] = box_class(name, half)
+    for folder in sorted(OWN_OBJECTS.iterdir()):
+        (contact,) = (geom for geom in class_file(folder.name, STRICT).body.iter("geom") if geom.get("type") == "box")
+        x, y, z = parse_numbers(contact.attrib["size"])
+        OBJECTS_DICT[folder.name] = box_class(folder.name, (x, y, z))
 
 
 def box_class(name: str, half: tuple[float, float, float]) -> type:

@@ -53,7 +53,7 @@ class Frame:
 
 
 def frames_of(variant: int) -> tuple[list[Frame], list[Frame]]:
-    """Return the frames of the prompt without the rest after it, and of the execution.
+    """Return the frames of the prompt without the rest after it, and of the execution without holds.
 
     Raises:
         SystemExit: the expert did not succeed.
@@ -62,12 +62,14 @@ def frames_of(variant: int) -> tuple[list[Frame], list[Frame]]:
     episode.reset(SEED, variant)
     prompt, execution = [frame_of(episode)], list[Frame]()
     while not episode.done:
-        idle = episode.idling
+        rests = episode.idling
         episode.step(episode.expert_action())
+        if episode.rested:
+            continue
         if episode.phase == EXECUTION:
             if not execution or episode.exec_steps % STRIDE == 0 or episode.done:
                 execution.append(frame_of(episode))
-        elif not idle and episode.step_index % STRIDE == 0:
+        elif not rests and episode.step_index % STRIDE == 0:
             prompt.append(frame_of(episode))
     if not episode.success:
         raise SystemExit(f"the expert did not solve variant {variant} at seed {SEED}; choose another seed")

@@ -326,7 +326,7 @@ def check(words: list[str]) -> None:
         case _ if program.startswith("scripts/"):
             assert (ROOT / program).is_file(), program
         case _:
-            assert program in ("source", "pip", "uv", "gzip"), f"unknown program {program}"
+            assert program in ("source", "export", "pip", "uv", "gzip"), f"unknown program {program}"
 
 
 def as_pair(flag: str) -> str:

@@ -176,7 +176,7 @@ def expert_states(episode: Episode, seed: int, count: int) -> list[ExpertState]:
     episode.reset(seed)
     perturbation, states = Perturbation(rng), []
     while not (episode.done or episode.expert_done):
-        if episode.step_index % EVERY == 0 and not episode.idling:
+        if episode.step_index % EVERY == 0 and not episode.at_rest:
             states.append(_state(episode))
         episode.step(perturbation.executed(episode.expert_action()))
     weights = np.array([NEAR_WEIGHT if state.near else 1.0 for state in states])

@@ -2,10 +2,12 @@
 
     python -m research.necessity.adversaries --scenes 50 --out outputs/adversaries
 
-Each decision is a function of the present observation and the instruction. Between decisions the scripted hand moves.
-Strategies use the scene as a notebook (drawers ajar, moved objects, knobs between off and on), look into drawers, read
-the clock, or guess at the best odds. Rollouts begin where the prompt has ended and stop once the strategy cannot change
-their result. They are appended to ``rollouts.jsonl``, scene by scene; the same command goes on.
+Each decision is a function of the instruction and of the input of the present plan: the last W observations before a
+plan of K actions, as the strategy declares them to the environment (`DECLARED`). Between decisions the scripted hand
+moves. Strategies use the scene as a notebook (drawers ajar, moved objects, knobs between off and on), pass home within
+a plan, put the camera into shut drawers, read the clock, or guess at the best odds. In a hold a strategy is not asked:
+its actions have no effect, and the observation repeats. Rollouts begin where the prompt has ended and stop once the
+strategy cannot change their result. They are appended to ``rollouts.jsonl``; the same command goes on.
 """
 
 from __future__ import annotations
@@ -18,59 +20,81 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.evaluation.metrics import wilson
 from lerobot_memobench.experts.expert import Expert, plan_of
 from lerobot_memobench.experts.hand import OPEN, UP
-from lerobot_memobench.experts.travel import go_home, release_fixture
-from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, NO_CLOCK, VALIDATION_SEED
+from lerobot_memobench.experts.travel import opening_direction, release_fixture, rise
+from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.sim.assets.registry import split_class
+from lerobot_memobench.sim.detents import DEAD_CENTRE
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import classes
-from lerobot_memobench.sim.scene import DEAD_CENTRE
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.formula import Atom, atoms
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, Task, World
 from research.command import run
-from research.necessity.demonstrations import rest_steps
+from research.necessity.clock import WAIT, best_plan, bin_of
 from research.necessity.notes import Motion, leave_ajar, loose_object, opened_to, pull, shift
 
 LEVELS = ("bottom", "middle", "top")
 TIMES = ("once", "twice", "three times")
 NOTE = 0.03
 """Distance that encodes one event where a drawer or an object is the note, m."""
-SLOT, PUNCTUAL = 32, 3
-"""Control steps of a slot of the clock, and within how many of them the hand comes home that comes in it."""
-RETURN = 12
-"""Control steps from the place where the hand hovers to its home."""
-HOVER = 0.08
-"""Height above home at which the hand hovers, m."""
+HOVER = 0.04
+"""Height above home at which a hand waits for the clock without being away, m."""
+REST = 45
+"""Control steps at home that end the count."""
+BESIDE, NEAR = 0.09, 0.027
+"""Distances from home at which a hand turns to its side, and waits beside home for its plan, m."""
+SIDES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.3], [1.0, 0.0, 0.6], [0.0, -1.0, 0.3]])
+"""Directions (4, 3) from which a hand comes home after one, two, three and four events."""
+HAND_POSE = 0.002
+"""Distance from home from which an observation shows the side of the hand, m."""
+SHAKES, SHAKEN = 6, 0.0055
+"""How often a drawer is shaken, and up to which opening, m."""
+CAMERA_IN_HAND = np.array([0.0, 0.05, -0.097])
+"""Position of the wrist camera in the frame of the grip site, m."""
+LOOKS = {
+    "top": ((0.1121, 0.1076, 0.2073), ((-0.1206, -0.0551, 0.9912), (-0.9838, 0.1401, -0.1119))),
+    "middle": ((0.1179, 0.0997, 0.1349), ((-0.1567, 0.1625, 0.9742), (-0.9690, 0.1653, -0.1834))),
+}
+"""Drawer -> position of the camera in the cabinet's frame (m), and first two axes of its hand there."""
+SHOWN_PIXELS = 40
+"""Pixels of an object from which a picture shows it."""
 SHOWN = "the clock, if it were shown"
-"""The control of the strategy that reads the clock: it gets the step of the episode, which no observation holds."""
-CHUNK = "home within a chunk of actions"
-"""A policy that carries out several actions without looking is bound by no ceiling: it passes home, where it sees the
-scene as it began for a single step, within a chunk, and its hand knows the way all the rest of the time."""
-UNBOUND = (SHOWN, CHUNK)
-"""Strategies that no ceiling binds: a clock, or a chunk of actions, is a memory."""
+"""The control of the strategy that reads the clock: it gets the elapsed steps, which no observation holds."""
+UNBOUND = (SHOWN,)
+"""Strategies that the ceiling without a memory does not bind."""
+DECLARED: dict[str, dict[str, Any]] = {
+    "past home, two frames": {"window_steps": 2},
+    "past home, 6 actions": {"replan_steps": 6},
+    "past home, 10 actions": {"replan_steps": 10},
+    "past home, 10 actions, two frames": {"replan_steps": 10, "window_steps": 2},
+    "past home, 50 actions": {"replan_steps": 50},
+}
+"""Strategy -> settings of its policy, as the environment gets them; others plan each action from one frame."""
 
 
 def ceiling(task: Task) -> float:
-    """Return the highest success rate of a policy that decides at every step, by the present observation alone.
+    """Return the highest success rate of a policy without a memory and without a clock.
 
-    At home the scene is as it began, to the bit. So the same thing is begun there with the same probability at each
-    step: of two things in order at best 1/4, of three 1/27, and `counted` of events and a rest. In the other families
-    the first choice decides, and the observation is the same for all variants.
+    Every plan that has an effect after home has observed home alone, and there the scene is as it began, to the bit. So
+    the same thing is begun after each release with the same probability: of two things in order at best 1/4, of three
+    1/27, and `counted` of events and a rest. In the other families the first choice decides, and the observation is the
+    same for all variants.
     """
     if task.family == "counting":
-        return float(np.mean([counted(1 + k, rest_steps(task.goal)) for k in task.random_variants]))
+        return float(np.mean([counted(1 + k) for k in task.random_variants]))
     if task.family == "ordering":
         return 1 / 27 if "three" in task.name else 1 / 4
     found = chance(task)
@@ -78,16 +102,13 @@ def ceiling(task: Task) -> float:
     return found
 
 
-def counted(number: int, rest: int) -> float:
-    """Return the highest probability of exactly so many events before the first rest of ``rest`` control steps.
+def counted(number: int) -> float:
+    """Return the highest probability of exactly so many events before the first rest: n^n / (n + 1)^(n + 1).
 
-    A policy stays at home in each step with the same probability. The first event begins before a rest, each later one
-    too, then the hand rests: nearly n^n / (n + 1)^(n + 1). The step in which a hand leaves home counts as rest, and the
-    one in which it comes home, which makes a rest after an event shorter than one at the start by a decision.
+    From each release a policy goes on with the same probability p, whatever it plans and whatever its input holds. It
+    makes n events and then rests in p^n (1 - p) of the episodes.
     """
-    first = np.linspace(0.0, 1.0, 100_001)
-    later = first ** ((rest - 2) / (rest - 1))
-    return float(((1 - first) * (1 - later) ** (number - 1) * later).max())
+    return float(number**number / (number + 1) ** (number + 1))
 
 
 # --- observations and actions of a strategy ---
@@ -100,9 +121,9 @@ class Seat:
     episode: Episode
     expert: Expert
     rng: np.random.Generator
-    shows_step: bool
 
     def __post_init__(self) -> None:
+        self._frames: list[NDArray[np.float64]] = []
         self._places = {name: self.sim.body_pose(name)[0] for name in self.task.objects}
 
     @property
@@ -115,10 +136,36 @@ class Seat:
         """The task, as its variant is."""
         return self.episode.task
 
+    def see(self) -> None:
+        """Keep the hand's position in the observation of this control step, in a hold too."""
+        self._frames.append(self.sim.proprio()[:3].astype(np.float64) - self.sim.home[0])
+
     @property
-    def step(self) -> int:
-        """The clock of the observation."""
-        return self.episode.step_index if self.shows_step else self.episode.clock
+    def elapsed(self) -> int:
+        """Control steps since the execution began, in holds too: what a clock would show."""
+        return len(self._frames) - 1
+
+    @property
+    def begins_plan(self) -> bool:
+        """Whether this observation is the last of the input of a new plan."""
+        return self.elapsed % (self.episode.settings.replan_steps or 1) == 0
+
+    def side(self) -> int | None:
+        """Return how many events the hand's side of home stands for in the input of the present plan.
+
+        None if each frame of the input shows the hand at home.
+        """
+        settings = self.episode.settings
+        last = self.elapsed - self.elapsed % (settings.replan_steps or 1)
+        for frame in self._frames[max(last - settings.window_steps + 1, 0) : last + 1]:
+            if np.linalg.norm(frame) > HAND_POSE:
+                return 1 + int(np.argmax(_directions() @ frame))
+        return None
+
+    def guess(self) -> int:
+        """Return which of the things to do is next, by chance: an event, or what ends the episode."""
+        others = max(len(self.placed()), self.task.family == "counting")
+        return int(self.rng.integers(len(self.events()) + others))
 
     def rows(self, kind: str) -> list[NDArray[np.float32]]:
         """Return the visible slots of a class, lowest first."""
@@ -151,7 +198,7 @@ class Seat:
 
     def rest(self) -> Motion:
         """Stay at home longer than the rest that ends the count."""
-        for _ in range(45):
+        for _ in range(REST):
             yield self.expert.hand.toward(*self.sim.home, OPEN)
 
     def another_joint(self) -> str:
@@ -249,41 +296,25 @@ def open_means_done(seat: Seat) -> Motion:
 
 
 def by_clock(seat: Seat) -> Motion:
-    """Come home in a slot of the clock that encodes the number of past events, and hover until then.
-
-    Who is home at another time has not begun: it hovers until the slot of its number. Without a clock: `by_chance`.
-    """
-    if seat.step == NO_CLOCK:
-        yield from by_chance(seat)
-    events = seat.events()
+    """Choose by the elapsed steps alone, as the best plan that was found (`clock.best_plan`); hover where it waits."""
+    events, placed, counts = seat.events(), seat.placed(), seat.task.family == "counting"
+    plan = best_plan(len(events) + bool(placed), counts)
     while True:
-        slot, late = divmod(seat.step, SLOT)
-        done = slot % (len(events) + 1)
-        if late > PUNCTUAL:
-            yield from _come_in_slot(seat, 0)
-        elif done < len(events):
-            yield from _bring(seat, *events[done])
-            yield from _come_in_slot(seat, done + 1)
-        else:
+        while (choice := plan[bin_of(seat.elapsed)]) == WAIT:
+            yield seat.expert.hand.toward(seat.sim.home[0] + HOVER * UP, seat.sim.home[1], OPEN)
+        if choice == 1 if counts else choice == len(events):
+            yield from seat.do()
             yield from _finish(seat)
             return
-
-
-def _come_in_slot(seat: Seat, number: int) -> Motion:
-    """Hover above home, and come home at the beginning of the next slot of ``number`` events."""
-    hand, (position, rotation) = seat.expert.hand, seat.sim.home
-    yield from go_home(hand, position + HOVER * UP, rotation)
-    cycle = SLOT * (len(seat.events()) + 1)
-    while (seat.step + RETURN) % cycle != number * SLOT:
-        yield hand.toward(position + HOVER * UP, rotation, OPEN)
-    yield from seat.do()
+        yield from _bring(seat, *events[choice])
+        yield from seat.do()
 
 
 def by_chance(seat: Seat) -> Motion:
     """Begin at home the same thing with the same probability each time: the best odds of all that has no note."""
     events, placed = seat.events(), seat.placed()
     while True:
-        choice = int(seat.rng.integers(len(events) + max(len(placed), seat.task.family == "counting")))
+        choice = seat.guess()
         if choice < len(events):
             yield from _bring(seat, *events[choice])
             yield from seat.do()
@@ -293,14 +324,42 @@ def by_chance(seat: Seat) -> Motion:
             yield from seat.rest()
 
 
-def by_chunk(seat: Seat) -> Motion:
-    """Do all events with the hand home in between, and look there only once they are done: then rest or not."""
-    while seat.task.family == "ordering" or seat.rng.random() < 0.5:
-        for begun, ended in seat.events():
-            yield from _bring(seat, begun, ended)
-            yield from seat.do()
-        yield from seat.do(*seat.placed())
-    yield from seat.rest()
+def past_home(seat: Seat) -> Motion:
+    """Come home from a side that stands for the past events, within a plan, and read it in the plan's input.
+
+    An input that shows home alone leaves the best odds.
+    """
+    events, placed = seat.events(), seat.placed()
+    while True:
+        seen = seat.side()
+        done = seat.guess() if seen is None else seen
+        if done < len(events):
+            yield from _bring(seat, *events[done])
+            yield from _come_from(seat, done + 1)
+        elif placed:
+            yield from seat.do(*placed)
+        else:
+            yield from seat.rest()
+
+
+def _come_from(seat: Seat, number: int) -> Motion:
+    """Wait beside home, on the side of ``number`` events, until a plan begins; then come home."""
+    hand, (home, turn) = seat.expert.hand, seat.sim.home
+    side = _directions()[number - 1]
+    yield from rise(hand, OPEN, 0.2)
+    yield from hand.move(home + BESIDE * side, turn, OPEN, tolerance=0.012, turn_tolerance=0.04, timeout=120)
+    yield from hand.move(home + NEAR * side, turn, OPEN, tolerance=0.004, turn_tolerance=0.04, timeout=60)
+    while not seat.begins_plan:
+        yield hand.toward(home + NEAR * side, turn, OPEN)
+    for _ in range(30):
+        if seat.sim.holds(Atom("asbegun", ())):
+            return
+        yield hand.toward(home, turn, OPEN, speed=0.6)
+
+
+def _directions() -> NDArray[np.float64]:
+    """Return `SIDES` as unit vectors."""
+    return SIDES / np.linalg.norm(SIDES, axis=1, keepdims=True)
 
 
 def without_coming_home(seat: Seat) -> Motion:
@@ -334,6 +393,67 @@ def peek(by: float, seat: Seat) -> Motion:
             yield from _fetch(seat)
             return
     yield from open_one(seat)
+
+
+def look_inside(seat: Seat) -> Motion:
+    """Put the wrist camera into shut drawers, open the one whose picture shows the object, or guess."""
+    name = _asked(seat)[0]
+    for level in LOOKS:
+        yield from _look(seat, level)
+        geoms, (model, *_) = seat.sim.geoms("wrist"), seat.sim._drawing()
+        shown = model.body_rootid[model.geom_bodyid[geoms[geoms >= 0]]] == model.body(name).rootid[0]
+        if shown.sum() >= SHOWN_PIXELS or seat.rows(_asked(seat)[1]):
+            yield from seat.do(Atom("open", (f"wooden_cabinet_1_{level}_region",)))
+            yield from _fetch(seat)
+            return
+    yield from seat.do()
+    yield from open_one(seat)
+
+
+def _look(seat: Seat, level: str) -> Motion:
+    """Bring the wrist camera into a drawer of the cabinet from its side, without moving a joint."""
+    hand, (place, cabinet) = seat.expert.hand, seat.sim.body_pose("wooden_cabinet_1")
+    position, (first, second) = LOOKS[level]
+    frame = cabinet @ np.array([first, second, np.cross(first, second)]).T
+    target = place + cabinet @ np.array(position) - frame @ CAMERA_IN_HAND
+    before = target - 0.10 * frame[:, 1] - 0.05 * frame[:, 2]
+    yield from hand.move(hand.position + 0.05 * UP, frame, OPEN, tolerance=0.03, turn_tolerance=0.3, timeout=120)
+    yield from hand.move(before, frame, OPEN, tolerance=0.01, turn_tolerance=0.05, timeout=120)
+    yield from hand.move(
+        target + 0.012 * frame[:, 1], frame, OPEN, tolerance=0.001, turn_tolerance=0.01, timeout=60, speed=0.5
+    )
+    yield from hand.move(before, frame, OPEN, tolerance=0.03, turn_tolerance=0.3, timeout=60)
+
+
+def shake(seat: Seat) -> Motion:
+    """Shake each drawer below its spring and come home; open the one after which home is another one, or guess.
+
+    The strategy remembers which drawer it has shaken, and how home was.
+    """
+    begun = _bits(seat)
+    for drawer in sorted(seat.sim.world.joints):
+        joint = seat.sim.world.articulation(drawer)[0]
+        yield from pull(seat.expert, drawer, opened_to(seat.expert, drawer, 0.0) - 0.004)
+        out = np.append(opening_direction(seat.expert.hand, joint), [0.0, 0.0, 0.0, 1.0])
+        for _ in range(SHAKES):
+            for _ in range(12):
+                if joint.closed_q - seat.sim.world.articulation(drawer)[1] > SHAKEN:
+                    break
+                yield (out * [0.1, 0.1, 0.1, 1, 1, 1, 1]).astype(np.float32)
+            for _ in range(3):
+                yield (out * [-1, -1, -1, 1, 1, 1, 1]).astype(np.float32)
+        yield from release_fixture(seat.expert.hand)
+        yield from seat.do()
+        if not np.array_equal(_bits(seat), begun):
+            yield from seat.expert.achieve(Atom("open", (drawer,)))
+            yield from _fetch(seat)
+            return
+    yield from open_one(seat)
+
+
+def _bits(seat: Seat) -> NDArray[np.float64]:
+    """Return all that an observation at home could show: the whole state, the hand's pose and the object slots."""
+    return np.concatenate([seat.sim.state()[1:], seat.sim.proprio(), seat.episode.objects()])
 
 
 def open_one(seat: Seat) -> Motion:
@@ -382,9 +502,8 @@ EVENTS: dict[str, Strategy] = {
     "an object is the note": by_note(partial(_notes_in_object, NOTE), partial(_write_in_object, NOTE)),
     "a millimetre is the note": by_note(partial(_notes_in_object, 0.0003), partial(_write_in_object, 0.0003)),
     "open means done": open_means_done,
-    "the clock": by_clock,
     SHOWN: by_clock,
-    CHUNK: by_chunk,
+    **dict.fromkeys(DECLARED, past_home),
     "without coming home": without_coming_home,
     "chance": by_chance,
 }
@@ -392,6 +511,8 @@ FINDING: dict[str, Strategy] = {
     "peek 6 cm": partial(peek, 0.058),
     "peek 3 cm": partial(peek, 0.025),
     "peek below the spring": partial(peek, 0.006),
+    "look into shut drawers": look_inside,
+    "shake below the spring": shake,
     "open one": open_one,
 }
 PROMPTED: dict[str, Strategy] = {
@@ -408,29 +529,37 @@ STRATEGIES: dict[str, dict[str, Strategy]] = {
     "strict_procedure": PROMPTED,
 }
 """Family -> name -> strategy."""
+NOTHING = np.zeros(ACTION_DIM, np.float32)
+"""An action without effect: in a prompt or a hold."""
 
 
 @cache
-def _episode(name: str) -> Episode:
+def _episode(name: str, strategy: str, world: World) -> Episode:
     """Return the episodes of a task, with a scene that is compiled once; of prompts only the final scene is visible."""
-    return Episode(get_task(name), demonstration_prompt=False)
+    task = get_task(name).in_world(world)
+    return Episode(task, EnvSettings(suite=STRICT, demonstration_prompt=False, **DECLARED.get(strategy, {})))
 
 
-def rollout(name: str, strategy: str, seed: int) -> dict[str, object]:
-    """Return one rollout of a strategy: success, whether the goal was lost, control steps."""
-    episode = _episode(name)
+def rollout(name: str, strategy: str, seed: int, world: World = MEMOBENCH) -> dict[str, object]:
+    """Return one rollout of a strategy: success, whether the goal was lost, control steps, and those in holds."""
+    episode = _episode(name, strategy if strategy in DECLARED else "", world)
     episode.reset(seed, keep_prompt=True)
     while episode.phase != EXECUTION:
-        episode.step(np.zeros(ACTION_DIM, np.float32))
+        episode.step(NOTHING)
     rng = np.random.default_rng([seed, zlib.crc32(f"{name}, {strategy}".encode())])
     expert = Expert(episode.task, episode.sim, rng)
     expert.hand.speed = 0.8
-    for action in STRATEGIES[str(episode.task.family)][strategy](Seat(episode, expert, rng, strategy == SHOWN)):
-        episode.step(action)
-        if episode.done:
+    seat = Seat(episode, expert, rng)
+    motion = STRATEGIES[str(episode.task.family)][strategy](seat)
+    while not episode.done:
+        seat.see()
+        action = next(motion, None) if episode.action_has_effect else NOTHING
+        if action is None:
             break
+        episode.step(action)
     found = {"success": episode.success, "lost": episode.lost, "steps": episode.exec_steps}
-    return {"task": name, "strategy": strategy, "seed": seed, **found}
+    found["held"] = episode.pacing.held_steps
+    return {"task": name, "world": world, "strategy": strategy, "seed": seed, **found}
 
 
 def table(rollouts: list[dict[str, object]]) -> str:
@@ -470,28 +599,32 @@ def adversaries(
     seed: Annotated[int, typer.Option(help="Seed of the first scene.")] = VALIDATION_SEED,
     tasks: Annotated[list[str] | None, typer.Option(help="Names or memory types; all strict tasks if omitted.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    world: Annotated[str, typer.Option(help="memobench or libero.")] = MEMOBENCH,
+    strategies: Annotated[list[str] | None, typer.Option(help="Names of strategies; all if omitted.")] = None,
 ) -> None:
     """Roll out every strategy on every strict task; print the table."""
     out.mkdir(parents=True, exist_ok=True)
     log = out / "rollouts.jsonl"
     found = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
-    done = {(r["task"], r["strategy"], r["seed"]) for r in found}
+    done = {(r["task"], r["strategy"], r["seed"], r["world"]) for r in found}
     chosen = [
         name for name in task_names(suite="strict") if not tasks or name in tasks or get_task(name).memory_type in tasks
     ]
     wanted = [
-        (name, strategy, seed + scene)
+        (name, strategy, seed + scene, cast("World", world))
         for scene in range(scenes)
         for name in chosen
         for strategy in STRATEGIES[str(get_task(name).family)]
-        if (name, strategy, seed + scene) not in done
+        if (name, strategy, seed + scene, world) not in done and strategy in (strategies or [strategy])
     ]
     with ProcessPoolExecutor(workers) as pool, log.open("a") as file:
         for future in as_completed([pool.submit(rollout, *one) for one in wanted]):
             found.append(future.result())
             file.write(json.dumps(found[-1]) + "\n")
             file.flush()
-    asked = [one for one in found if one["task"] in chosen and seed <= one["seed"] < seed + scenes]
+    asked = [
+        one for one in found if one["task"] in chosen and one["world"] == world and seed <= one["seed"] < seed + scenes
+    ]
     print(f"{table(asked)}\n\n{summary(asked)}")
     print(f"\nceiling of these tasks, their mean: {100 * np.mean([ceiling(get_task(name)) for name in chosen]):.1f} %")
 

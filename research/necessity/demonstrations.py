@@ -162,7 +162,7 @@ class Home:
         now = self._sim.snapshot()
         physics = now.physics.copy()
         physics[self._places] = self._start.physics[self._places]
-        self._sim.restore(dataclasses.replace(self._start, physics=physics))
+        self._sim.restore(dataclasses.replace(self._start, physics=physics, hidden=now.hidden))
 
     def settle(self) -> Iterator[None]:
         """Come home and hold still for `SETTLE` steps, yielding after each; end exactly at home."""

@@ -79,9 +79,10 @@ def answers_of(variants: Sequence[Task]) -> list[Atom]:
 
 @dataclass(frozen=True)
 class Place:
-    """Places of objects, to distinguish states."""
+    """Places of objects, to distinguish states; of absent ones their drawers."""
 
     true: frozenset[Atom]
+    absent: frozenset[tuple[str, str]]
     objects: NDArray[np.float64]
     joints: NDArray[np.float64]
     reach: NDArray[np.float64]
@@ -89,7 +90,7 @@ class Place:
     def same(self, other: Place) -> bool:
         """Whether all relevant objects are where they were."""
         return (
-            self.true == other.true
+            (self.true, self.absent) == (other.true, other.absent)
             and bool(np.all(np.linalg.norm(self.objects - other.objects, axis=-1) < SAME_PLACE))
             and bool(np.all(np.abs(self.joints - other.joints) < self.reach))
         )
@@ -165,8 +166,14 @@ class Laboratory:
         """Whether a thing lies in a closed drawer: an expert that looks into the simulator would know which."""
         if thing not in self.sim.task.objects:
             return False
+        if any(thing == name for name, _ in self._absent()):
+            return True
         drawers = [f"{name}_{part}" for name, asset in self.sim.assets.items() for part in asset.articulations if part]
         return any(self.sim.holds(Atom("in", (thing, it))) and self.sim.holds(Atom("close", (it,))) for it in drawers)
+
+    def _absent(self) -> frozenset[tuple[str, str]]:
+        """Return the objects that are absent until their drawers open, with these."""
+        return frozenset((hidden.name, hidden.region) for hidden in self.sim.snapshot().hidden)
 
     def place(self) -> Place:
         """Return where things are now."""
@@ -179,6 +186,7 @@ class Laboratory:
         ]
         return Place(
             self.true(),
+            self._absent(),
             np.array(objects).reshape(-1, 3),
             np.array([q for _, q in articulations]),
             np.array([SAME_JOINT["slide" if a.kind == "drawer" else "hinge"] for a, _ in articulations]),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure
 from lerobot_memobench.io import write_file
-from lerobot_memobench.protocol import IDLE_STEPS
+from lerobot_memobench.protocol import LONGEST_HOLD
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import DRAWN
 from research.necessity.study import Result, pictures_path
@@ -215,8 +215,8 @@ COLUMNS = {
     "aliased": "frames that are alike and have more than one right answer: as it happens / with the step / arm at home",
     "as it happens ≥": "best map from observations at a decision, with the pose of the hand, to answers, in the "
     "demonstrated order",
-    "with step ≥": "the same where the step counter is observed too: where the robot idles before "
-    f"the execution, steps count as alike up to {IDLE_STEPS:,} apart, which a threshold may beat",
+    "with step ≥": "the same where the step counter is observed too: in strict tasks, whose holds "
+    f"last up to {LONGEST_HOLD:,} steps, steps count as alike up to so many apart; a threshold may beat that",
     "any order ≥": "best map from pictures with the arm at home to answers if any order will do that the goal accepts: "
     "found, and confirmed in the simulator",
     "any order, prob. ≥": "best probabilities found, wrong answers corrected as the scene allows, within the horizon",

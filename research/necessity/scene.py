@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.protocol import IDLE_STEPS
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.protocol import LONGEST_HOLD
+from lerobot_memobench.tasks.task import STRICT, Task
 from research.necessity.demonstrations import (
     Demonstration,
     Frame,
@@ -55,7 +55,7 @@ class Scene:
                 self._owners += [variant.variant_index] * len(demonstration.frames)
                 self._asked += [variant.language] * len(demonstration.frames)
         self._tolerance = tolerance
-        self._idle = IDLE_STEPS if variants[0].idles else 0
+        self._hold = LONGEST_HOLD if variants[0].suite == STRICT else 0
         self._differences = pairwise_table([frame.at_home for frame in self._frames], difference)
         self._pictures = classes(self._differences, tolerance)
 
@@ -104,12 +104,12 @@ class Scene:
         return np.concatenate([*self._frames[i].at_home, *self._frames[j].at_home], axis=1)
 
     def _told_by_the_step(self) -> NDArray[np.bool_]:
-        """Return the pairs of frames that the step counter separates, (n, n): further apart than the longest idling.
+        """Return the pairs of frames that the step counter separates, (n, n): further apart than the longest hold.
 
-        Without idling every step does, which is generous: in other scenes the same decision comes at another step.
+        Without holds every step does, which is generous: in other scenes the same decision comes at another step.
         """
         steps = np.array([frame.step for frame in self._frames])
-        return np.abs(np.subtract.outer(steps, steps)) > self._idle
+        return np.abs(np.subtract.outer(steps, steps)) > self._hold
 
     def _histories(self, pictures: Sequence[int]) -> list[History]:
         """Return a history per demonstration; pictures under different instructions are distinct."""

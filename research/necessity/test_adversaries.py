@@ -4,15 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, gamma
 
-from lerobot_memobench.envs.episode import referent_of
-from lerobot_memobench.evaluation.metrics import wilson
+from lerobot_memobench.envs.episode import Episode, referent_of
+from lerobot_memobench.envs.pacing import Pacing
+from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from research.necessity.adversaries import SHOWN, STRATEGIES, UNBOUND, ceiling, counted, rollout
+from research.necessity.adversaries import (
+    DECLARED,
+    NOTHING,
+    STRATEGIES,
+    UNBOUND,
+    Seat,
+    _look,
+    ceiling,
+    counted,
+    rollout,
+)
+from research.necessity.clock import BINS, WAIT, WIDTH, counting
 
 FINDING = "find_the_artichoke_hidden_in_one_of_the_drawers"
 COUNTING = "check_the_middle_drawer_a_given_number_of_times"
+ORDERING = "check_all_three_drawers_once_each_in_the_given_order"
 
 
 def test_a_look_into_a_wrong_drawer_loses() -> None:
@@ -21,26 +34,55 @@ def test_a_look_into_a_wrong_drawer_loses() -> None:
     assert rollout(FINDING, "peek 6 cm", seed)["lost"]
 
 
-@pytest.mark.parametrize("strategy", ["another joint is the note", "the clock", SHOWN])
-def test_events_are_counted_by_a_clock_that_is_not_shown(strategy: str) -> None:
-    seed = next(seed for seed in range(20_000, 20_010) if referent_of(get_task(COUNTING), seed).variant_index == 1)
-    assert rollout(COUNTING, strategy, seed)["success"] == (strategy == SHOWN)
+def test_a_camera_inside_a_shut_drawer_shows_nothing() -> None:
+    seed = next(seed for seed in range(20_000, 20_010) if referent_of(get_task(FINDING), seed).variant_index == 0)
+    episode = Episode(get_task(FINDING), demonstration_prompt=False)
+    episode.reset(seed, keep_prompt=True)
+    while not episode.action_has_effect:
+        episode.step(NOTHING)
+    seat = Seat(episode, Expert(episode.task, episode.sim, np.random.default_rng(0)), np.random.default_rng(0))
+    body = episode.sim.model.body("artichoke_1").id
+    for action in _look(seat, "top"):
+        episode.step(action)
+        geoms = episode.sim.geoms("wrist")
+        assert not np.isin(geoms[geoms >= 0], np.flatnonzero(episode.sim.model.geom_bodyid == body)).any()
+    assert not episode.lost
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", DECLARED)
+@pytest.mark.parametrize("name", [COUNTING, ORDERING])
+def test_without_holds_a_plan_that_passes_home_is_a_memory(
+    monkeypatch: pytest.MonkeyPatch, strategy: str, name: str
+) -> None:
+    """The first choice is by chance, as nothing is known at the start: here it is the right one."""
+    monkeypatch.setattr(Pacing, "hold", lambda self, steps: None)
+    monkeypatch.setattr(Seat, "guess", lambda self: 0)
+    assert sum(bool(rollout(name, strategy, seed)["success"]) for seed in range(20_000, 20_004)) >= 3
 
 
 def test_ceilings() -> None:
     found = {name: ceiling(get_task(name)) for name in task_names(suite="strict")}
-    assert found[COUNTING] == pytest.approx((1 / 4 + 4 / 27 + 27 / 256) / 3, abs=0.005)
+    assert found[COUNTING] == pytest.approx((1 / 4 + 4 / 27 + 27 / 256) / 3)
+    assert found[ORDERING] == pytest.approx(1 / 27)
     assert found[FINDING] == pytest.approx(1 / 3)
     assert 0 < min(found.values()) <= max(found.values()) <= 0.5
 
 
-def test_the_ceiling_of_counting_is_what_staying_by_chance_reaches() -> None:
-    """Ten thousand policies at home, step by step: some stay for 40 steps before the event, some leave after it."""
-    rng, stay = np.random.default_rng(0), 0.5 ** (1 / 39)
-    before, after = rng.geometric(1 - stay, (2, 10_000)) - 1
-    solved = np.mean((before + 1 < 40) & (1 + after + 1 >= 40))
-    low, high = wilson(float(solved), 10_000)
-    assert low < counted(1, 40) < high
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_the_ceiling_of_counting_is_the_best_probability_to_go_on(number: int) -> None:
+    """Of policies that go on with a fixed probability after each release, none is better, and one is as good."""
+    going_on = np.linspace(0.0, 1.0, 1_001)
+    assert counted(number) == pytest.approx(float(np.max(going_on**number * (1 - going_on))), abs=1e-5)
+
+
+def test_waiting_for_a_step_of_the_clock_beats_the_ceiling_without_one() -> None:
+    """Begin the one event at step 800 if home is released by then, and rest at every later release."""
+    clock, plan = counting(1), np.full(BINS, 1)
+    plan[: 800 // WIDTH], plan[800 // WIDTH] = WAIT, 0
+    assert clock.rate(plan) == pytest.approx(gamma.cdf(840, 0.5, scale=1200), abs=0.03)
+    assert clock.rate(plan) > 2.5 * counted(1)
+    assert clock.rate(np.full(BINS, 0)) == clock.rate(np.full(BINS, 1)) == 0.0
 
 
 @pytest.mark.slow

@@ -143,7 +143,7 @@ def test_a_picture_met_twice_in_an_episode_is_found(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(("task", "expected"), [(PAN, "clock"), (STRICT_STOVE, "open")])
-def test_a_step_counter_decides_where_the_robot_does_not_idle(
+def test_a_step_counter_decides_where_no_hold_blurs_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: str, expected: str
 ) -> None:
     """The same picture with the hand at the same place asks for two answers, at steps 0 and 20."""

@@ -1,6 +1,6 @@
 """Finding: the video shows the drawer in which an object is hidden; all drawers are closed during execution.
 
-Pulling a wrong drawer open fails the episode, before its content becomes visible.
+A hidden object is outside the scene until its drawer is ajar. A wrong drawer that is ajar fails the episode.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ def _setting(asked: Thing, drawer: str, hidden: tuple[tuple[Thing, str], ...]) -
     wrong = tuple(Atom("ajar", (region(other),)) for other in DRAWERS if other != drawer)
     on_table = Atom("on", (asked.instance, SPOT.full_name))
     goal: Formula = And((Never(Or(wrong)), Atom("wasopen", (place,)), on_table))
-    checkpoints = (Atom("open", (place,)), Not(Atom("in", (asked.instance, place))), goal)
+    taken = And((Atom("wasopen", (place,)), Not(Atom("in", (asked.instance, place)))))  # a hidden object is nowhere
+    checkpoints = (Atom("open", (place,)), taken, goal)
     return Setting(
         f"find the {asked.words} in the cabinet without moving a wrong drawer and put it on the table",
         goal,

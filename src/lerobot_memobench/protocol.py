@@ -17,11 +17,16 @@ UPSTREAM_EVALUATIONS = 2
 PROMPT_HORIZON = 1500
 """Maximum number of control steps of a demonstration prompt. Hiding two objects takes some 750, and more than 1000 if
 one of them is grasped at the fifth attempt."""
-IDLE_STEPS = 1800
-"""Maximum number of control steps that the robot of a strict task idles before the execution. The seed draws the number
-uniformly from 0, so a policy cannot infer its progress by counting calls."""
+HOLD_SHAPE, HOLD_MEAN, LONGEST_HOLD = 0.5, 600, 6000
+"""Holds of strict tasks: at the start of the execution and at each return home, actions have no effect for a number of
+control steps that the seed draws. Holds at a return have a gamma distribution with this shape and mean, cut at the
+longest hold. The first hold of a task without a prompt is uniform up to the longest one, because these tasks ask for
+events that a clock could time; of a task with a prompt it has the gamma distribution too. `research.necessity.clock`
+computes what a policy that knows the elapsed time alone can reach."""
+MOST_HOLDS = 30
+"""Number of drawn holds per episode; later ones have the shortest length. No task needs more than 10 returns."""
 PROMPT, EXECUTION = 0, 1
-"""Values of ``phase``. In `PROMPT` the prompt plays or the robot idles, and actions have no effect."""
+"""Values of ``phase``. In `PROMPT` the prompt plays, and actions have no effect."""
 OBS_PHASE, OBS_STEP = CLOCK = ("observation.phase", "observation.step")
 """A policy's names of the phase and of the control steps since it began; also columns of a dataset. Both are float32,
 (B,) in a batch, and not normalised."""

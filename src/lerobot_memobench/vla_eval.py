@@ -65,8 +65,8 @@ class MEMOBench(StepBenchmark):
     Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3); ``states`` float32 (8,):
     end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) of
     `MemobenchEnv`. The first observation of an episode with a demonstration prompt also contains ``video_history`` and
-    ``wrist_video_history``, lists of pictures, ``state_history``, a list of states, and ``episode_restart``. Frames of
-    an idling robot are omitted, because they equal the first observation.
+    ``wrist_video_history``, lists of pictures, ``state_history``, a list of states, and ``episode_restart``. Frames
+    of the rest between prompt and execution are omitted, because they equal the first observation.
 
     Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`.
 

@@ -401,7 +401,7 @@ def test_export_names_other_settings(evaluated: Path, tmp_path: Path, monkeypatc
     monkeypatch.setattr("lerobot_memobench.board.exports.MOST", 10)
     folder = shutil.copytree(evaluated, tmp_path / "easy")
     assert json.loads(vla_eval_json(read_runs([folder])[0]))["results"][0]["overall_score"] == pytest.approx(60.0)
-    in_card(lambda card: card["protocol"].update(difficulty="easy", idle=900))(folder)
+    in_card(lambda card: card["protocol"].update(difficulty="easy"))(folder)
     write_episodes(folder, [{**each, "difficulty": "easy"} for each in read_episodes(folder)])
     (run,) = read_runs([folder])
     (entry,) = json.loads(vla_eval_json(run))["results"]

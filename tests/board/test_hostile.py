@@ -192,6 +192,17 @@ STRICT: dict[str, tuple[Change, str]] = {
         ),
         "inputs are 'pixels'",
     ),
+    "both read by a policy of one's own": (
+        both(
+            every(lambda record: record.update(policy="window 0123")),
+            in_card(
+                lambda card: (card["policy"].update(type="window"), card["policy"]["settings"].pop("perception", 0))
+            ),
+            inputs("pixels", obs_type="both"),
+            features({"observation.environment_state": "ENV", "observation.images.image": "VISUAL"}),
+        ),
+        "inputs are 'pixels'",
+    ),
     "the expert as pixels": (
         both(
             every(lambda record: record.update(policy="memobench_expert 0123")),
@@ -226,7 +237,7 @@ STRICT: dict[str, tuple[Change, str]] = {
         "the card names mujoco not 3",
     ),
     # seeds
-    "seeds named as sealed": (both(relabelled, commit()), "begins after"),
+    "seeds named as sealed": (both(relabelled, commit()), "drew the variants"),
     "sealed for another policy": (both(sealed, commit(policy="5" * 64)), r"match \(policy"),
     "sealed in another release": (both(sealed, commit(release="0.1.0")), r"match \(release"),
     "run 0 of the sealed test": (both(sealed, commit(run=0)), "run|greater"),

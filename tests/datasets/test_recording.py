@@ -18,7 +18,6 @@ from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.recording import HOLD_FRAMES
 from lerobot_memobench.datasets.validate import replay
-from lerobot_memobench.envs.episode import first_execution_step
 from lerobot_memobench.protocol import NO_CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -29,8 +28,8 @@ HIGHLIGHT = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 SEED = 10_000
-IDLING_SEED = SEED + 2
-"""Seed with few rounds and a short rest."""
+HELD_SEED = SEED + 2
+"""Seed with few rounds."""
 RUNS = Path(__file__).parents[2] / "results" / "demonstrations.parquet"
 
 
@@ -55,21 +54,33 @@ def test_recorded_demonstration(stove):
 
 
 @pytest.mark.parametrize("name", [COUNTING, pytest.param(HIGHLIGHT, marks=pytest.mark.slow)])
-def test_idle_frames(name):
-    """Their actions are zeros, the scene rests in the execution's first state, and the execution has no clock."""
-    demo = record_demonstration(get_task(name), IDLING_SEED, images=False, referent="drawn", perturb=True)
-    begins, found = first_execution_step(get_task(name), IDLING_SEED, True), labels(demo)
+def test_held_frames(name, monkeypatch, tmp_path):
+    """At them and in the rest after a prompt the scene and the labels rest and actions are zeros; no frame is lost."""
+    monkeypatch.setattr("lerobot_memobench.envs.episode.LONGEST_HOLD", 9)
+    demo = record_demonstration(get_task(name), HELD_SEED, images=False, referent="drawn", perturb=True)
+    begins, found = get_task(name).prompt_steps or 0, labels(demo)
     assert demo.success
-    assert demo.exec_start == begins > 0
+    assert demo.exec_start == begins
     np.testing.assert_array_equal(found.step, [*range(begins), *[NO_CLOCK] * (len(demo) - begins)])
     np.testing.assert_array_equal(found.phase, np.arange(len(demo)) >= begins)
-    idle = ~demo.actions.any(axis=1)
-    rest = int(np.flatnonzero(idle)[0])
-    assert (rest == 0) == (demo.task.prompt is None)
-    np.testing.assert_array_equal(np.flatnonzero(idle), np.arange(rest, begins))
-    for column in (demo.states, demo.proprio, demo.objects):
-        assert (column[rest:begins] == column[begins]).all()
+    assert found.held[begins]
+    assert not found.held[:begins].any()
+    starts = np.flatnonzero(np.diff(found.held.astype(int), prepend=0) == 1)
+    assert len(starts) > (name == COUNTING)
+    held = np.flatnonzero(found.held[:-1])
+    assert not demo.applied[held].any()
+    assert not demo.actions[held].any()
+    for column in (demo.states, demo.proprio, demo.objects, demo.satisfied):
+        np.testing.assert_array_equal(column[held], column[held + 1])
+    moving = np.setdiff1d(np.arange(begins, len(demo) - 1), held)
+    assert (demo.states[moving, 0] < demo.states[moving + 1, 0]).all(), "the time runs where actions have an effect"
     assert replay(demo) is None
+    recorded = read_episode(write_dataset([beginning(demo, begins + 30)], tmp_path / "ds"), 0)
+    assert replay(recorded) is None
+    for frame in (begins, begins + 20, begins + 29):
+        flags = recorded.columns["held"].copy()
+        flags[frame] ^= True
+        assert replay(replace(recorded, columns=recorded.columns | {"held": flags})) is not None, frame
 
 
 def test_perturbed_demonstration(moved, tmp_path):

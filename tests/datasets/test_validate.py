@@ -22,7 +22,7 @@ from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS
 from lerobot_memobench.datasets.frames import holds_texts, read_frame_table
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import image_key, read_info
-from lerobot_memobench.datasets.lerobot_format.reading import check_idling, read_episode
+from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes, read_episode
 from lerobot_memobench.datasets.statistics import check_statistics, complete, lacking, measured
 from lerobot_memobench.datasets.validate import Verdict, images_of, replay, validate
 from lerobot_memobench.errors import MemobenchError
@@ -68,8 +68,9 @@ def difference(folder: Path, images: bool = False) -> str:
 
 
 COLUMNS = {
-    "action": "action (it alone is in the episode's hash",
+    "action": "action or held (they alone are in the episode's hash",
     "executed_action": "states at frame 4",  # the state after it
+    "held": "states at frame 4",
     "episode_index": "meta/episodes has length=6, but it has 5 frames",
     "task_index": "task at frame 3",
     **dict.fromkeys(
@@ -219,13 +220,19 @@ def test_replay_compares_fields_of_the_episode(stove, simulated, tmp_path):
             read_episode(folder, number)
 
 
-def test_demonstrations_without_idling_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("lerobot_memobench.envs.episode.first_execution_step", lambda *_: 4)
+def test_strict_demonstrations_of_an_earlier_version_are_refused(tmp_path, copy):
     task = get_task("turn_the_stove_on_and_off_a_given_number_of_times")
-    idling, earlier = (drawn_steps(task.name, 10_002, 6, start) for start in (4, 0))
-    check_idling(write_dataset([idling], tmp_path / "now"))
-    with pytest.raises(MemobenchError, match="step 0, expected 4"):
-        check_idling(write_dataset([earlier], tmp_path / "before"))
+    now = write_dataset([drawn_steps(task.name, 10_002, 6)], tmp_path / "now")
+    check_revision(now)
+    idled = write_dataset([drawn_steps(task.name, 10_002, 6, 4)], tmp_path / "idled")
+    without = copy(now)
+    info = json.loads((without / "meta" / "info.json").read_text())
+    del info["features"]["held"]
+    (without / "meta" / "info.json").write_text(json.dumps(info))
+    other_goal = [replace(place, instructions=("turn it on",)) for place in list_episodes(now)]
+    for folder, places in ((idled, None), (without, None), (now, other_goal)):
+        with pytest.raises(MemobenchError, match="generate the demonstrations again"):
+            check_revision(folder, places)
 
 
 # --- statistics ---

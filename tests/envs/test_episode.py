@@ -1,4 +1,4 @@
-"""Episodes: drawn variants, prompt and idling, pacing, end of the execution, failures, the authors' evaluation."""
+"""Episodes: drawn variants, prompt, pacing, end of the execution, failures, the authors' evaluation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from lerobot_memobench.envs.episode import Episode, first_execution_step, referent_of
+from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.episode_log import episode_record
 from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, Pacing
 from lerobot_memobench.envs.settings import EnvSettings
@@ -21,7 +21,6 @@ from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import (
     EXECUTION,
     HORIZON,
-    IDLE_STEPS,
     PAPER,
     SEALED,
     SPLITS,
@@ -117,27 +116,13 @@ def test_strict_tasks_draw_for_each_referent_and_a_variant_stays_fixed() -> None
         assert chosen.task.variant_index == 2
 
 
-# --- prompt and idling ---
-
-
-def test_idling_is_uniform_and_independent_of_the_variant() -> None:
-    task, seeds = get_task(STRICT_STOVE), range(20_000, 20_600)
-    steps = np.array([first_execution_step(task, seed, False) for seed in seeds])
-    assert 0 <= steps.min() < 20
-    assert IDLE_STEPS - 20 < steps.max() <= IDLE_STEPS
-    assert np.abs(np.quantile(steps, [0.25, 0.5, 0.75]) / IDLE_STEPS - [0.25, 0.5, 0.75]).max() < 0.05
-    variants = np.array([referent_of(task, seed).variant_index for seed in seeds])
-    for variant in range(3):
-        assert abs(steps[variants == variant].mean() - IDLE_STEPS / 2) < IDLE_STEPS / 20
-        assert first_execution_step(task.variant(variant), seeds[0], True) == steps[0]
+# --- prompt ---
 
 
 def test_prompts_of_strict_tasks_have_one_length() -> None:
     for task in map(get_task, task_names(suite=None)):
         assert {task.variant(k).prompt_steps for k in task.random_variants} == {task.prompt_steps}
-        assert task.idles == (task.suite == STRICT) == (task.prompt_steps is not None)
-        length = task.prompt_steps or 0
-        assert first_execution_step(task, SEED, True) - first_execution_step(task, SEED, False) == length
+        assert (task.suite == STRICT) == (task.prompt_steps is not None)
 
 
 # --- pacing ---

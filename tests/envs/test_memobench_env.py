@@ -21,19 +21,21 @@ from lerobot.envs import env_to_policy_features, preprocess_observation
 
 import lerobot_memobench.envs
 from lerobot_memobench.datasets.demonstration import labels
+from lerobot_memobench.envs import episode as episode_module
 from lerobot_memobench.envs import memobench_env
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode import Episode, first_execution_step
+from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import differences, read_episodes, read_log
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import CHECKPOINTS, SPARSE
+from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS, RESET, STEPS
 from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import failure_of
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.protocol import ENDED, EXECUTION, IDLE_STEPS, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
+from lerobot_memobench.protocol import ENDED, EXECUTION, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
 from lerobot_memobench.run.card import first_variant_mismatch
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
@@ -83,7 +85,7 @@ def check_equal(found: dict[str, Any], expected: dict[str, Any]) -> None:
 def play(env: Any, seed: int, steps: int = 3) -> list[dict[str, Any]]:
     """Return the observations of the first execution frames; ends at the horizon."""
     observation, _ = env.reset(seed=seed)
-    while observation["phase"][0] == PROMPT:
+    while not env.episode.action_has_effect:  # prompt or hold
         observation, *_ = env.step(REST)
     found = [observation]
     for action in actions(seed, steps):
@@ -111,11 +113,13 @@ CONTRACT = {
 }
 
 
+@pytest.mark.usefixtures("short_holds")
 @pytest.mark.parametrize(("name", "world", "obs_type"), CONTRACT.values(), ids=CONTRACT)
 def test_contract_of_reset_step_log_and_resume(tmp_path: Path, name: str, world: str, obs_type: str) -> None:
     task = get_task(name)
     settings = {"obs_type": obs_type, "world": world, "render": "fast", "seed_base": 20_000, "horizon": 3}
-    if task.idles:
+    strict = task.suite == "strict"
+    if strict:
         settings["prompt_in"] = RESET
     env = MemobenchEnv(name, log_dir=str(tmp_path), replan_steps=20, **settings)
     for part in (*env.observation_space.spaces.values(), *env.observation_space.spaces.get("pixels", {}).values()):
@@ -126,8 +130,8 @@ def test_contract_of_reset_step_log_and_resume(tmp_path: Path, name: str, world:
 
     frames = play(env, 20_001)
     assert all(env.observation_space.contains(frame) for frame in frames)
-    assert (frames[0]["step"], frames[0]["phase"]) == ([NO_CLOCK if task.idles else 0], [EXECUTION])
-    assert frames[-1]["step"] == [ENDED if task.idles else 3]
+    assert (frames[0]["step"], frames[0]["phase"]) == ([NO_CLOCK if strict else 0], [EXECUTION])
+    assert frames[-1]["step"] == [ENDED if strict else 3]
     record, after = env.record(), env.scene_hash()
     assert env.render().shape == (320, 512, 3)
     again = play(env, 20_001)
@@ -204,7 +208,7 @@ def test_batches_in_processes_of_all_tasks(name: str, tmp_path: Path) -> None:
     check_batches(tmp_path, (False, True), 12, tasks=name, suite=get_task(name).suite, prompt_in=RESET, obs_type=BOTH)
 
 
-# --- prompt and idling ---
+# --- prompt ---
 
 
 @pytest.mark.usefixtures("no_rendering")
@@ -235,16 +239,17 @@ def test_prompt_ignores_actions_and_restores_the_scene() -> None:
 
 
 @pytest.mark.parametrize("name", [pytest.param(HIGHLIGHT, marks=pytest.mark.slow), STRICT_HIGHLIGHT])
-def test_prompt_in_reset_gives_the_same_execution_log_and_video(tmp_path: Path, name: str) -> None:
-    task = get_task(name)
-    idle = {seed: first_execution_step(task, seed, True) - (task.prompt_steps or 0) for seed in range(20_000, 20_600)}
-    seed = next(seed for seed, steps in idle.items() if not task.idles or 10 <= steps <= 60)
+def test_prompt_in_reset_gives_the_same_execution_log_and_video(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(episode_module, "LONGEST_HOLD", 20)
+    task, seed = get_task(name), 20_000
     frames, records, videos = [], [], []
     for where in (STEPS, RESET):
         log = tmp_path / where
         env = make(name, obs_type=BOTH, prompt_in=where, horizon=3, log_dir=str(log), videos=-1)
         prompt = 0 if where == RESET else PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
-        assert env._max_episode_steps == 3 + prompt + (IDLE_STEPS if task.idles and where == STEPS else 0)
+        assert env._max_episode_steps == longest(env.settings) + prompt
         assert (env.reset(seed=seed)[1]["phase"] == EXECUTION) == (where == RESET)
         frames.append(play(env, seed))
         env.close()
@@ -317,12 +322,12 @@ def test_oracle_instruction_equals_the_dataset_frame_by_frame(name: str, referen
     assert plain.task_description == demo.task.language
 
 
+@pytest.mark.usefixtures("short_holds")
 def test_evidence_runs_each_scene_with_each_variant(tmp_path: Path) -> None:
     settings = {"prompt_in": RESET, "horizon": 1}
     env = make(STRICT_HIGHLIGHT, log_dir=str(tmp_path / "each"), evidence=True, **settings)
     for seed in range(20_000, 20_003):
-        env.reset(seed=seed)
-        env.step(REST)
+        play(env, seed, steps=1)
     records = read_episodes(tmp_path / "each")
     found = [(r["episode"], r["seed"], r["variant"]) for r in records]
     assert found == [(0, 20_000, 0), (1, 20_000, 1), (2, 20_001, 0)]
@@ -330,8 +335,7 @@ def test_evidence_runs_each_scene_with_each_variant(tmp_path: Path) -> None:
     assert first_variant_mismatch(records) is None
     assert first_variant_mismatch([{**records[0], "variant": 1}]) is not None
     drawn = make(STRICT_HIGHLIGHT, log_dir=str(tmp_path / "drawn"), **settings)
-    drawn.reset(seed=20_000)
-    drawn.step(REST)
+    play(drawn, 20_000, steps=1)
     (line,) = read_episodes(tmp_path / "drawn")
     assert "choice" not in line
     assert line["scene_hash"] == records[0]["scene_hash"] == records[1]["scene_hash"] != records[2]["scene_hash"]

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs import episode as episode_module
 from lerobot_memobench.envs import prompt_cache
-from lerobot_memobench.envs.episode import first_execution_step
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.prompt_cache import Prompt, RestoredPrompt, prompt_file, prompt_of
@@ -102,15 +101,15 @@ def test_rollouts_are_equal_without_cache_while_writing_and_restored(
     if longest is not None:
         monkeypatch.setattr(episode_module, "PROMPT_HORIZON", longest)
         monkeypatch.setitem(STRICT_PROMPT_STEPS, "hide", longest)
-    task, simulated, step = get_task(name), [0], Simulation.step
+    simulated, step = [0], Simulation.step
 
     def counted(sim: Simulation, action: Any) -> None:
         simulated[0] += 1
         step(sim, action)
 
     monkeypatch.setattr(Simulation, "step", counted)
-    length = task.prompt_steps or 0
-    seed = next(s for s in range(20_000, 21_000) if first_execution_step(task, s, True) - length < 20)
+    monkeypatch.setattr(episode_module, "LONGEST_HOLD", 5)
+    seed = 20_000
     runs, steps = {}, {}
     for run, off in {"simulated": "off", "written": "", "restored": ""}.items():
         monkeypatch.setenv(prompt_cache.VARIABLE, off)

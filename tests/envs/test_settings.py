@@ -7,6 +7,7 @@ import gzip
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,9 +26,9 @@ from lerobot_memobench.envs.evaluation_file import (
     write_protocol,
 )
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.settings import GOALS, IDLE, NOT_COMPARED, SCENE_HASHES, SETTINGS, EnvSettings
+from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EVALUATION_SEED, HORIZON, IDLE_STEPS, UPSTREAM_HORIZON
+from lerobot_memobench.protocol import EVALUATION_SEED, HOLD_MEAN, HORIZON, UPSTREAM_HORIZON
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import STRICT
 
@@ -89,7 +90,7 @@ def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
 @pytest.mark.parametrize(
     ("asked", "found"),
     [
-        ({"suite": STRICT, "referent": "fixed"}, {"referent": "drawn", IDLE: IDLE_STEPS, GOALS: 2}),
+        ({"suite": STRICT, "referent": "fixed"}, {"referent": "drawn", HOLD: HOLD_MEAN, GOALS: 3}),
         ({"protocol": "upstream"}, {"demonstration_prompt": False, "horizon": UPSTREAM_HORIZON}),
         ({"protocol": "upstream", "horizon": 5}, {"horizon": 5}),
         ({}, {"horizon": HORIZON, "seed_base": EVALUATION_SEED, "world": "memobench"}),
@@ -113,14 +114,22 @@ def test_upstream_protocol_has_no_controls() -> None:
     [
         (None, "steps", None),
         (type("P", (), {"n_action_steps": 4}), "reset", 4),
-        (type("P", (), {"reads_prompt": True}), "steps", None),
+        (type("P", (), {"reads_prompt": True, "n_obs_steps": 2}), "steps", None),
     ],
 )
 def test_policy_determines_prompt_and_replanning(policy: Any, prompt_in: str, replan: int | None) -> None:
     settings = MemobenchEnvConfig().settings_for(policy)
     assert (settings.prompt_in, settings.replan_steps) == (prompt_in, replan)
+    assert settings.window_steps == getattr(policy, "n_obs_steps", 1)
     named = MemobenchEnvConfig(prompt_in="steps", replan_steps=2).settings_for(policy)
     assert (named.prompt_in, named.replan_steps) == ("steps", 2)
+
+
+def test_averaged_plans_count_as_observed_steps() -> None:
+    """ACT's temporal ensemble carries a plan over `chunk_size` steps, so a hold must be longer."""
+    for coefficient, window in ((0.01, 100), (None, 1)):
+        act = {"n_obs_steps": 1, "chunk_size": 100, "n_action_steps": 1, "temporal_ensemble_coeff": coefficient}
+        assert MemobenchEnvConfig().settings_for(SimpleNamespace(**act)).window_steps == window
 
 
 # --- the file ---
@@ -130,8 +139,8 @@ def test_omitted_settings_have_their_former_values() -> None:
     assert differences({"horizon": 5}, {"suite": "published", "horizon": 5}) == []
     assert differences({"suite": STRICT}, {}) == ["suite: strict and published"]
     now = EnvSettings(suite=STRICT).protocol_block
-    before = {key: value for key, value in now.items() if key != IDLE}
-    assert differences(before, now) == [f"idle: 0 and {IDLE_STEPS}"]
+    before = {key: value for key, value in now.items() if key != HOLD}
+    assert differences(before, now) == [f"hold: 0 and {HOLD_MEAN}"]
     assert differences(now, now) == []
     assert differences({"tasks": ["a"], "policy": {"sha256": "a"}}, {"tasks": ["b"], "policy": {"sha256": "b"}}) == []
     found = differences({"tasks": ["a"]}, {"tasks": ["b"]}, extent=True)

@@ -141,7 +141,7 @@ def played(benchmark: MEMOBench, number: int = 0, expert: bool = False) -> tuple
 Make = Callable[..., MEMOBench]
 
 
-def test_idling_frames_are_not_sent(benchmarks: Make) -> None:
+def test_frames_at_rest_after_a_prompt_are_not_sent(benchmarks: Make) -> None:
     first, _ = played(benchmarks(HIGHLIGHT, suite="strict", horizon=1, seed=20_000))
     assert first["step"].tolist() == [NO_CLOCK]
     assert len(first["video_history"]) == len(first["state_history"]) == 66, "the highlight only"

@@ -158,7 +158,7 @@ def most_frequent_share(rows: np.ndarray, shuffled: np.ndarray) -> float:
 
 
 def test_one_subgoal_cannot_be_shuffled() -> None:
-    table = FrameTable(np.array([0, 5]), np.ones(5, np.uint8), {"coarse": ["put it down"] * 5}, None)
+    table = FrameTable(np.array([0, 5]), np.ones(5, np.uint8), np.zeros(5, bool), {"coarse": ["put it down"] * 5}, None)
     config = MemobenchMemConfig(align="semantic", subgoal_level="coarse", align_targets="shuffled")
     with pytest.raises(MemobenchError, match="needs at least two"):
         with_targets(table, config, Path("here"))

@@ -63,6 +63,7 @@ KEPT = {
     OBJECTS,
     PRIVILEGED,
     "executed_action",
+    "held",
     "checkpoint.index",
     "checkpoint.operation",
     "checkpoint.completed",

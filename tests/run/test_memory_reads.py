@@ -72,6 +72,7 @@ def test_a_rollout_that_fails_writes_no_part_of_an_episode(tmp_path: Path) -> No
     assert not reads_file(tmp_path, "a_task", 0).exists()
 
 
+@pytest.mark.usefixtures("short_holds")
 def test_reads_of_evidence_belong_to_their_episode(tmp_path: Path) -> None:
     """Four episodes of two scenes, in two parts; the second part is resumed after its first episode."""
     for part, number in (("a", 0), ("a", 1), ("b", 2), ("b", 3)):
@@ -79,7 +80,10 @@ def test_reads_of_evidence_belong_to_their_episode(tmp_path: Path) -> None:
         policy: Any = Policy([{"step": 0, "entries": [0], "weights": [number / 10]}])
         with ReadLog(tmp_path / part, 20_000, "drawn").noting(MILK, policy, [20_000 + number]) as ended:
             env.reset(seed=[20_000 + number])
-            ended(env.step(np.zeros((1, 7), np.float32))[3])
+            truncated = np.zeros(1, np.bool_)
+            while not truncated.any():  # the execution begins with a hold
+                truncated = env.step(np.zeros((1, 7), np.float32))[3]
+            ended(truncated)
         env.close()
     merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b"])
     (run,) = read_runs([tmp_path / "all"])

@@ -127,7 +127,6 @@ BAD: list[tuple[list[str], str]] = [
     (["referent=rnd"], "'random'"),
     (["suite=strikt"], "'strict'"),
     (["suite=strict", f"tasks={STOVE}"], "task of the published suite"),
-    (["suite=strict", "world=libero"], "leave one of the two out"),
     (["tasks=stove"], "'stove'"),
     (["tasks="], "among the tasks"),
     (["policy=memobnch_mem"], "memobench_mem"),

@@ -207,11 +207,11 @@ def test_a_card_runs_no_more_than_its_episodes(settings: dict[str, Any], named: 
         rerun.repeat(Path(), None, None, lambda plan: pytest.fail("it was run"), print)
 
 
-@pytest.mark.parametrize("idle", [0, 1200])
-def test_a_strict_card_of_an_earlier_version_is_refused(idle: int) -> None:
-    asked = {"tasks": [COUNTING], "episodes": 1, "suite": "strict", **({"idle": idle} if idle else {})}
+@pytest.mark.parametrize("hold", [0, 1200])
+def test_a_strict_card_of_an_earlier_version_is_refused(hold: int) -> None:
+    asked = {"tasks": [COUNTING], "episodes": 1, "suite": "strict", **({"hold": hold} if hold else {})}
     write_card(Path(), card({**RANDOM, "env": {"suite": "strict"}}, protocol=asked))
-    with pytest.raises(MemobenchError, match=f"idle={idle} on the card"):
+    with pytest.raises(MemobenchError, match=f"hold={hold} on the card"):
         rerun.repeat(Path(), None, None, lambda plan: pytest.fail("it was run"), print)
 
 

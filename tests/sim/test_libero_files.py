@@ -81,9 +81,9 @@ def test_user_scans(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (touched,) = (scene.model.geom_bodyid == scene.model.body(tomato).id).nonzero()[0]
     assert scene.model.geom_condim[touched] == 4
     assert scene.assets[tomato].high == pytest.approx((0.02, 0.03, 0.02))  # the second scan
-    assert mjcf.class_file("beefsteak_tomato__1").bottom == pytest.approx(-0.02)
+    assert mjcf.class_file("beefsteak_tomato__1", "published").bottom == pytest.approx(-0.02)
     with pytest.raises(MemobenchError, match="2 scans"):
-        mjcf.class_file("beefsteak_tomato__2")
+        mjcf.class_file("beefsteak_tomato__2", "published")
 
 
 def test_scan_references_outside_its_folder_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,4 +93,4 @@ def test_scan_references_outside_its_folder_are_refused(tmp_path: Path, monkeypa
     path.write_text(path.read_text().replace('file="visuals/model.obj"', 'file="../outside.obj"'))
     monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
     with pytest.raises(MemobenchError, match="which is not in its folder"):
-        mjcf.class_file("biscuit").assets()
+        mjcf.class_file("biscuit", "published").assets()

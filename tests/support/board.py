@@ -11,7 +11,7 @@ from typing import Any
 
 from lerobot_memobench.board.submission import CARD, LOG
 from lerobot_memobench.datasets.generation import task_hash
-from lerobot_memobench.envs.episode import first_execution_step, referent_of
+from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.policies.lerobot_config import tree_hash
@@ -51,7 +51,7 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
     return {
         **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed, "referent": "drawn"},
         **{"variant": task.variant_index, "replan_steps": 5, "prompt_shown": None if task.prompt is None else True},
-        **{"prompt_steps": first_execution_step(published, seed, True), "steps": steps, "success": success},
+        **{"prompt_steps": published.prompt_steps, "steps": steps, "success": success},
         **(choice if settings.get("evidence") else {}),
         **({"paused_steps": 500} if settings.get("pause_steps") else {}),
         "checkpoints": [
@@ -126,7 +126,6 @@ def sealed(folder: Path) -> None:
             record["seed"] = 100_007 + record["episode"]
             task = get_task(record["task"])
             record["variant"] = referent_of(task, record["seed"]).variant_index
-            record["prompt_steps"] = first_execution_step(task, record["seed"], True)
             record["scene_hash"] = scene_of(task.name, record["seed"])
 
     in_log(move, card=True)(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,15 +28,31 @@ def record_demonstration(task: Task, seed: int, *, variant: int = 0, **settings:
     return replace(demo, images={name: np.stack([images[name] for images in shown]) for name in shown[0]})
 
 
-def drawn_steps(task_name: str, seed: int, frames: int, exec_start: int = 0, world: str = MEMOBENCH) -> Demonstration:
-    """Return as many steps of drawn actions; ``exec_start`` of them are of the prompt."""
+def drawn_steps(
+    task_name: str,
+    seed: int,
+    frames: int,
+    exec_start: int = 0,
+    world: str = MEMOBENCH,
+    holds: Sequence[tuple[int, int]] = (),
+) -> Demonstration:
+    """Return as many steps of drawn actions; ``exec_start`` of them are of the prompt.
+
+    Args:
+        holds: first held frame and the frame after the last one of each hold.
+    """
     actions = np.random.default_rng(seed).uniform(-1, 1, (frames, 7)).astype(np.float32)
-    return resimulate(get_task(task_name).in_world(world), seed, actions, exec_start)
+    held = np.zeros(frames, np.bool_)
+    for start, end in holds:
+        held[start:end] = True
+    actions[held] = 0
+    return resimulate(get_task(task_name).in_world(world), seed, actions, exec_start, held=held)
 
 
 def beginning(demo: Demonstration, frames: int) -> Demonstration:
     """Return the first steps of a demonstration as one of its own."""
-    found = resimulate(demo.task, demo.seed, demo.applied[:frames], demo.exec_start)
+    held = None if demo.held is None else demo.held[:frames]
+    found = resimulate(demo.task, demo.seed, demo.applied[:frames], demo.exec_start, held=held)
     executed = None if demo.executed is None else demo.executed[:frames]
     return replace(
         found, actions=demo.actions[:frames], executed=executed, referent=demo.referent, variant=demo.variant

@@ -1,4 +1,4 @@
-"""Difficulties of strict tasks: variants, idling and horizon; the standard one is the suite as published."""
+"""Difficulties of strict tasks: variants and horizon; the standard one is the suite as published."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from lerobot_memobench.envs.episode_log import differences, episode_record, writ
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
-from lerobot_memobench.evaluation.gaps import success_by_gap
 from lerobot_memobench.evaluation.headline import protocol_phrases
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.protocol import ACTION_DIM
@@ -22,10 +21,8 @@ from lerobot_memobench.run.card import first_variant_mismatch
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Difficulty
 from lerobot_memobench.tasks.task import STRICT
-from tests.support.logs import rollout
 
 STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
-HIDING = "find_the_artichoke_hidden_in_one_of_the_drawers"
 
 
 @pytest.mark.parametrize(("difficulty", "most"), list(zip(DIFFICULTIES, (2, 3, 5, 8), strict=True)))
@@ -50,33 +47,17 @@ def test_only_counting_tasks_have_harder_variants() -> None:
         assert (len(drawn) > 1) == (get_task(name).family == "counting")
 
 
-@pytest.mark.parametrize(
-    ("difficulty", "idle", "horizon"), [("easy", 900, 1200), ("standard", 1800, 1200), ("extreme", 7200, 3200)]
-)
-def test_a_difficulty_sets_idling_and_horizon(difficulty: str, idle: int, horizon: int) -> None:
+@pytest.mark.parametrize(("difficulty", "horizon"), [("easy", 1200), ("standard", 1200), ("extreme", 3200)])
+def test_a_difficulty_sets_the_horizon(difficulty: str, horizon: int) -> None:
     settings = EnvSettings(suite=STRICT, difficulty=difficulty)
-    assert (settings.horizon, settings.protocol_block["idle"]) == (horizon, idle)
+    assert settings.horizon == horizon
     assert EnvSettings(suite=STRICT, difficulty=difficulty, horizon=700).horizon == 700
     assert settings.changed(difficulty="hard").horizon == 2000
-    episode = Episode(get_task(STOVE), settings)
-    episode.reset(20_000)
-    begins = episode._execution_step
-    assert 0 <= begins <= idle
-    assert begins == pytest.approx(idle * _share(20_000), abs=2)
-
-
-def _share(seed: int) -> float:
-    """Return the drawn share of the idling time, the same at all difficulties."""
-    episode = Episode(get_task(STOVE), EnvSettings(suite=STRICT))
-    episode.reset(seed)
-    return episode._execution_step / 1800
 
 
 def test_the_expert_counts_to_eight() -> None:
     episode = Episode(get_task(STOVE).at("extreme"), EnvSettings(suite=STRICT, difficulty="extreme"))
     episode.reset(20_000, variant=7)
-    while episode.phase == 0:
-        episode.step(np.zeros(ACTION_DIM))
     while not episode.done:
         episode.step(episode.expert_action())
     assert (episode.success, episode.progress.index) == (True, 4)
@@ -92,17 +73,9 @@ def test_a_difficulty_is_for_strict_tasks_and_known() -> None:
 
 def test_evaluations_of_two_difficulties_differ_and_earlier_protocols_are_standard() -> None:
     hard, standard = (EnvSettings(suite=STRICT, difficulty=each).protocol_block for each in ("hard", STANDARD))
-    assert {each.split(":")[0] for each in differences(hard, standard)} == {"difficulty", "horizon", "idle"}
+    assert {each.split(":")[0] for each in differences(hard, standard)} == {"difficulty", "horizon"}
     earlier = {name: value for name, value in standard.items() if name != "difficulty"}
     assert differences(earlier, standard) == []
-
-
-def test_gaps_contain_the_idling_of_the_difficulty() -> None:
-    lines = [rollout(HIDING, "spatial", "SUC", [False] * 3, False, 0, seed=seed) for seed in range(20_000, 20_040)]
-    changed = {STANDARD: {}, "extreme": {"difficulty": "extreme"}}
-    groups = {name: list(success_by_gap([line | more for line in lines])) for name, more in changed.items()}
-    assert "4096–8191" in groups["extreme"]
-    assert "4096–8191" not in groups[STANDARD]
 
 
 def test_a_log_of_a_difficulty_is_checked_and_described_as_such(tmp_path: Path) -> None:
@@ -111,7 +84,6 @@ def test_a_log_of_a_difficulty_is_checked_and_described_as_such(tmp_path: Path) 
     lines = []
     for number in range(5):
         episode.reset(20_000 + number)
-        episode.step_index = episode._execution_step - 1
         while not episode.done:
             episode.step(np.zeros(ACTION_DIM))
         lines.append(episode_record(episode, number, 0.1))

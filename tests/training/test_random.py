@@ -13,6 +13,7 @@ from accelerate import Accelerator
 from lerobot.datasets import LeRobotDataset
 from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 
+from lerobot_memobench.datasets.frames import FrameLookup, read_frame_table
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem as modeling
 from lerobot_memobench.training.data import DecodedSamples
 from lerobot_memobench.training.sampler import frame_sampler
@@ -45,10 +46,12 @@ def test_processes_draw_different_noise_of_the_same_policy(
 
 def test_augmentation_follows_seed_and_draw(synthetic: Path) -> None:
     transforms = ImageTransforms(ImageTransformsConfig(enable=True))
-    dataset = LeRobotDataset("memobench/synthetic", root=synthetic, image_transforms=transforms)
+    times = {"action": [0.0]}
+    dataset = LeRobotDataset("memobench/synthetic", root=synthetic, image_transforms=transforms, delta_timestamps=times)
+    lookup = FrameLookup(synthetic, read_frame_table(synthetic))
 
     def picture(seed: int, number: int) -> torch.Tensor:
-        found: torch.Tensor = DecodedSamples(dataset, seed)[5, number][PICTURE]
+        found: torch.Tensor = DecodedSamples(dataset, lookup, [0], seed)[5, number][PICTURE]
         return found
 
     state = torch.get_rng_state()

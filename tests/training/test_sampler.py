@@ -14,13 +14,16 @@ from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.sampler import compute_sampler_state
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.training.data import open_datasets, open_training
+from lerobot_memobench.training.data import execution_statistics, open_datasets, open_training
 from lerobot_memobench.training.loop import make_held_out_loader, make_sampler
 from lerobot_memobench.training.sampler import frame_sampler, grouped_order, weighted_order
+from tests.support.held_dataset import HELD, LENGTHS, PROMPTS, STRETCHES, make_held_dataset
 from tests.support.small_policy import small_config
 
 EPISODES, PHASE = np.array([0, 40, 63, 94]), np.ones(94, int)
 PHASE[40:48] = 0
+ACTS = ~HELD
+ACTS[: PROMPTS[0]] = False
 
 
 def sampler(**options: Any) -> Any:
@@ -50,6 +53,23 @@ def test_resumed_training_draws_the_rest_of_the_epoch(step: int, batch_size: int
 def test_dataset_without_execution_is_refused() -> None:
     with pytest.raises(MemobenchError, match="execution frame"):
         frame_sampler(EPISODES, np.zeros(94, int), None)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"together": 3}, {"together": 3, "tasks": (np.array([0, 1]), np.array([1.0, 2.0]))}]
+)
+def test_held_frames_are_not_drawn(options: dict[str, Any]) -> None:
+    def made() -> Any:
+        return frame_sampler(np.cumsum([0, *LENGTHS]), ACTS, None, seed=5, **options)
+
+    whole, resumed = made(), made()
+    drawn = list(whole)
+    assert len(drawn) == len(whole) == ACTS.sum()
+    assert ACTS[drawn].all()
+    if "tasks" not in options:
+        assert sorted(drawn) == np.flatnonzero(ACTS).tolist()
+    resumed.go_on(2, 4, 1)
+    assert list(resumed) == drawn[8:]
 
 
 @pytest.mark.parametrize("moments", [1, 3, 6])
@@ -110,3 +130,30 @@ def test_null_draws_frames_uniformly(objects: Path) -> None:
         )
         training = open_training(config, open_datasets(config))
         assert (sorted(make_sampler(config, training)) == sorted(make_sampler(config, training).frames)) is drawn
+
+
+@pytest.mark.parametrize("perception", ["objects", "pixels"])
+def test_chunks_end_at_a_hold(perception: str, tmp_path: Path) -> None:
+    """Also those of LeRobot's dataset; statistics are of the frames to learn from."""
+    root = make_held_dataset(tmp_path / "held", pictures=perception == "pixels")
+    config = TrainPipelineConfig(
+        DatasetConfig("local/data", root=str(root)),
+        policy=small_config(size="tiny", perception=perception, chunk_size=4, n_action_steps=4),
+    )
+    training = open_training(config, open_datasets(config))
+    lookup, samples = training.lookup, training.samples()
+    np.testing.assert_array_equal(lookup.acts, ACTS)
+    assert sorted(make_sampler(config, training).frames) == np.flatnonzero(ACTS).tolist()
+    for start, end in STRETCHES:
+        for frame in (start, end - 2, end - 1):
+            there = min(4, end - frame)
+            assert samples[frame]["action_is_pad"].tolist() == [False] * there + [True] * (4 - there)
+            whole = np.asarray(training.dataset.hf_dataset[frame : frame + there]["action"])
+            np.testing.assert_array_equal(samples[frame]["action"][:there], whole)
+    if lookup.columns:
+        actions = lookup.columns["action"].numpy()[ACTS]
+        np.testing.assert_allclose(
+            execution_statistics(training.policy.config, training.dataset.meta, lookup)["action"]["mean"],
+            actions.mean(axis=0),
+            atol=1e-6,
+        )

@@ -17,7 +17,10 @@ from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.training.samples import keep_in_memory
 from lerobot_memobench.training.view import Choice, viewed, write_view
+from tests.support.held_dataset import LENGTHS as HELD_LENGTHS
+from tests.support.held_dataset import STRETCHES, make_held_dataset
 from tests.support.object_dataset import LENGTHS, PROMPTS
 
 STATE, SLOTS, PICTURE = "observation.state", "observation.environment_state", "observation.images.image"
@@ -53,6 +56,48 @@ def test_view_holds_the_frames_after_the_prompt(pictured: Path, tmp_path: Path) 
             assert (here["frame_index"], here["index"], here["episode_index"]) == (frame, first + frame, episode)
         first += length - prompt
     assert next((tmp_path / "view").rglob("*.mp4")).is_symlink()
+
+
+def test_stretches_between_holds_are_episodes(tmp_path: Path) -> None:
+    """Their chunks and windows end at the holds, pictures and texts stay those of the frames."""
+    root = make_held_dataset(tmp_path / "held", pictures=True)
+    write_view(root, tmp_path / "view", Choice(obs_type=BOTH))
+    times = {"action": [0.0, 0.05, 0.1], STATE: [-0.05, 0.0]}
+    whole, view = opened(root), opened(tmp_path / "view", delta_timestamps=times)
+    assert view.num_episodes == len(STRETCHES)
+    assert view.num_frames == sum(end - start for start, end in STRETCHES)
+    row = 0
+    for episode, (start, end) in enumerate(STRETCHES):
+        place = view.meta.episodes[episode]
+        assert (place["dataset_from_index"], place["length"]) == (row, end - start)
+        assert place["source_episode_index"] == (start >= HELD_LENGTHS[0])
+        for frame in range(start, end):
+            there, here = whole[frame], view[row]
+            assert torch.equal(here[PICTURE], there[PICTURE]), (episode, frame)
+            assert torch.equal(here[STATE][1], there[STATE])
+            assert torch.equal(here["action"][0], there["action"])
+            assert here["action_is_pad"].tolist() == [frame + k >= end for k in range(3)]
+            assert here[f"{STATE}_is_pad"].tolist() == [frame == start, False]
+            assert (here["frame_index"], here["index"], here["episode_index"]) == (frame - start, row, episode)
+            for old, new in zip(there["language_persistent"], here["language_persistent"], strict=True):
+                age = float(there["timestamp"]) - float(old["timestamp"])
+                assert float(here["timestamp"]) - float(new["timestamp"]) == pytest.approx(age, abs=1e-5)
+            row += 1
+    assert not torch.equal(view[0][PICTURE], view[row - 1][PICTURE])
+    in_memory = opened(tmp_path / "view", delta_timestamps=times, episodes=[1, 3])
+    from_files = opened(tmp_path / "view", delta_timestamps=times, episodes=[1, 3])
+    keep_in_memory(in_memory)
+    for number in range(len(from_files)):
+        for name in (STATE, "action", "action_is_pad", f"{STATE}_is_pad"):
+            assert torch.equal(in_memory[number][name], from_files[number][name])
+
+
+def test_chosen_episodes_are_those_of_the_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    root = make_held_dataset(tmp_path / "held")
+    words = ["policy=act", "policy.device=cpu", f"dataset={root}", "dataset.episodes=[1]"]
+    found = viewed(read_arguments("train", split_arguments(words)), None, None, print)
+    assert found.get("dataset.episodes") == "[2, 3]"
 
 
 @pytest.mark.parametrize(

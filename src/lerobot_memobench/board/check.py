@@ -19,7 +19,6 @@ from packaging.version import InvalidVersion
 
 from lerobot_memobench.board.submission import EVIDENCE, PAUSES, RERUNS, Evaluation, Submission, read_submission
 from lerobot_memobench.datasets.generation import task_hash
-from lerobot_memobench.envs.episode import first_execution_step
 from lerobot_memobench.envs.episode_log import INPUTS, OF_THE_POLICY, OMITTED, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
 from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PIXELS, EnvSettings
@@ -342,10 +341,10 @@ def _contradictions(protocol: Mapping[str, Any], record: Mapping[str, Any], task
     shown = protocol["demonstration_prompt"] and task.prompt is not None
     hidden = task.prompt is not None and not task.prompt.restores
     longest = PROMPT_HORIZON if shown else 0
-    at = first_execution_step(get_task(task.name), record["seed"], protocol["demonstration_prompt"])
+    at = (task.prompt_steps or 0) if shown else 0
     prompt = record.get("prompt_steps") or 0
-    if prompt != at if task.idles else not int(shown) <= prompt <= longest:
-        yield f"begins after {prompt} steps of prompt and idling; expected {at or f'{int(shown)} to {longest}'}"
+    if prompt != at if task.suite == STRICT else not int(shown) <= prompt <= longest:
+        yield f"begins after {prompt} steps of prompt; expected {at or f'{int(shown)} to {longest}'}"
     if (record.get("prompt_shown") is not None) != (shown or hidden):
         yield f"has prompt_shown={record.get('prompt_shown')}; its prompt was {'' if shown else 'not '}part of it"
 
@@ -376,10 +375,11 @@ def _check_inputs(run: Evaluation) -> None:
     claimed = {*str(run.protocol[INPUTS]).split(", ")}
     features = [*_block(settings.get("input_features")).values()]
     types = {str(_block(each).get("type")) for each in features} & {"VISUAL", "ENV"}
-    drawn = {PIXEL_INPUT, DETECTIONS} if obs_type != OBJECTS and types != {"ENV"} else set()
+    detector = settings.get("detector")
+    drawn = {PIXEL_INPUT, DETECTIONS} if obs_type != OBJECTS and (types != {"ENV"} or detector is not None) else set()
     objects = {PRIVILEGED} if obs_type != PIXELS and types != {"VISUAL"} else set()
-    reads = settings.get("perception", OBJECTS_READ if kind in READ_OBJECTS else None) == OBJECTS_READ
-    needed = objects if reads and "ENV" in types and settings.get("detector") is None else set()
+    reads = settings["perception"] == OBJECTS_READ if "perception" in settings else not _ignores_objects(kind)
+    needed = objects if reads and "ENV" in types and detector is None else set()
     asked = _block(run.card.get("settings", {}).get("env"))
     if kind in SCRIPTS or asked.get("expert_action") or asked.get("blind_action"):
         needed = {SIMULATOR}
@@ -388,6 +388,15 @@ def _check_inputs(run: Evaluation) -> None:
             f"{run.place}: inputs are {run.protocol[INPUTS]!r} on the card with obs_type={obs_type} and the policy "
             f"{kind} of {' and '.join(sorted(types)) or 'unknown'} features; expected {needed or drawn | objects}"
         )
+
+
+def _ignores_objects(kind: str) -> bool:
+    """Return whether a policy type is one of LeRobot's that do not read objects."""
+    import lerobot.policies  # noqa: F401 - registers the types
+    from lerobot.configs.policies import PreTrainedConfig
+
+    found = PreTrainedConfig.get_known_choices().get(kind)
+    return found is not None and found.__module__.startswith("lerobot.") and kind not in READ_OBJECTS
 
 
 def _block(value: Any) -> Mapping[str, Any]:

@@ -92,7 +92,7 @@ def board_row(
 
 
 def _assets(world: str, stand_ins: bool) -> str:
-    return f"LIBERO{', boxes for missing scans' if stand_ins else ''}" if world == LIBERO else "package"
+    return f"LIBERO{', own objects for missing scans' if stand_ins else ''}" if world == LIBERO else "package"
 
 
 # --- text ---

@@ -53,7 +53,9 @@ ROW_NAME = re.compile(r"(?!(con|prn|aux|nul|com\d|lpt\d)$)[a-z0-9][a-z0-9_-]{1,6
 TEXT = re.compile(r"[\w(][\w .,:;+()/%~–-]{0,199}")
 FIRST_DAY = "2026-01-01"
 ACCOUNT = re.compile(r"@[A-Za-z0-9-]{1,39}")
-LINK = re.compile(r"https://(?!(.*\.)?xn--|.*/\.\.?(/|$))[A-Za-z0-9.-]+(/[\w.~/%+@=-]*)?", re.ASCII | re.IGNORECASE)
+LINK = re.compile(
+    r"https://(?!(.*\.)?xn--|.*/(\.|%2e){1,2}(/|$))[A-Za-z0-9.-]+(/[\w.~/%+@=-]*)?", re.ASCII | re.IGNORECASE
+)
 """Without look-alike hosts (IDNA) and paths that lead elsewhere."""
 
 

@@ -230,9 +230,9 @@ def view(
     obs_type: Annotated[
         str | None, typer.Option(help=f"Inputs: {', '.join(OBS_TYPES)}; pictures if there are some by default.")
     ] = None,
-    prompts: Annotated[bool, typer.Option(help="Keep the frames of demonstration prompts.")] = False,
+    prompts: Annotated[bool, typer.Option(help="Keep the frames of demonstration prompts and holds.")] = False,
 ) -> None:
-    """Write a dataset for lerobot-train. Without the frames of prompts, and with the columns of chosen inputs."""
+    """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
     from lerobot_memobench.datasets.lerobot_format.layout import read_info
     from lerobot_memobench.training.view import choice_for, write_view
 

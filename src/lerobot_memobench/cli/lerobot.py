@@ -127,7 +127,8 @@ def check_tasks(given: Arguments) -> None:
     """Refuse unknown tasks before LeRobot is imported, which takes ten seconds."""
     tasks = given.value("tasks") or given.value("env.tasks")
     suite = given.value("suite") or given.value("env.suite") or PUBLISHED
-    if tasks is not None and given.value("config_path") is None:
+    elsewhere = any(given.value(key) for key in ("config_path", "task_dir", "env.task_dir"))
+    if tasks is not None and not elsewhere:
         resolve_tasks(tasks, suite)
 
 

@@ -287,7 +287,7 @@ def same_history_in_training(found: Behaviour) -> str:
 
 
 def _only(stream: Stream, call: int) -> Stream:
-    return Stream(stream.frames[call : call + 1], stream.task, stream.index + call)
+    return Stream(stream.frames[call : call + 1], stream.task, stream.indices[call : call + 1])
 
 
 def is_deterministic(found: Behaviour) -> str:

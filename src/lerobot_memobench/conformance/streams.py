@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
 from lerobot_memobench.sim.convention import UPRIGHT
@@ -111,12 +111,12 @@ class Stream:
     Attributes:
         frames: observations by their names at the policy, without a batch dimension.
         task: the instruction.
-        index: of the first frame in the dataset.
+        indices: of the frames in the dataset.
     """
 
     frames: tuple[dict[str, Tensor], ...]
     task: str
-    index: int
+    indices: tuple[int, ...]
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -141,7 +141,7 @@ class Stream:
 
 
 def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: bool, frames: int) -> Iterator[Stream]:
-    """Yield the beginning of each episode of a LeRobotDataset as a rollout observes it.
+    """Yield the beginning of each episode of a LeRobotDataset as a rollout observes it, without held frames.
 
     Args:
         dataset: without delta timestamps.
@@ -153,18 +153,22 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
 
     for episode in dataset.meta.episodes:
         first, end = episode["dataset_from_index"], episode["dataset_to_index"]
-        phases = [float(phase) for phase in dataset.hf_dataset[first:end][OBS_PHASE]]
+        rows = dataset.hf_dataset[first:end]
+        phases = [float(phase) for phase in rows[OBS_PHASE]]
         if EXECUTION not in phases:
             continue
         start = phases.index(EXECUTION)
         shown: list[dict[str, Tensor]] = []
-        for index in range(first if prompts else first + start, min(first + start + frames, end)):
+        held = rows.get(HELD_COLUMN, np.zeros(len(phases)))
+        acting = [first + frame for frame in range(start, len(phases)) if not held[frame]][:frames]
+        indices = (*range(first if prompts else first + start, first + start), *acting)
+        for index in indices:
             item = dataset[index] if pictures else dataset.hf_dataset[index]
             frame = {key: item[key] for key in (OBS_STATE, *CLOCK)}
             frame |= {key: _as_float(item[key]) for key in item if pictures and key.startswith(f"{OBS_IMAGES}.")}
             frame |= {} if objects is None else {OBS_ENV_STATE: item[objects]}
             shown.append(frame)
-        yield Stream(tuple(shown), episode["tasks"][0], first if prompts else first + start)
+        yield Stream(tuple(shown), episode["tasks"][0], indices)
 
 
 def _as_float(picture: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.policies.convention import check_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
-from lerobot_memobench.protocol import CLOCK, EXECUTION
+from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import SHORT_FORMS, policy_config, read_arguments, split_arguments
 from lerobot_memobench.run.rollout import has_planned_action, needs_observation
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
@@ -115,7 +115,7 @@ class Subject:
         """
         from lerobot.utils.collate import lerobot_collate_fn
 
-        batch = lerobot_collate_fn([self.dataset[int(self.numbers[stream.index + call])] for call in calls])
+        batch = lerobot_collate_fn([self.dataset[int(self.numbers[stream.indices[call]])] for call in calls])
         for key in self.cameras:
             if key in batch and batch[key].dtype == torch.uint8:
                 batch[key] = batch[key].to(torch.float32) / 255
@@ -223,7 +223,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     else:
         choice = choice_for(config, raw.meta.features, None, obs_type)
         if not choice.prompts:
-            numbers = np.cumsum(read_frame_table(Path(raw.root)).phase == EXECUTION) - 1
+            numbers = np.cumsum(read_frame_table(Path(raw.root)).acts) - 1
         if needs_view(raw.meta.features, choice):
             write_view(Path(raw.root), view, choice)
             whole.dataset.root = str(view)

@@ -27,7 +27,7 @@ from lerobot_memobench.protocol import (
     PROPRIO_DIM,
 )
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
-from lerobot_memobench.tasks.task import LEVELS, MEMOBENCH, OPERATIONS, Task
+from lerobot_memobench.tasks.task import LEVELS, MEMOBENCH, OPERATIONS, STRICT, Task
 
 MAX_CHECKPOINTS = 6
 """Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
@@ -36,7 +36,7 @@ MIN_FRAMES_BETWEEN_ROWS = 5
 style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
 LEVEL_COLUMNS = {level: f"subgoal.{level}" for level in LEVELS}
 """Level of a checkpoint's text -> column with its text at every frame."""
-INSTRUCTION_COLUMN, MEMORY_COLUMN = "subgoal.instruction", "oracle_memory"
+INSTRUCTION_COLUMN, MEMORY_COLUMN, HELD_COLUMN = "subgoal.instruction", "oracle_memory", "held"
 EARLIER_COLUMNS = {
     "coarse_subgoal": LEVEL_COLUMNS["coarse"],
     "simple_subgoal": LEVEL_COLUMNS["intermediate"],
@@ -45,7 +45,7 @@ EARLIER_COLUMNS = {
 }
 """Column of datasets before version 0.3 -> its present name. Version 0.3 reads both, and the second and third are those
 of RoboMME's datasets too."""
-NOT_HASHED = ("step", "coarse_subgoal", "subtask")
+NOT_HASHED = ("step", "coarse_subgoal", "subtask", "held")
 """Labels that are not part of an episode's hash."""
 LanguageRow = dict[str, Any]
 
@@ -63,16 +63,18 @@ class Demonstration:
         actions: (T, 7) float32, OSC pose deltas and gripper: labels of the frames.
         proprio: (T, 8) float32, end-effector position 3, axis-angle 3, gripper joints 2.
         images: ``{"image", "wrist_image"}`` to (T, H, W, 3) uint8, or None.
-        exec_start: first frame of the execution; frames before it are the demonstration prompt and idle frames, whose
-            actions are zeros.
+        exec_start: first frame of the execution; frames before it are the demonstration prompt and the rest after it,
+            whose actions are zeros.
         satisfied: (T, K) bool, whether the predicate of checkpoint k is true at frame t; false in the prompt.
             Predicates are evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
         success: whether the goal was reached.
         objects: (T, SIZE) float32, the visible objects (`sim.object_slots`).
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
         scene_hash: hash of the initial scene, or empty.
-        stand_ins: classes of the scene whose missing scans were replaced by boxes.
+        stand_ins: classes of the scene whose missing scans this package's objects replaced.
         executed: (T, 7) float32, the applied actions of a perturbed episode; None: ``actions``.
+        held: (T,) bool, whether the scene is held at frame t of the execution, so that its action, zeros, has no
+            effect; None: at no frame.
 
     Raises:
         MemobenchError: arrays have different lengths, or another type or width than stated above.
@@ -94,6 +96,7 @@ class Demonstration:
     scene_hash: str = ""
     stand_ins: tuple[str, ...] = ()
     executed: NDArray[np.float32] | None = None
+    held: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         length = len(self.states)
@@ -104,6 +107,8 @@ class Demonstration:
         self._check("objects", self.objects, np.float32, (length, None))
         if self.executed is not None:
             self._check("executed", self.executed, np.float32, (length, ACTION_DIM))
+        if self.held is not None:
+            self._check("held", self.held, np.bool_, (length,))
         if self.images is not None:
             for camera, frames in self.images.items():
                 self._check(f"images[{camera!r}]", frames, np.uint8, (length, None, None, 3))
@@ -155,7 +160,8 @@ class Labels:
 
     Attributes:
         phase: (T,) int64, 0 prompt, 1 execution.
-        step: (T,) int64, control steps since the phase began; `NO_CLOCK` in the execution of a task that idles.
+        step: (T,) int64, control steps since the phase began; `NO_CLOCK` in the execution of a strict task.
+        held: (T,) bool, whether the action at frame t of the execution has no effect.
         index: (T,) int64, number of checkpoints completed in order before frame t: index of the present one.
         operation: (T,) int64, 0 S, 1 U, 2 C of the present checkpoint, -1 after the last one.
         completed: (T, 6) bool, whether checkpoint k was satisfied at any frame up to and including t.
@@ -171,6 +177,7 @@ class Labels:
 
     phase: NDArray[np.int64]
     step: NDArray[np.int64]
+    held: NDArray[np.bool_]
     index: NDArray[np.int64]
     operation: NDArray[np.int64]
     completed: NDArray[np.bool_]
@@ -187,6 +194,7 @@ class Labels:
         return {
             OBS_PHASE: self.phase.astype(np.float32),
             OBS_STEP: self.step.astype(np.float32),
+            HELD_COLUMN: self.held,
             "checkpoint.index": self.index,
             "checkpoint.operation": self.operation,
             "checkpoint.completed": self.completed,
@@ -225,7 +233,8 @@ def labels(demo: Demonstration) -> Labels:
     acting = frames >= demo.exec_start
     return Labels(
         phase=np.where(acting, EXECUTION, PROMPT).astype(np.int64),
-        step=np.where(acting, NO_CLOCK if task.idles else frames - demo.exec_start, frames),
+        step=np.where(acting, NO_CLOCK if task.suite == STRICT else frames - demo.exec_start, frames),
+        held=np.zeros(length, np.bool_) if demo.held is None else demo.held,
         index=index,
         operation=np.array(codes, dtype=np.int64)[index],
         completed=np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),
@@ -328,6 +337,8 @@ def digest(demo: Demonstration) -> str:
     columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
     if demo.executed is not None:
         columns["executed"] = demo.executed
+    if found.held.any():  # an added column changes no hash of demonstrations without holds
+        columns["held"] = found.held
     columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in NOT_HASHED}
     # Independent of byte order, memory layout and dictionary order.
     sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS, MEMORY_COLUMN
+from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import (
     OBJECTS,
     check_clock,
@@ -26,7 +26,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import files_below
-from lerobot_memobench.protocol import OBS_PHASE
+from lerobot_memobench.protocol import OBS_PHASE, PROMPT
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -48,12 +48,14 @@ class FrameTable:
     Attributes:
         episodes: (E + 1,) int64, first frame of each episode.
         phase: (N,) uint8.
+        held: (N,) bool, whether the scene is held in the execution.
         subgoals: level to (N,) texts.
         memory: (N,) oracle memory texts; None without this column.
     """
 
     episodes: np.ndarray
     phase: np.ndarray
+    held: np.ndarray
     subgoals: dict[str, list[str]]
     memory: list[str] | None
 
@@ -62,18 +64,28 @@ class FrameTable:
         """Number of episodes."""
         return len(self.episodes) - 1
 
+    @property
+    def acts(self) -> np.ndarray:
+        """(N,) bool, whether the action of a frame has an effect: frames to learn from."""
+        return (self.phase != PROMPT) & ~self.held
+
+    def runs(self, flags: np.ndarray) -> np.ndarray:
+        """Return the first frames (R,) of the longest parts of episodes with equal flags (N,), and N."""
+        return np.union1d(self.episodes, np.flatnonzero(np.diff(flags)) + 1).astype(np.int64)
+
 
 def read_frame_table(root: Path) -> FrameTable:
-    """Read phase and subgoals of every frame.
+    """Read phase, holds and subgoals of every frame.
 
     Raises:
         MemobenchError: the frames are not numbered 0, 1, 2, ... or an episode is not contiguous.
     """
-    table = _read_columns(root, [OBS_PHASE, MEMORY_COLUMN, *LEVEL_COLUMNS.values()])
+    table = _read_columns(root, [OBS_PHASE, HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()])
     there = set(table.column_names)
     return FrameTable(
         episodes=_episodes(root, table),
         phase=(_numbers(table, OBS_PHASE) if OBS_PHASE in there else np.ones(len(table))).astype(np.uint8),
+        held=_numbers(table, HELD_COLUMN).astype(np.bool_) if HELD_COLUMN in there else np.zeros(len(table), np.bool_),
         subgoals={level: _texts(table, name) for level, name in LEVEL_COLUMNS.items() if name in there},
         memory=_texts(table, MEMORY_COLUMN) if MEMORY_COLUMN in there else None,
     )
@@ -205,6 +217,8 @@ class FrameLookup:
     Attributes:
         episodes: (E + 1,) first frame of each episode.
         phase: (N,) 0 in the prompt.
+        acts: (N,) whether the action of a frame has an effect.
+        runs: first frames of the parts of episodes between holds, and of the holds, and N.
         texts: distinct subgoals.
         text_embeddings: (texts, d_t).
         memories: distinct oracle memory texts.
@@ -222,7 +236,8 @@ class FrameLookup:
         encoded: Mapping[str, Encoded] | None = None,
     ) -> None:
         self.root, self.stride = root, stride
-        self.episodes, self.phase = table.episodes, table.phase
+        self.episodes, self.phase, self.acts = table.episodes, table.phase, table.acts
+        self.runs = table.runs(table.held)
         self.texts, rows = numbered(table)
         self._subgoal_rows = {level: resolve_subgoals(found, table.episodes) for level, found in rows.items()}
         width = 0 if texts is None else texts.dim
@@ -253,6 +268,12 @@ class FrameLookup:
             )
         episode = int(np.searchsorted(self.episodes, index, "right")) - 1
         return episode, index - int(self.episodes[episode])
+
+    def run_of(self, index: int) -> tuple[int, int]:
+        """Return the bounds of the part of an episode between two holds, or of the hold, with a global index."""
+        self.locate(index)
+        following = int(np.searchsorted(self.runs, index, "right"))
+        return int(self.runs[following - 1]), int(self.runs[following])
 
     def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
         """Return the remembered features (n, P, D) of an episode's slots; slot k is its frame k * stride."""

@@ -39,8 +39,8 @@ FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
 }
-"""Mean frames of a demonstration, prompt included, in the full runs (results/demonstrations.md). Frames in
-which a robot idles are not counted: they take little time and room."""
+"""Mean frames of a demonstration, prompt included, in the full runs (results/demonstrations.md). Rest
+and held frames are not counted: they take little time and room."""
 FRAME_BYTES, IMAGES_BYTES = 800, 5_400
 """Bytes of a frame without images, and of both cameras' videos per frame at 256 × 256."""
 FRAME_SECONDS, IMAGES_SECONDS = 0.0045, 0.011

@@ -26,8 +26,9 @@ policy does not stop before it."""
 PERTURBATION = 4
 """Stream of the episode's random numbers that draws perturbations."""
 PATIENCE = 40
-"""Steps that an episode continues after the expert has finished its plan: falling or sliding objects, and formulas that
-must hold for some steps, may still reach the goal. Then it is given up, long before the horizon."""
+"""Steps, without held ones, that an episode continues after the expert has finished its plan: falling or sliding
+objects, and formulas that must hold for some steps, may still reach the goal. Then it is given up, long before the
+horizon."""
 
 Images = dict[str, NDArray[np.uint8]]
 """Camera to a frame, (H, W, 3)."""
@@ -70,13 +71,13 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
     """Record an episode without images; ``show`` is called with the images of each frame."""
     episode.reset(seed)
     sim, fixture_poses = episode.sim, episode.sim.fixture_poses()
-    states, proprio, objects, satisfied, actions, executed = [], [], [], [], [], []
+    states, proprio, objects, satisfied, actions, executed, held = [], [], [], [], [], [], []
     disturb = Perturbation(generator(episode.published, seed, PERTURBATION)) if settings.perturb else None
     reached = rests = False
-    held = idle = 0
+    after = idle = 0
     images: Images | None = None
-    while held < HOLD_FRAMES:
-        if not (rests and episode.idling):  # a scene at rest is observed once
+    while after < HOLD_FRAMES:
+        if not (episode.rested or (rests and episode.idling)):  # a scene at rest is observed once
             state, hand, seen = sim.state(), sim.proprio(), episode.objects()
             images = episode.images() if settings.images else None
         rests = episode.idling
@@ -84,14 +85,15 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
         proprio.append(hand)
         objects.append(seen)
         satisfied.append(episode.progress.satisfied)
+        held.append(episode.phase == EXECUTION and not episode.action_has_effect)
         if images is not None:
             show(images)
         reached = reached or episode.success
-        idle += episode.expert_done
+        idle += episode.expert_done and not held[-1]
         over = reached or episode.done or idle > PATIENCE
-        held += over
+        after += over
         wanted = episode.expert_action()
-        acting = disturb is not None and episode.phase == EXECUTION
+        acting = disturb is not None and episode.action_has_effect
         done = wanted
         if disturb is not None and acting and not over:
             done = disturb.executed(wanted, sim.at_detent)
@@ -117,6 +119,7 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
         fixture_poses=fixture_poses,
         scene_hash=episode.scene_hash,
         stand_ins=episode.stand_ins,
+        held=np.array(held) if any(held) else None,
     )
 
 

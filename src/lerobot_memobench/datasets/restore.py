@@ -229,7 +229,7 @@ def _read_states(
 def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
     """Raise if the frames are not in the order of their time, which may restart at the end of the prompt.
 
-    The end of the prompt is the start of the execution, or, if the robot idles before it, the first frame of idling.
+    The end of the prompt is the start of the execution, or, if the scene rests before it, the first frame of the rest.
     Only an evenly running time is checked: other programs leave zeros or other numbers there.
     """
     time = states[:, 0]

@@ -46,14 +46,16 @@ def measured(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def compute(folder: Path, names: Iterable[str]) -> dict[str, Stats]:
     """Compute the statistics of a dataset's features: exact for numbers, over LeRobot's sample of frames for images.
 
+    Held frames do not count for numbers: nothing is learned from them, and they may be most frames.
+
     Raises:
         MemobenchError: a column is missing or damaged.
     """
     features, chosen = read_info(folder)["features"], list(names)
     cameras = [name for name in chosen if features[name]["dtype"] in IMAGES]
     numbers = [name for name in chosen if name not in cameras]
-    columns = read_recorded(folder, numbers)[0] if numbers else {}
-    found = {name: numeric_stats(column.numpy()) for name, column in columns.items()}
+    columns, table = read_recorded(folder, numbers)
+    found = {name: numeric_stats(column.numpy()[~table.held]) for name, column in columns.items()}
     return found | {camera: _image_stats(folder, camera) for camera in cameras}
 
 

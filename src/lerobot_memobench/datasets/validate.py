@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels, persistent_rows
+from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, digest, labels, persistent_rows
 from lerobot_memobench.datasets.frames import FrameReader, frame_reader
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
@@ -45,7 +45,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import (
     Columns,
     EpisodePlace,
     RecordedEpisode,
-    check_idling,
+    check_revision,
     list_episodes,
     read_episode,
 )
@@ -61,7 +61,7 @@ from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 COMPARED = ("task_name", "seed", "referent", "variant", "success", "scene_hash", "digest")
 """Fields of an episode in the manifest that its record has too."""
@@ -222,7 +222,7 @@ def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Che
     places: Sequence[EpisodePlace] = ()
     with contextlib.suppress(MemobenchError):  # the check of each episode reports a damaged file
         places = list_episodes(folder)
-    check_idling(folder, places)
+    check_revision(folder, places)
     count = episode_count(folder)
     return [_Check(f"episode {k}", folder, False, partial(_replay_episode, folder, k, tasks)) for k in range(count)]
 
@@ -365,7 +365,7 @@ def replay(
         MemobenchError: there is no such task, or the actions were removed.
     """
     if isinstance(recorded, Demonstration):
-        task, start, wanted, executed = recorded.task, 0, recorded.actions, recorded.applied
+        task, start, wanted, executed, held = recorded.task, 0, recorded.actions, recorded.applied, recorded.held
         columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
     else:
         published = (task or get_task(recorded.task_name)).in_world(recorded.world)
@@ -374,14 +374,15 @@ def replay(
         if "action" not in columns:
             raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")
         wanted, executed = columns["action"], columns[EXECUTED_ACTION if EXECUTED_ACTION in columns else "action"]
+        held = columns.get(HELD_COLUMN)
     watch = _ImageCheck(recorded.exec_start, len(wanted), images)
-    again = resimulate(task, recorded.seed, executed, recorded.exec_start, watch)
+    again = resimulate(task, recorded.seed, executed, recorded.exec_start, watch, held)
     again = replace(again, referent=recorded.referent, variant=recorded.variant)
     if not np.array_equal(wanted, executed):
         again = replace(again, actions=wanted, executed=again.actions)
     found = _whole_difference(whole, _whole(again))
     if found is not None and found.column == "digest" and again.executed is not None:
-        found = replace(found, column="action (it alone is in the episode's hash and not in its states)")
+        found = replace(found, column="action or held (they alone are in the episode's hash and not in its states)")
     frames = np.arange(len(wanted))
     numbering = {
         "task": [task.language] * len(wanted),
@@ -431,12 +432,18 @@ def _unlike(drawn: NDArray[np.uint8], recorded: NDArray[np.uint8]) -> str:
 
 
 def resimulate(
-    task: Task, seed: int, actions: NDArray[np.float32], exec_start: int, watch: _ImageCheck | None = None
+    task: Task,
+    seed: int,
+    actions: NDArray[np.float32],
+    exec_start: int,
+    watch: _ImageCheck | None = None,
+    held: NDArray[np.bool_] | None = None,
 ) -> Demonstration:
     """Apply (T, 7) float32 actions in the scene of ``seed``; return the resulting demonstration without images.
 
     At the end of the prompt the scene returns to its start, except for hidden objects: at frame ``exec_start``, or at
-    the first idle frame, whose action is zeros. ``watch`` compares the images of each frame.
+    the first frame of the rest before it, whose action is zeros. ``watch`` compares the images of each frame; ``held``
+    (T,) are the frames after which nothing is simulated.
     """
     sim = Simulation(task, None if watch is None else watch.settings)
     sim.reset(seed)
@@ -446,13 +453,16 @@ def resimulate(
     states, proprio, satisfied = [], [], []
     objects: list[NDArray[np.float32]] = []
     success = False
-    rests = False
+    rests, strict = False, task.suite == STRICT
     for frame, action in enumerate(actions):
-        rested, rests = rests, task.idles and frame < exec_start and not action.any()
-        if frame > 0 and not rested and (rests or frame == exec_start):
+        rested, rests = rests, strict and frame < exec_start and not action.any()
+        rests = rests or (held is not None and bool(held[frame]))
+        if 0 < frame <= exec_start and not rested and (rests or frame == exec_start):
             sim.end_prompt(start, () if task.prompt is None else task.prompt.places)
         if frame > 0 and frame == exec_start:
             sim.begin_execution()
+        if frame == exec_start and strict:
+            progress.settle(sim.holds)
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
         if watch is not None:
             watch.compare(sim, frame)
@@ -463,8 +473,8 @@ def resimulate(
         success = success or progress.success
         if not rests:
             sim.step(action)
-        if frame >= exec_start:
-            progress.step(sim.holds)
+            if frame >= exec_start:
+                progress.step(sim.holds)
     return Demonstration(
         task=task,
         seed=seed,
@@ -480,6 +490,7 @@ def resimulate(
         fixture_poses=fixture_poses,
         scene_hash=scene_hash,
         objects=np.array(objects),
+        held=held,
     )
 
 

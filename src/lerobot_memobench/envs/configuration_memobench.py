@@ -164,7 +164,10 @@ class MemobenchEnvConfig(_WithSettings):
             settings = settings.changed(prompt_in=STEPS if policy is None else prompt_in(policy))
         if settings.replan_steps is None:
             settings = settings.changed(replan_steps=getattr(policy, "n_action_steps", None))
-        return settings
+        observed = getattr(policy, "n_obs_steps", 1)  # a hold must be longer than the policy's input
+        if getattr(policy, "temporal_ensemble_coeff", None) is not None:  # ACT averages the plans of so many steps
+            observed += policy.chunk_size - 1
+        return settings.changed(window_steps=max(settings.window_steps, observed))
 
     def opener(self, policy: Any, by: Acting, log_dir: Path) -> Opener:
         """Return a function that opens the vector environment of a task for a policy.

@@ -1,4 +1,4 @@
-"""An episode of one seed: settle the scene, play the prompt, idle, execute the policy's actions, track progress.
+"""An episode of one seed: settle the scene, play the prompt, execute the policy's actions, track progress.
 
 The gymnasium environment and the recorder of demonstrations share this class, so datasets and observations at
 evaluation agree.
@@ -24,8 +24,11 @@ from lerobot_memobench.protocol import (
     CAMERAS,
     ENDED,
     EXECUTION,
-    IDLE_STEPS,
+    HOLD_MEAN,
+    HOLD_SHAPE,
     IMAGE_SIZE,
+    LONGEST_HOLD,
+    MOST_HOLDS,
     NO_CLOCK,
     PROMPT,
     PROMPT_HORIZON,
@@ -47,6 +50,8 @@ from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import STRICT, Task, referent_text
 
+AS_BEGUN = Atom("asbegun", ())
+
 
 class Fault(NamedTuple):
     """Reason of an aborted execution: one of `tasks.failures.FAULTS`, and a sentence."""
@@ -61,8 +66,8 @@ class Episode:
     Args:
         task: the task of the catalogue.
         settings: settings of the environment. An episode uses ``referent``, ``demonstration_prompt``, ``horizon``,
-            ``protocol``, ``render``, ``pause_steps``, ``speed``, ``replan_steps``, ``corrupt_step``, ``reshow`` and
-            ``interference``. Without the demonstration prompt, objects that it hides are hidden before the first frame.
+            ``protocol``, ``render``, ``corrupt_step``, ``reshow``, ``interference`` and those of `Pacing`. Without the
+            demonstration prompt, objects that it hides are hidden before the first frame.
         render: size and quality of frames; None for those of ``settings``.
         changes: settings by name that replace those of ``settings``.
 
@@ -72,7 +77,7 @@ class Episode:
         exec_start: first frame of the execution; None before it.
         progress: checkpoints and goal, in execution steps.
         applied_action: action (7,) float32 executed in the last step.
-        rested: whether the last step was part of a pause: the scene was at rest and only the clock advanced.
+        rested: whether the last step was part of a pause or a hold: the scene was at rest and only the clock advanced.
         fault: reason of an aborted execution, or None.
         waits: whether other episodes are shown between prompt and execution.
         corrupts: whether the policy's memory is corrupted before the policy observes this frame. corrupted: whether it
@@ -125,6 +130,7 @@ class Episode:
         self.exec_start: int | None = None
         self.pacing = Pacing(self.settings, self._rng(4))
         self.rested = False
+        self._away, self._as_begun, self._holds = False, True, self._draw_holds()
         self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
         self.prompt_shown: bool | None = None
         self.drifted = False
@@ -140,10 +146,16 @@ class Episode:
             self._prompt = self._new_prompt()
         if not self.demonstration_prompt:
             self._hide_objects()
-        self._execution_step = first_execution_step(
-            self.published, self.seed, self.demonstration_prompt, self.settings.degree.idle_steps
-        )
+        self._execution_step = (self.published.prompt_steps or 0) if self.demonstration_prompt else 0
         self._begin_if_due()
+
+    def _draw_holds(self) -> Iterator[int]:
+        """Return the lengths of the episode's holds, which do not depend on the variant."""
+        rng = self._rng(5)
+        drawn = rng.gamma(HOLD_SHAPE, HOLD_MEAN / HOLD_SHAPE, MOST_HOLDS)
+        if self.published.prompt is None:
+            drawn[0] = rng.uniform(0, LONGEST_HOLD)
+        return iter(np.ceil(np.minimum(drawn, LONGEST_HOLD)).astype(int).tolist())
 
     def _new_prompt(self) -> Prompt:
         """Return the prompt from its beginning; the scene has to be in its initial state."""
@@ -164,7 +176,7 @@ class Episode:
             self._prompt.observed = False
 
     def _step_prompt(self) -> None:
-        """Play the next step of the prompt, or idle: then the scene rests and is not simulated."""
+        """Play the next step of the prompt; after its end the scene rests until the execution begins."""
         self.applied_action = np.zeros(ACTION_DIM, np.float32) if self._prompt is None else self._prompt.step()
         self.step_index += 1
         if self._prompt is not None and self._prompt.over:
@@ -198,11 +210,14 @@ class Episode:
         self.corrupts, self.corrupted = due, self.corrupted or due
 
     def _begin_if_due(self) -> None:
-        """Start the execution if prompt and idling have ended."""
+        """Start the execution if the prompt's time is over."""
         if self._prompt is not None or self.waits or self.step_index < self._execution_step:
             return
         self.sim.begin_execution()
         self.exec_start = self.step_index
+        if self.task.suite == STRICT:
+            self.progress.settle(self.sim.holds)  # the start counts as an arrival
+            self.pacing.hold(next(self._holds))
         self._corrupt_at(0)
         # A wrong atom that already holds, such as an object on the plate, is not a mistake of the policy.
         self._wrong_atoms = [atom for atom in _wrong_atoms(self.task) if not self.sim.holds(atom)]
@@ -214,34 +229,34 @@ class Episode:
 
     @property
     def idling(self) -> bool:
-        """Whether the robot idles: the prompt has ended, or the task has none, and the execution has not started."""
+        """Whether the prompt has ended and the execution has not started: strict prompts have a fixed length."""
         return self.phase == PROMPT and self._prompt is None and not self.waits
 
     @property
     def at_rest(self) -> bool:
-        """Whether the scene rests, while idling or in a pause."""
+        """Whether the scene rests, while idling, in a pause or in a hold."""
         return self.idling or self.rested
 
     @property
     def clock(self) -> int:
         """Value of ``step`` in observations: control steps since the phase began.
 
-        In the execution of a task that idles: `NO_CLOCK`, and `ENDED` once it has ended.
+        In the execution of a strict task: `NO_CLOCK`, and `ENDED` once it has ended.
         """
         if self.phase == PROMPT:
             return self.step_index
-        if self.task.idles:
+        if self.task.suite == STRICT:
             return ENDED if self.done else NO_CLOCK
         return self.step_index - (self.exec_start or 0)
 
     @property
     def action_has_effect(self) -> bool:
-        """Whether the next action is executed; actions during the prompt and in a pause are not."""
+        """Whether the next action is executed; actions in the prompt, in a pause and in a hold are not."""
         return self.phase == EXECUTION and self.pacing.action_has_effect
 
     @property
     def exec_steps(self) -> int:
-        """Execution steps so far, without pauses."""
+        """Execution steps so far, without pauses and holds."""
         return self.progress.steps
 
     @property
@@ -274,7 +289,7 @@ class Episode:
 
     @property
     def stand_ins(self) -> tuple[str, ...]:
-        """Object classes without scans on this machine, replaced by boxes in this scene."""
+        """Classes whose scans are missing on this machine; this package's objects replace them in this scene."""
         return self.sim.stand_ins
 
     def step(self, action: ArrayLike) -> None:
@@ -291,11 +306,26 @@ class Episode:
         self.step_index += 1
         if self.rested:
             return
+        self._hold_at_home()
         self.progress.step(self.sim.holds)
         self._corrupt_at(self.exec_steps)
         if self.choice is not None:
             self.choice.step(self.sim.holds)
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong_atoms)
+
+    def _hold_at_home(self) -> None:
+        """Begin a hold when the hand of a strict task has come home from somewhere else.
+
+        Also when it waits there until the scene is as it began: a mark that disappears by itself must not be
+        remembered across a hold.
+        """
+        if self.sim.caught_at_home:
+            as_begun = self.sim.holds(AS_BEGUN)
+            if self._away or (as_begun and not self._as_begun):
+                self.pacing.hold(next(self._holds, 0))
+            self._away, self._as_begun = False, as_begun
+        elif self.sim.is_away:
+            self._away = True
 
     def _act(self, action: ArrayLike) -> Fault | None:
         """Execute the policy's action; return the fault, if any."""
@@ -366,22 +396,6 @@ def referent_of(task: Task, seed: int) -> Task:
     position = (seed - first) % len(choices)
     order = generator(task, seed - position, 1).permutation(choices)
     return task.variant(int(order[position]))
-
-
-def first_execution_step(task: Task, seed: int, demonstration_prompt: bool, idle_steps: int = IDLE_STEPS) -> int:
-    """Return the first step of the execution in a seed's episode; 0 for a task that does not idle.
-
-    The seed draws the idling time independently of the variant.
-
-    Args:
-        task: the task of the catalogue, before a variant is drawn.
-        demonstration_prompt: whether the task's prompt is part of the episode.
-        idle_steps: maximum number of idle steps.
-    """
-    if not task.idles:
-        return 0
-    prompt = (task.prompt_steps or 0) if demonstration_prompt else 0
-    return prompt + int(generator(task, seed, 5).integers(idle_steps, endpoint=True))
 
 
 def generator(task: Task, seed: int, stream: int) -> np.random.Generator:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDic
 
 from annotated_types import Ge, Le
 
-from lerobot_memobench.envs.settings import GOALS, IDLE, MEMORY_CONTROLS, SCENE_HASHES
+from lerobot_memobench.envs.settings import GOALS, HOLD, MEMORY_CONTROLS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -120,9 +120,10 @@ class Outcome(TypedDict, total=False):
         referent: fixed, random, or drawn (strict tasks).
         variant: index of the task's variant; 0 is the published one.
         replan_steps: actions executed per prediction, if known.
-        prompt_steps: control steps before the execution: demonstration prompt and idling.
+        prompt_steps: control steps before the execution.
         steps: execution steps.
         paused_steps: control steps of pauses; only with pauses.
+        held_steps: control steps of holds; strict tasks only.
         corrupt: delete, swap or noise of the policy's memory; absent without.
         corrupt_step: execution step of the corruption; absent for 0, the end of the prompt.
         reshow: whether the prompt played a second time; absent without.
@@ -136,7 +137,7 @@ class Outcome(TypedDict, total=False):
         suite: ``strict``; absent for published tasks.
         difficulty: absent for the standard one.
         world: ``libero``; absent for the package's own scenes.
-        stand_ins: world ``libero``: classes without scans, replaced by boxes.
+        stand_ins: world ``libero``: classes whose missing scans this package's objects replaced.
         protocol: ``upstream``, the authors' evaluation; absent for the paper's.
         convention: of the pictures; absent for upright ones.
         lost: strict tasks: whether the goal became unreachable.
@@ -151,6 +152,7 @@ class Outcome(TypedDict, total=False):
     prompt_steps: Count | None
     steps: Count | None
     paused_steps: Whole
+    held_steps: Whole
     corrupt: Name
     corrupt_step: Count
     reshow: bool
@@ -241,6 +243,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         "failure": failure if fault is None else fault.failure,
         **({} if fault is None else {"fault": fault.why}),
         **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
+        **({} if task.suite == PUBLISHED else {"held_steps": episode.pacing.held_steps}),
         **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
         **({} if task.world == MEMOBENCH else {"world": task.world, "stand_ins": list(episode.stand_ins)}),
         **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),
@@ -498,12 +501,13 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, "world": MEMOBENCH, "difficulty": STANDARD, "protocol": BY_PAPER},
     "convention": UPRIGHT,
-    **{"pause_steps": 0, "speed": 1.0, "evidence": False, IDLE: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
+    **{"pause_steps": 0, "speed": 1.0, "evidence": False, HOLD: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
+    **{"window_steps": 1, "delay_steps": 0},
     **MEMORY_CONTROLS,
 }
 """Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
 steps per rendered picture, exists in earlier versions only."""
-OF_THE_POLICY = ("prompt_in", INPUTS)
+OF_THE_POLICY = ("prompt_in", "window_steps", "delay_steps", INPUTS)
 """Settings that follow from the policy. They may differ between compared evaluations, not between parts of one."""
 EXTENT = ("tasks", "episodes")
 """Extent of an evaluation. It may differ between compared evaluations, which use their common episodes."""

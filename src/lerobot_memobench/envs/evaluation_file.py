@@ -23,7 +23,7 @@ from lerobot_memobench.envs.episode_log import (
     Outcome,
     differences,
 )
-from lerobot_memobench.envs.settings import GOALS, IDLE, NOT_COMPARED, SCENE_HASHES, EnvSettings
+from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import LARGEST, Count, Name, Number, Whole, is_there, read_json, write_file
 
@@ -50,7 +50,7 @@ _FIELDS: dict[str, Any] = {
         for each in fields(EnvSettings)
         if each.name not in NOT_COMPARED
     },
-    **{IDLE: Count | None, GOALS: Count, SCENE_HASHES: Count, INPUTS: Name | None},
+    **{HOLD: Count | None, GOALS: Count, SCENE_HASHES: Count, INPUTS: Name | None},
 }
 Settings: Any = TypedDict("Settings", _FIELDS, total=False)  # type: ignore[misc]
 """Settings that must agree between two evaluations to be compared, as a file holds them."""

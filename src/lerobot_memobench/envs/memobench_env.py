@@ -69,8 +69,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and
     actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began, in the execution of a
-    strict task `NO_CLOCK` or `ENDED`; optionally ``expert_action`` (7,) and ``blind_action`` (7,). The robot of a
-    strict task idles before the execution, with ``phase`` 0.
+    strict task `NO_CLOCK` or `ENDED`; optionally ``expert_action`` (7,) and ``blind_action`` (7,). A strict task is
+    held at the start of the execution and after each return home (`Pacing.hold`); observations do not show it.
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
@@ -158,19 +158,14 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def _max_episode_steps(self) -> int:
-        """Upper bound of steps for LeRobot's loop: the horizon with pauses, prompt and idling."""
+        """Upper bound of steps for LeRobot's loop: the horizon with pauses, holds and prompt."""
         task = self._task
         if self.settings.prompt_in == RESET:
             return self._longest
         prompt = self.settings.demonstration_prompt and task.prompt is not None
         longest_prompt = PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
         prompts = longest_prompt * (1 + self.settings.reshow) if prompt else 0
-        return (
-            self._longest
-            + prompts
-            + self.settings.longest_interference
-            + (self.settings.degree.idle_steps if task.idles else 0)
-        )
+        return self._longest + prompts + self.settings.longest_interference
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -209,7 +204,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observation(), self._info()
 
     def _play_prompt(self) -> None:
-        """Play prompt and idling to their end; render them for a video only."""
+        """Play the prompt to its end; render it for a video only."""
         self._observer.needed = False
         if self._video is None:
             self.episode.skip_prompt_frames()

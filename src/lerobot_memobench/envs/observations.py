@@ -162,7 +162,7 @@ def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
         longest: maximum number of control steps of an execution.
     """
     reach = np.repeat(np.array([3.0, 2 * np.pi, 0.1], np.float32), (3, 3, 2))  # m, rad, m
-    longest += (1 + settings.reshow) * PROMPT_HORIZON + settings.degree.idle_steps + settings.longest_interference
+    longest += (1 + settings.reshow) * PROMPT_HORIZON + settings.longest_interference
     parts: dict[str, spaces.Space[Any]] = {
         "agent_pos": spaces.Box(-reach, reach, (PROPRIO_DIM,), np.float32),
         # LeRobot passes unknown numeric keys to the policy as `observation.<key>`. From these two, a policy with a

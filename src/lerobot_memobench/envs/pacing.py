@@ -1,10 +1,14 @@
-"""Pauses and slower actions during the execution. Both separate memory from a clock.
+"""Pauses, holds and slower actions during the execution. They separate memory from a clock.
 
-The environment asks the policy at every control step, also in a pause. Actions and observations stay the same; only
-their times change.
+The environment asks the policy at every control step, also in a pause or a hold. Actions and observations stay the
+same; only their times change.
 
 A pause starts and ends between two chunks of ``replan_steps`` actions, because losing part of a chunk would disturb the
 motion, not the sense of time. A lower speed stretches a chunk as a whole; actions received meanwhile have no effect.
+
+A hold begins when a strict task's hand comes home, and ends between two chunks. It is longer than a plan: the first
+plan that has an effect after it has observed home alone. So neither a chunk of actions nor a window of observations
+carries a fact past home.
 """
 
 from __future__ import annotations
@@ -13,9 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.settings import EnvSettings, steps_per_action
+from lerobot_memobench.protocol import LONGEST_HOLD, MOST_HOLDS
+from lerobot_memobench.tasks.task import STRICT
 
 STEPS_BETWEEN_PAUSES = (20, 120)
 """Smallest and largest number of execution steps between two pauses, drawn uniformly."""
+FEWEST_STEPS_AWAY = 2
+"""Smallest number of execution steps between two holds: an action moves the hand by at most 5 cm."""
 
 
 class Pacing:
@@ -23,12 +31,12 @@ class Pacing:
 
     Args:
         settings: uses ``pause_steps``; ``speed``: at 1/n an action takes n control steps, each with 1/n of its
-            displacement; ``replan_steps``: actions per prediction.
+            displacement; ``replan_steps``: actions per prediction; ``window_steps``; ``delay_steps``.
         rng: draws the start of each pause.
 
     Attributes:
         pauses: whether the settings contain pauses.
-        paused_steps: control steps of pauses so far.
+        paused_steps, held_steps: control steps of pauses and of holds so far.
     """
 
     def __init__(self, settings: EnvSettings, rng: np.random.Generator) -> None:
@@ -39,8 +47,9 @@ class Pacing:
         self._actions: list[NDArray[np.float32]] = []  # of the current chunk
         self._step = 0  # within the current chunk
         self._until_pause = self._gap()  # execution steps
-        self._rests = 0  # remaining steps of this pause
-        self.paused_steps = 0
+        self._rests = self._held = 0  # remaining steps of this pause, of this hold
+        self.paused_steps = self.held_steps = 0
+        self._shortest_hold = shortest_hold(settings)
 
     def _gap(self) -> int:
         return int(self._rng.integers(*STEPS_BETWEEN_PAUSES, endpoint=True)) if self.pauses else 0
@@ -48,13 +57,23 @@ class Pacing:
     @property
     def action_has_effect(self) -> bool:
         """Whether the next action is executed."""
-        return not self._rests and self._step < self._chunk
+        return not self._rests and not self._held and self._step < self._chunk
+
+    def hold(self, steps: int) -> None:
+        """Hold the scene for at least ``steps`` control steps, longer than a plan, until a chunk begins."""
+        steps = max(steps, self._shortest_hold)
+        self._held = steps + -(self._step + steps) % (self._chunk * self._stretch)
+        self._actions, self._step = [], 0
 
     def step(self, action: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        """Return the executed action (7,) for the policy's action (7,) in [−1, 1]; None in a pause."""
+        """Return the executed action (7,) for the policy's action (7,) in [−1, 1]; None in a pause or a hold."""
         if self._rests:
             self._rests -= 1
             self.paused_steps += 1
+            return None
+        if self._held:
+            self._held -= 1
+            self.held_steps += 1
             return None
         if self._step < self._chunk:
             self._actions.append(action)
@@ -69,10 +88,25 @@ class Pacing:
         return slowed
 
 
+def shortest_hold(settings: EnvSettings) -> int:
+    """Return the minimum number of control steps of a hold.
+
+    A plan of K actions that begins d steps after its observation, made from a window of W steps of which the last
+    before home is the first, acts until step W + d + K − 3 after the arrival.
+    """
+    length = (settings.replan_steps or 1) * steps_per_action(settings.speed)
+    return settings.window_steps + settings.delay_steps + length - 1
+
+
 def longest(settings: EnvSettings) -> int:
-    """Return the maximum number of control steps of an execution, including pauses."""
-    steps = settings.horizon * steps_per_action(settings.speed)
-    return steps + steps // STEPS_BETWEEN_PAUSES[0] * _whole_chunks(settings.pause_steps, settings.replan_steps or 1)
+    """Return the maximum number of control steps of an execution, including pauses and holds."""
+    steps, chunk = settings.horizon * steps_per_action(settings.speed), settings.replan_steps or 1
+    pauses = steps // STEPS_BETWEEN_PAUSES[0] * _whole_chunks(settings.pause_steps, chunk)
+    if settings.suite != STRICT:
+        return steps + pauses
+    shortest, round_up = shortest_hold(settings), chunk * steps_per_action(settings.speed)
+    drawn = MOST_HOLDS * (max(LONGEST_HOLD, shortest) + round_up)
+    return steps + pauses + drawn + steps // FEWEST_STEPS_AWAY * (shortest + round_up)
 
 
 def _whole_chunks(steps: int, chunk: int) -> int:

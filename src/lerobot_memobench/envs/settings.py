@@ -16,6 +16,7 @@ from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.protocol import (
     BY_PAPER,
     EVALUATION_SEED,
+    HOLD_MEAN,
     HORIZON,
     PROMPT_HORIZON,
     PROTOCOLS,
@@ -26,7 +27,7 @@ from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
-from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS, STRICT, SUITES, WORLDS, check_world
+from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS, STRICT, SUITES, WORLDS
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
@@ -53,9 +54,10 @@ CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0}
 """Settings of corruption and interference, with their values in the protocol."""
 
-IDLE, GOALS, STRICT_GOALS = "idle", "goals", 2
-"""Protocol keys of strict tasks: maximum idle steps before the execution, and revision of the goals. Goals of revision
-1 could be reached without memory, by marks in the scene and a clock."""
+HOLD, GOALS, STRICT_GOALS = "hold", "goals", 3
+"""Protocol keys of strict tasks: mean control steps of a hold, and revision of the goals. Goals of revision 1 could be
+reached without memory by marks in the scene and a clock, goals of revision 2 by a camera inside a drawer and by a plan
+that passes home."""
 SCENE_HASHES = "scene_hash_version"
 """Protocol key: version of the hash of scenes (`sim.scene_hash`)."""
 UPSTREAM_ONLY = {
@@ -87,7 +89,7 @@ class EnvSettings:
 
     suite: str = setting(PUBLISHED, "published tasks, or strict: 30 variants that need a memory", SUITES)
     world: str = setting(MEMOBENCH, "scenes of this package, or of the paper with LIBERO's assets", WORLDS)
-    difficulty: str = setting(STANDARD, "number of repetitions and idling time of strict tasks", DIFFICULTIES)
+    difficulty: str = setting(STANDARD, "number of repetitions in strict tasks", DIFFICULTIES)
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
     obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
@@ -101,7 +103,11 @@ class EnvSettings:
     demonstration_prompt: bool = setting(True, "object and procedural tasks start with their demonstration prompt")
     prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or in reset", PROMPT_IN)
     horizon: int = setting(HORIZON, "execution steps per episode; the default follows the difficulty", least=1)
-    replan_steps: int | None = setting(None, "actions executed per prediction; pauses start between chunks", least=1)
+    replan_steps: int | None = setting(
+        None, "actions executed per prediction; pauses start, and holds end, between chunks", least=1
+    )
+    window_steps: int = setting(1, "control steps of observations in an input of a policy without a memory", least=1)
+    delay_steps: int = setting(0, "control steps from an observation to the first action planned from it", least=0)
     render: str = setting("default", "fast has no shadows; high is for figures and ten times slower", QUALITIES)
     oracle_memory: bool = setting(False, "the instruction ends with the completed checkpoints (oracle memory control)")
     pause_steps: int = setting(0, "control steps of each pause, at moments drawn by the seed (pause control)", least=0)
@@ -128,7 +134,6 @@ class EnvSettings:
         if self.convention != UPRIGHT and self.obs_type == OBJECTS:
             raise MemobenchError(f"convention={self.convention} is of pictures, and obs_type={OBJECTS} has none")
         if self.suite == STRICT:
-            check_world(self.world, self.suite)
             self._set(referent=DRAWN, horizon=self.degree.horizon if self.horizon == HORIZON else self.horizon)
         elif self.difficulty != STANDARD:
             raise MemobenchError(
@@ -197,13 +202,13 @@ class EnvSettings:
 
     @property
     def degree(self) -> Degree:
-        """Repetitions, idling time and horizon of the difficulty."""
+        """Repetitions and horizon of the difficulty."""
         return degree_of(self.difficulty)
 
     @property
     def longest_interference(self) -> int:
         """Maximum number of control steps of the other episodes between prompt and execution."""
-        return self.interference * (PROMPT_HORIZON + self.degree.idle_steps + self.horizon + 2)
+        return self.interference * (PROMPT_HORIZON + self.horizon + 2)
 
     def changed(self, **changes: Any) -> EnvSettings:
         """Return a copy with changed values.
@@ -233,8 +238,8 @@ SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in N
 
 
 def revision(suite: str, difficulty: str) -> dict[str, int]:
-    """Return protocol entries of a suite that changed with versions: idling and goals of strict tasks."""
-    return {IDLE: degree_of(difficulty).idle_steps, GOALS: STRICT_GOALS} if suite == STRICT else {}
+    """Return protocol entries of a suite that changed with versions: holds and goals of strict tasks."""
+    return {HOLD: HOLD_MEAN, GOALS: STRICT_GOALS} if suite == STRICT else {}
 
 
 def steps_per_action(speed: float) -> int:

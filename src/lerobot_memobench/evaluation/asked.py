@@ -77,7 +77,8 @@ NOT_RUN = {"suite", "world", "difficulty"}
 """Settings that a line omits for their usual value even where its episode was not run."""
 REQUIRED: Mapping[str, tuple[str, Any]] = {
     **dict.fromkeys(("choice", "answered", "variants", "chance"), ("evidence", True)),
-    **{"lost": ("suite", STRICT), "stand_ins": ("world", LIBERO)},
+    **dict.fromkeys(("lost", "held_steps"), ("suite", STRICT)),
+    "stand_ins": ("world", LIBERO),
 }
 """Field that a line holds under one setting only -> that setting and its value."""
 

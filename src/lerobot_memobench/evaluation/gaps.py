@@ -7,7 +7,6 @@ from itertools import pairwise
 
 from lerobot_memobench.evaluation.metrics import Record
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.difficulty import STANDARD, degree_of
 from lerobot_memobench.tasks.gap import gaps
 
 EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
@@ -33,14 +32,9 @@ def _samples(record: Record) -> Iterator[tuple[int, bool]]:
     """Yield gap and success of the checkpoints that an episode came to; none for tasks without measured gaps."""
     if suite_of(record["task"]) is None:
         return
-    from lerobot_memobench.envs.episode import first_execution_step
-
     task = get_task(record["task"])
     for gap, checkpoint in zip(gaps(task), record["checkpoints"], strict=False):
         steps = 0 if gap is None else gap.median
-        if gap is not None and gap.idles and record.get("seed") is not None:
-            idle_steps = degree_of(record.get("difficulty", STANDARD)).idle_steps
-            steps += first_execution_step(task, record["seed"], False, idle_steps)
         reached = checkpoint.get("ordered_step") is not None
         yield steps, reached
         if not reached:

@@ -108,7 +108,6 @@ def inputs_of(run: Run) -> str:
 def _prompt(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]:
     if protocol.get("demonstration_prompt") is False:
         return ["no demonstration prompt"]
-    # A strict task without a prompt idles too; its prompt steps show no scene.
     if not any(record.get("prompt_steps") and record.get("prompt_shown", True) is not None for record in records):
         return []
     prompt_in = protocol.get("prompt_in")

@@ -130,14 +130,14 @@ def notes_on(records: Sequence[Record]) -> list[str]:
 
 
 def stand_ins_of(records: Iterable[Record]) -> list[str]:
-    """Return the classes whose scans were missing in any of the rollouts, so that boxes replaced them."""
+    """Return the classes whose missing scans this package's objects replaced in any of the rollouts."""
     return sorted({name for record in records for name in record.get("stand_ins", ())})
 
 
 def missing_scans(records: Iterable[Record]) -> list[str]:
-    """Return a sentence where boxes replaced scans."""
+    """Return a sentence where this package's objects replaced scans."""
     missing = ", ".join(stand_ins_of(records))
-    note = f"scans were missing, so boxes replaced {missing}: figures with and without them do not compare"
+    note = f"this package's objects replaced the missing scans {missing}: figures with and without them do not compare"
     return [note] if missing else []
 
 

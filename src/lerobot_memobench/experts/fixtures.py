@@ -42,9 +42,10 @@ from lerobot_memobench.sim.assets.asset import Articulation
 
 HANDLE_TILT = np.radians(35)
 """Downward tilt of the hand at a handle: the flange clears the table, rad."""
-WIDE_HANDLE_ROLL, WIDE_HANDLE_TILT = np.radians(40), np.radians(24)
-"""Roll and downward tilt of the hand at a bar that is longer than the open fingers, rad. With another tilt the hand
-would touch the table below the lowest drawer, or the handle above."""
+WIDE_HANDLE_ROLL, WIDE_HANDLE_TILT = np.radians(30), np.radians(27)
+"""Roll and downward tilt of the hand at a bar that is longer than the open fingers, rad. With more roll or less tilt
+the hand touches the table below the lowest drawer, stays above the bar and slips off; with more tilt it touches the
+handle above; with less roll the bar does not fit between the fingers."""
 DOWNWARD_REACH = 0.72
 """Distance from the arm's base up to which a downward hand moves freely, m."""
 DOOR_THICKNESS = 0.02

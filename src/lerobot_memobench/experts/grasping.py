@@ -94,6 +94,8 @@ FAR_SIDE_COST = 0.15
 them and move to the middle."""
 WIDE_GRASP = 0.068
 """Width from which a grasp is difficult, m."""
+TIGHT_GRASP, TIGHT_GRASP_SPEED = 0.074, 0.3
+"""Width from which a grasp leaves so little room that the hand descends slowly, m, and its speed there."""
 MAX_RIM_LEAN = np.radians(14)
 """Largest lean along a bowl's wall, rad."""
 MAX_RIGHTING_TILT = np.radians(35)
@@ -239,7 +241,7 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
     asset = hand.sim.assets[name]
     if not asset.grasps:
         raise MemobenchError(
-            f"the expert cannot hold {name!r}: class {asset.class_name} declares no grasp; add one in its builder"
+            f"the expert cannot hold {name!r}: class {asset.class_name} has no two opposite sides that fit the hand"
         )
     higher = _raised_grasps(asset)
     options = [] if attempt >= LOW_GRASP_ATTEMPTS else _options(hand, name, asset.grasps, avoid, place, reaching=False)
@@ -324,7 +326,13 @@ def pick(
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
         yield from hand.move(
-            way.at, way.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60, give_up=way.stall_check()
+            way.at,
+            way.turned,
+            OPEN,
+            tolerance=0.005,
+            speed=0.6 if way.grasp.width < TIGHT_GRASP else TIGHT_GRASP_SPEED,
+            timeout=60 if way.grasp.width < TIGHT_GRASP else 120,
+            give_up=way.stall_check(),
         )
         yield from hand.close(way.closing, hand.rotation)
         # After a miss retry at once, first at the same place. Otherwise policies would learn to lift an empty hand, or

@@ -36,6 +36,8 @@ HAND_HALF_WIDTH = 0.05
 PRESS_STEPS = 2
 """Steps of pushing against a joint's stop. Fewer than the six steps a policy executes per plan; otherwise a policy that
 cannot observe the contact would plan them repeatedly."""
+RELEASE_GAP, MAX_RELEASE_STEPS = 0.004, 6
+"""Increase of the finger opening at which an object is released, m, and largest number of steps waited for it."""
 
 FINGER_REACH = 0.0095
 """Length of the finger tips below the grip site, m."""
@@ -383,8 +385,16 @@ def release_fixture(hand: Hand, height: float = 0.12) -> Steps:
 
 
 def release_object(hand: Hand, up: float = 0.12) -> Steps:
-    """Move up while the fingers open: fully open inside a bowl they would press against its wall and lift it."""
+    """Move up while the fingers open: fully open inside a bowl they would press against its wall and lift it.
+
+    Before that the fingers leave the object: a rising pad hooks under the eaves of LIBERO's light milk carton.
+    """
+    grip = hand.sim.gripper_opening()
     yield from hand.open(3)
+    for _ in range(MAX_RELEASE_STEPS):
+        if hand.sim.gripper_opening() > grip + RELEASE_GAP:
+            break
+        yield from hand.open(1)
     target = hand.position + up * UP
     yield from hand.move(target, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, speed=0.7, timeout=60)
 

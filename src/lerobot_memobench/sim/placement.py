@@ -107,9 +107,11 @@ class Placer:
                 joints[articulation.joint] = articulation.open_q if opened else articulation.closed_q
         return joints
 
-    def place(self, seed: int) -> Placement:
-        """Sample the placement of a seed; see `draw`."""
-        return self.draw(np.random.default_rng([seed, zlib.crc32(self._task.scene_name.encode())]))
+    def place(self, seed: int, draw: int = 0) -> Placement:
+        """Sample a placement of a seed; see `draw`. Further ones have the numbers 1, 2, …"""
+        return self.draw(
+            np.random.default_rng([seed, zlib.crc32(self._task.scene_name.encode()), *([draw] if draw else [])])
+        )
 
     def draw(self, rng: np.random.Generator) -> Placement:
         """Draw until there is no overlap; write the placement into model and data, and return it.

@@ -16,6 +16,8 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING_SIGNS, make_controller
+from lerobot_memobench.sim.hiding import HiddenObject, HiddenObjects
+from lerobot_memobench.sim.placement import Placement
 from lerobot_memobench.sim.raster.drawlist import DrawList, Image
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
@@ -30,6 +32,10 @@ Array = NDArray[np.float64]
 
 MJCF_CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
 STABILISATION_STEPS = 10
+SETTLED_SHIFT, SETTLED_SPEED = 0.01, 0.02
+"""Largest horizontal shift of an object while a strict scene settles, m, and largest speed after it, m/s or rad/s."""
+MAX_SCENES = 200
+"""Maximum number of draws of a strict scene."""
 NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 """No motion, gripper open."""
 
@@ -73,6 +79,8 @@ class Snapshot:
     gripper: Array
     goes_on: bool
     """Whether the state continues its predecessor (`StartState.mark_step`)."""
+    hidden: tuple[HiddenObject, ...] = ()
+    """Objects outside the scene."""
 
 
 class Simulation:
@@ -101,7 +109,9 @@ class Simulation:
         kind = WORLDS[task.world]
         self.world = kind.predicates(task, self.model, self.data, scene.assets)
         self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
+        self._hidden = HiddenObjects(self.model, self.data)
         self._at_home: Snapshot | None = None
+        self.caught_at_home = False
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
         self._drawn: tuple[mujoco.MjModel, mujoco.MjData, DrawList | None] | None = None
@@ -119,17 +129,37 @@ class Simulation:
     def reset(self, seed: int, settling: Callable[[Callable[[Atom], bool]], None] | None = None) -> None:
         """Sample the initial state of a seed and run the stabilisation steps.
 
-        Equal seeds of equal tasks give bit-equal states, independent of earlier simulation.
+        Equal seeds of equal tasks give bit-equal states, independent of earlier simulation. A strict scene is drawn
+        again, from the seed and the number of the draw, while an object is thrown or still moves after these steps.
 
         Args:
             seed: seed of the scene.
             settling: called with `holds` after each stabilisation step.
+
+        Raises:
+            MemobenchError: each of `MAX_SCENES` draws of a strict scene has such an object.
         """
-        self._at_home = None
+        self._at_home, self.caught_at_home = None, False
+        self._hidden.absent = ()
+        for draw in range(MAX_SCENES):
+            placement = self._set_up(seed, draw, settling)
+            if not self._strict or self._has_settled(placement):
+                break
+        else:
+            raise MemobenchError(
+                f"task {self.task.name}: an object was thrown or moved in each of {MAX_SCENES} draws of the initial "
+                f"state of seed {seed}; move the regions of its :init apart"
+            )
+        self._start.mark_hand()
+        self._at_home = self.snapshot() if self._strict else None
+        self.begin_execution()
+
+    def _set_up(self, seed: int, draw: int, settling: Callable[[Callable[[Atom], bool]], None] | None) -> Placement:
+        """Set one draw of the initial state, run the stabilisation steps, and return the placement before them."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._arm_qpos] = robot.ARM_START
         self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
-        self._placer.place(seed)
+        placement = self._placer.place(seed, draw)
         self.highlights = ()
         mujoco.mj_step1(self.model, self.data)
         self._controller.reset(self.data)
@@ -139,9 +169,14 @@ class Simulation:
             self.step(NO_OP)
             if settling is not None:
                 settling(self.holds)
-        self._start.mark_hand()
-        self._at_home = self.snapshot() if self._strict else None
-        self.begin_execution()
+        return placement
+
+    def _has_settled(self, placement: Placement) -> bool:
+        """Return whether objects rest where they were placed, and nothing moves."""
+        others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
+        shifts = [self.data.body(name).xpos[:2] - placement.poses[name][:2] for name in self.task.objects]
+        moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
+        return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[others:]).max(initial=0.0)) <= SETTLED_SPEED
 
     def begin_execution(self) -> None:
         """Store the present state as the reference of the atoms in `SINCE_START`."""
@@ -164,12 +199,24 @@ class Simulation:
         self._controller.set_goal(self.data, action)
         self._controller.advance(self.data, float(action[6]), SUBSTEPS)
         self._check_physics(time)
+        if self._hidden.absent:
+            self._update_hidden()
         closing = action[6] > 0.0  # closing the hand leaves the detent
+        self.caught_at_home = False
         if self._at_home is not None and self._begun is not None and not closing and self._start.in_detent():
+            self.caught_at_home = True
             if self._start.nearly_as_begun():
                 self._put_back(self._begun)
             else:
                 self._put_back(self._at_home, arm_only=True)
+
+    def _update_hidden(self) -> None:
+        """Keep absent objects parked; put those whose drawer is ajar into it."""
+        ajar = [hidden.region for hidden in self._hidden.absent if self._start.left_dead_centre(hidden.region)]
+        revealed = self._hidden.reveal(ajar)
+        self._hidden.park()
+        mujoco.mj_step1(self.model, self.data)
+        self._start.mark_objects(revealed)
 
     def _check_physics(self, time: float) -> None:
         """Raise for MuJoCo's warnings; without the check it silently continues from the model's initial state."""
@@ -187,11 +234,15 @@ class Simulation:
         its earlier motion.
         """
         time, qpos, qvel = self.data.time, self.data.qpos.copy(), self.data.qvel.copy()
+        absent = self._hidden.absent
         self.restore(start)
         if arm_only:
+            self._hidden.absent = absent
             others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
             self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
             mujoco.mj_step1(self.model, self.data)
+        else:
+            self._start.mark_objects(hidden.name for hidden in self._hidden.absent)
         self.data.time = time
 
     # --- state ----------------------------------------------------------------------------------------------
@@ -252,7 +303,9 @@ class Simulation:
         mujoco.mj_getState(self.model, self.data, physics, self._full)
         controller = self._controller
         position, rotation = controller.goal_position.copy(), controller.goal_rotation.copy()
-        return Snapshot(physics, position, rotation, controller.gripper.copy(), self._start.goes_on)
+        return Snapshot(
+            physics, position, rotation, controller.gripper.copy(), self._start.goes_on, self._hidden.absent
+        )
 
     def restore(self, snapshot: Snapshot, *, replayed: bool = False) -> None:
         """Restore a snapshot of this simulation, bit for bit.
@@ -266,33 +319,25 @@ class Simulation:
         self._controller.goal_position = snapshot.goal_position.copy()
         self._controller.goal_rotation = snapshot.goal_rotation.copy()
         self._controller.gripper = snapshot.gripper.copy()
+        self._hidden.absent = snapshot.hidden
         mujoco.mj_step1(self.model, self.data)
 
     def end_prompt(self, start: Snapshot, hidden: Sequence[tuple[str, str]] = ()) -> None:
-        """Restore the state before a demonstration prompt, except for hidden objects, which rest in their drawers.
+        """Restore the state before a demonstration prompt, without the hidden objects.
 
-        Drawers and other objects are restored to the bit: a drawer with content settles a nanometre from an empty one,
-        and a displaced bottle would reveal the hand's path.
+        Drawers and other objects are restored bit for bit: a displaced bottle would reveal the hand's path. Hidden
+        objects are absent until their drawers are ajar (`sim.hiding`).
 
         Args:
             start: state before the prompt.
             hidden: pairs of object and region of the episode's variant; ``self.task`` is the published variant.
         """
         self.highlights = ()
-        offsets = [self.data.body(name).xpos - self._region_position(region) for name, region in hidden]
-        rotations = [self.data.body(name).xquat.copy() for name, _ in hidden]
+        absent = tuple(self._hidden.describe(name, region) for name, region in hidden)
         self.restore(start)
-        for (name, region), offset, quaternion in zip(hidden, offsets, rotations, strict=True):
-            joint = self.model.joint(int(self.model.body(name).jntadr[0]))
-            qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
-            self.data.qpos[qpos : qpos + 7] = np.concatenate([self._region_position(region) + offset, quaternion])
-            self.data.qvel[dof : dof + 6] = 0.0
+        self._hidden.absent = absent
+        self._hidden.park()
         mujoco.mj_step1(self.model, self.data)
-
-    def _region_position(self, place: str) -> Array:
-        """Return the present position (3,) of a drawer's region; zeros for a region of the table, which is fixed."""
-        site = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, place)
-        return self.data.site_xpos[site].copy() if site >= 0 else np.zeros(3)
 
     def scene_hash(self) -> str:
         """Return a short hash of the present state and the fixtures' poses."""
@@ -348,6 +393,11 @@ class Simulation:
     def home(self) -> tuple[Array, Array]:
         """Position (3,) and rotation (3, 3) of the grip site after the scene has settled."""
         return self._start.home
+
+    @property
+    def is_away(self) -> bool:
+        """Whether the hand is so far from home that it may have moved something."""
+        return self._start.is_away()
 
     @property
     def at_detent(self) -> bool:

@@ -6,7 +6,7 @@ predicates that compare the present state with the start of the execution.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import isnan
 from typing import Any
 
@@ -18,7 +18,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.assets.asset import Articulation, Asset
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
-from lerobot_memobench.sim.scene import DEAD_CENTRE
+from lerobot_memobench.sim.detents import DEAD_CENTRE
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
@@ -31,6 +31,9 @@ ON_SITE_BELOW, ON_SITE_ABOVE = 0.005, 0.10
 
 DETENT_DISTANCE = 0.02
 """Largest distance of the grip site from home for the detent, m; twice the error of learned policies."""
+AWAY_DISTANCE, AWAY_ANGLE = 0.05, 0.5
+"""Distance (m) and rotation (rad) of the hand from home beyond which it is away. Within both the arm is 2 cm or more
+from all fixtures and objects; within the distance alone a turned hand's wrist reaches knobs and drawers."""
 DETENT_ANGLE = 0.1
 """Largest rotation of the hand from home for the detent, rad."""
 DETENT_OPENING = 0.01
@@ -202,6 +205,8 @@ class StartState:
         self._previous: NDArray[np.float64] | None = None
         self._bodies = {name: int(model.body(name).id) for name in objects}
         self._joints = joints
+        self._places: dict[str, NDArray[np.float64]] = {}
+        self._turns: dict[str, NDArray[np.float64]] = {}
         self.mark_hand()
         self.mark_scene()
 
@@ -231,8 +236,13 @@ class StartState:
     def mark_scene(self) -> None:
         """Store the present state of the scene as the start of the execution."""
         self._start_state = self._current_state()
-        self._places = {name: self._data.xpos[body].copy() for name, body in self._bodies.items()}
-        self._turns = {name: self._data.xquat[body].copy() for name, body in self._bodies.items()}
+        self.mark_objects(self._bodies)
+
+    def mark_objects(self, names: Iterable[str]) -> None:
+        """Store the present poses of objects as their start."""
+        for name in names:
+            self._places[name] = self._data.xpos[self._bodies[name]].copy()
+            self._turns[name] = self._data.xquat[self._bodies[name]].copy()
 
     def holds(self, atom: Atom) -> bool:
         """Return whether an atom of `SINCE_START` is true now.
@@ -269,7 +279,11 @@ class StartState:
         joint, address = self._joints[name]
         q = float(self._data.qpos[address])
         open_or_on = q >= joint.on_at_least if joint.kind == "knob" else q < joint.open_below
-        return self._joint_shift(name) > DEAD_CENTRE[joint.kind] and not open_or_on
+        return self.left_dead_centre(name) and not open_or_on
+
+    def left_dead_centre(self, name: str) -> bool:
+        """Return whether a joint is farther from its start than its detent reaches."""
+        return self._joint_shift(name) > DEAD_CENTRE[self._joints[name][0].kind]
 
     def _shift(self, name: str) -> float:
         """Return the distance of an object from its start, m."""
@@ -293,15 +307,22 @@ class StartState:
         """Return whether the open hand is near home and at rest, so that the detent catches it."""
         return self.at_detent() and bool(np.all(self._speed() <= DETENT_SPEED))
 
+    def is_away(self) -> bool:
+        """Return whether the hand is so far from home that it may have moved something."""
+        distance, angle = self._from_home()
+        return distance > AWAY_DISTANCE or angle > AWAY_ANGLE
+
     def at_detent(self) -> bool:
         """Return whether the open hand is close enough to home for the detent, at any speed."""
-        position, rotation, opening = self._hand()
+        distance, angle = self._from_home()
+        near = distance <= DETENT_DISTANCE and angle <= DETENT_ANGLE
+        return near and bool(np.all(np.abs(self._hand()[2] - self._opening) <= DETENT_OPENING))
+
+    def _from_home(self) -> tuple[float, float]:
+        """Return the distance (m) and the rotation (rad) of the hand from home."""
+        position, rotation, _ = self._hand()
         cosine = (np.trace(self._rotation.T @ rotation) - 1.0) / 2.0
-        return bool(
-            np.linalg.norm(position - self._position) <= DETENT_DISTANCE
-            and np.arccos(np.clip(cosine, -1.0, 1.0)) <= DETENT_ANGLE
-            and np.all(np.abs(opening - self._opening) <= DETENT_OPENING)
-        )
+        return float(np.linalg.norm(position - self._position)), float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
     def _speed(self) -> NDArray[np.float64]:
         """Return the speed of the grip site (2,), m/s and rad/s."""

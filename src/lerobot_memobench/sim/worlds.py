@@ -29,8 +29,8 @@ CACHED_SCENES = 4
 class Places(Protocol):
     """Places fixtures and objects in a simulation."""
 
-    def place(self, seed: int) -> Placement:
-        """Sample the placement of a seed, write it into model and data, and return it."""
+    def place(self, seed: int, draw: int = 0) -> Placement:
+        """Sample a placement of a seed, write it into model and data, and return it."""
 
 
 Vector = NDArray[np.float64]

@@ -1,11 +1,11 @@
-"""Difficulties of strict tasks: how often an event is repeated, and how long the robot idles before the execution."""
+"""Difficulties of strict tasks: how often an event is repeated."""
 
 from __future__ import annotations
 
 from typing import Literal, NamedTuple, cast, get_args
 
 from lerobot_memobench.errors import check_choice
-from lerobot_memobench.protocol import HORIZON, IDLE_STEPS
+from lerobot_memobench.protocol import HORIZON
 
 Difficulty = Literal["easy", "standard", "hard", "extreme"]
 DIFFICULTIES: tuple[Difficulty, ...] = get_args(Difficulty)
@@ -18,11 +18,9 @@ class Degree(NamedTuple):
 
     Attributes:
         most: largest number of repetitions that a counting task asks for.
-        idle_steps: maximum number of control steps that the robot idles before the execution.
     """
 
     most: int
-    idle_steps: int
 
     @property
     def horizon(self) -> int:
@@ -31,15 +29,15 @@ class Degree(NamedTuple):
 
 
 DEGREES: dict[Difficulty, Degree] = {
-    "easy": Degree(2, IDLE_STEPS // 2),
-    "standard": Degree(3, IDLE_STEPS),
-    "hard": Degree(5, 2 * IDLE_STEPS),
-    "extreme": Degree(8, 4 * IDLE_STEPS),
+    "easy": Degree(2),
+    "standard": Degree(3),
+    "hard": Degree(5),
+    "extreme": Degree(8),
 }
 
 
 def degree_of(difficulty: str) -> Degree:
-    """Return the repetitions and idling of a difficulty; raise `MemobenchError` if it is unknown."""
+    """Return the repetitions of a difficulty; raise `MemobenchError` if it is unknown."""
     check_choice("difficulty", difficulty, DIFFICULTIES)
     return DEGREES[cast("Difficulty", difficulty)]
 

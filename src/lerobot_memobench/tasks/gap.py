@@ -10,24 +10,24 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 GAPS_FILE = Path(__file__).with_name("gaps.json")
 
 
 class Gap(NamedTuple):
-    """Gap of a checkpoint in control steps over the expert's episodes, without the idling that a seed draws.
+    """Gap of a checkpoint in control steps over the expert's episodes, without holds.
 
-    ``idles``: whether the idling time of the episode, 0 to `protocol.IDLE_STEPS`, lies between cue and use.
+    ``held``: whether the first hold of the execution lies between cue and use.
     """
 
     least: int
     median: int
     most: int
-    idles: bool
+    held: bool
 
     def __str__(self) -> str:
-        return f"{self.median} + idling" if self.idles else str(self.median)
+        return f"{self.median} + hold" if self.held else str(self.median)
 
 
 def cue_in_prompt(task: Task, checkpoint: int) -> bool:
@@ -42,15 +42,15 @@ def gaps(task: Task) -> tuple[Gap | None, ...]:
     """Return the gap of each checkpoint, () for a task that was not measured; None: nothing has to be remembered."""
     found: list[Gap | None] = []
     for k, row in enumerate(_measured().get(task.name, [])):
-        idles = task.idles and cue_in_prompt(task, k)
-        found.append(None if row is None else Gap(row[0], row[1], row[2], idles))
+        held = task.suite == STRICT and cue_in_prompt(task, k)
+        found.append(None if row is None else Gap(row[0], row[1], row[2], held))
     return tuple(found)
 
 
 def longest_gap(task: Task) -> Gap | None:
     """Return the largest median gap of a task's checkpoints; None for a task without one or not measured."""
     found = [gap for gap in gaps(task) if gap is not None]
-    return max(found, key=lambda gap: (gap.idles, gap.median), default=None)
+    return max(found, key=lambda gap: (gap.held, gap.median), default=None)
 
 
 @cache

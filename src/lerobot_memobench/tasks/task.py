@@ -51,20 +51,6 @@ def referent_text(requested: str, drawn: bool) -> str:
     return DRAWN if drawn else requested
 
 
-def check_world(world: str, suite: str) -> None:
-    """Check that a world exists and supports a suite.
-
-    Raises:
-        MemobenchError: the world is unknown or does not support the suite.
-    """
-    check_choice("world", world, WORLDS)
-    if (suite, world) == (STRICT, LIBERO):
-        raise MemobenchError(
-            f"world={LIBERO} does not support suite={STRICT}: only world={MEMOBENCH} has the detents and sealed "
-            "drawers of strict tasks; leave one of the two out"
-        )
-
-
 @dataclass(frozen=True)
 class Checkpoint:
     """A memory checkpoint.
@@ -201,9 +187,9 @@ class Task:
         """Return the task in another world, with equal layout, instruction, goal and checkpoints.
 
         Raises:
-            MemobenchError: the world does not support the task's suite.
+            MemobenchError: the world is unknown.
         """
-        check_world(world, self.suite)
+        check_choice("world", world, WORLDS)
         published = self.published and self.published.in_world(world)
         return dataclasses.replace(self, world=world, published=published)
 
@@ -222,14 +208,9 @@ class Task:
         return self.name.replace("_", " ") if any(variant.language for variant in self.variants) else self.language
 
     @property
-    def idles(self) -> bool:
-        """Whether the robot idles before the execution, so that its start time carries no information."""
-        return self.suite == STRICT
-
-    @property
     def prompt_steps(self) -> int | None:
         """Fixed number of control steps of the prompt; None for a variable length."""
-        if not self.idles:
+        if self.suite != STRICT:
             return None
         if self.prompt is None:
             return 0

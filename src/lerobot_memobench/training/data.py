@@ -29,7 +29,7 @@ from lerobot_memobench.datasets.frames import (
     read_recorded,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, read_info, without_pattern
-from lerobot_memobench.datasets.lerobot_format.reading import check_idling
+from lerobot_memobench.datasets.lerobot_format.reading import check_revision
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
@@ -48,7 +48,7 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
 )
 from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
 from lerobot_memobench.policies.memobench_mem.targets import with_targets
-from lerobot_memobench.protocol import OBS_PHASE, PROMPT
+from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
 from lerobot_memobench.training.sampler import seed_of
 
@@ -81,9 +81,10 @@ class Training:
     def samples(self, dataset: LeRobotDataset | None = None) -> Dataset[dict[str, Any]]:
         """Return the samples of a part of the dataset by their global indices; None: of the episodes to train on."""
         dataset = dataset or self.dataset
+        chunk = self.policy.config.action_delta_indices
         if not self.lookup.columns:
-            return DecodedSamples(dataset, self.seed)
-        return RecordedSamples(self.lookup, dataset.meta.tasks.index.tolist(), self.policy.config.action_delta_indices)
+            return DecodedSamples(dataset, self.lookup, chunk, self.seed)
+        return RecordedSamples(self.lookup, dataset.meta.tasks.index.tolist(), chunk)
 
 
 def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
@@ -131,7 +132,7 @@ def check_dataset_version(meta: LeRobotDatasetMetadata) -> None:
     """Refuse a dataset that an earlier version of the benchmark made."""
     check_clock(meta.features, meta.root)
     if EPISODE_INFO in meta.features:
-        check_idling(Path(meta.root))
+        check_revision(Path(meta.root))
 
 
 def check_episodes(episodes: Sequence[int] | None, meta: LeRobotDatasetMetadata) -> None:
@@ -246,6 +247,8 @@ def text_encoder(config: MemobenchMemConfig) -> TextEncoder:
 class RecordedSamples(Dataset[dict[str, Any]]):
     """LeRobot's samples by their global indices, from columns in main memory, without pictures.
 
+    Chunks end at a hold as at the end of an episode.
+
     Args:
         chunk: steps of a sample's actions, relative to its frame.
     """
@@ -255,8 +258,7 @@ class RecordedSamples(Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         lookup = self._lookup
-        episode, _ = lookup.locate(index)
-        first, end = lookup.episodes[episode : episode + 2].tolist()
+        first, end = lookup.run_of(index)
         found: dict[str, Any] = {name: column[index] for name, column in lookup.columns.items()}
         wanted = index + self._chunk
         found[ACTION] = lookup.columns[ACTION][wanted.clamp(first, end - 1)]
@@ -265,19 +267,21 @@ class RecordedSamples(Dataset[dict[str, Any]]):
 
 
 class DecodedSamples(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their global indices, pictures included.
+    """LeRobot's samples by their global indices, pictures included; actions of a chunk after a hold are padding.
 
     With the number of a draw (`FrameSampler.numbered`) an augmentation depends on it and the seed alone.
     """
 
-    def __init__(self, dataset: LeRobotDataset, seed: int) -> None:
+    def __init__(self, dataset: LeRobotDataset, lookup: FrameLookup, chunk: Sequence[int], seed: int) -> None:
         self._dataset, self._seed, self._row = dataset, seed, dataset.absolute_to_relative_idx
+        self._lookup, self._chunk = lookup, torch.tensor([*chunk])
 
     def __getitem__(self, drawn: int | tuple[int, int]) -> dict[str, Any]:
         index, number = drawn if isinstance(drawn, tuple) else (drawn, 0)
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed_of(self._seed, number, 0, 0))
             found: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
+        found[f"{ACTION}_is_pad"] |= index + self._chunk >= self._lookup.run_of(index)[1]
         return found
 
 
@@ -324,7 +328,7 @@ def make_processors(config: TrainPipelineConfig, meta: LeRobotDatasetMetadata, l
 def execution_statistics(
     config: MemobenchMemConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup
 ) -> dict[str, dict[str, Any]]:
-    """Return the statistics of states and actions over execution frames; {} if LeRobot makes the samples.
+    """Return the statistics of states and actions over frames to learn from; {} if LeRobot makes the samples.
 
     Statistics of relative actions depend on the chunk and are the dataset's.
 
@@ -334,8 +338,7 @@ def execution_statistics(
     if not lookup.columns:
         return {}
     columns = {name: lookup.columns[name].numpy() for name in (OBS_STATE, ACTION)}
-    executed = lookup.phase != PROMPT
-    found = {name: get_feature_stats(one[executed], axis=0, keepdims=False) for name, one in columns.items()}
+    found = {name: get_feature_stats(one[lookup.acts], axis=0, keepdims=False) for name, one in columns.items()}
     if config.use_relative_actions:
         found[ACTION] = dict(meta.stats[ACTION])
         if np.allclose(found[ACTION]["mean"], columns[ACTION].mean(axis=0), atol=1e-4):

@@ -276,7 +276,7 @@ def make_sampler(config: TrainPipelineConfig, training: Training) -> FrameSample
     tasks = None if weights is None else task_weights(dataset.meta, lookup.episodes, lookup.phase, weights)
     return frame_sampler(
         lookup.episodes,
-        lookup.phase,
+        lookup.acts,
         dataset.episodes,
         together=policy.frames_per_episode,
         tasks=tasks,
@@ -309,13 +309,13 @@ def make_loader(
 
 
 def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> DataLoader[Any]:
-    """Return batches of the execution frames of held-out episodes.
+    """Return batches of the frames to learn from of held-out episodes.
 
     There are at most ``max_eval_samples``, at equal distances in the episodes of each task.
     """
     dataset, lookup = training.held_out, training.lookup
     assert dataset is not None
-    frames = frame_sampler(lookup.episodes, lookup.phase, dataset.episodes).frames.tolist()
+    frames = frame_sampler(lookup.episodes, lookup.acts, dataset.episodes).frames.tolist()
     if config.max_eval_samples > 0:
         tasks, rows = dataset.hf_dataset.data.column("task_index").to_pylist(), dataset.absolute_to_relative_idx
         of_task: dict[int, list[int]] = {}

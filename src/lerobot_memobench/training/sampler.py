@@ -1,10 +1,10 @@
-"""Draw the frames of a training: execution frames, several of an episode in a row, tasks by their weights."""
+"""Draw the frames of a training: those whose action has an effect, several of an episode in a row, tasks by weight."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ class FrameSampler:
     Without groups and weights the order is that of LeRobot's sampler.
 
     Args:
-        starts: (E,) first execution frame of each episode. ends: (E,) the frame after its last one.
+        parts: for each episode its frames to draw.
         together: frames of an episode in a row.
         tasks: (E,) number of each episode's task, with ``weights``; None: each frame is drawn once per epoch.
         weights: (T,) weight of each task. An epoch has as many frames as without weights.
@@ -35,8 +35,7 @@ class FrameSampler:
         numbered: whether it yields pairs of a frame and its number among all draws.
     """
 
-    starts: np.ndarray
-    ends: np.ndarray
+    parts: Sequence[np.ndarray]
     together: int = 1
     tasks: np.ndarray | None = None
     weights: np.ndarray | None = None
@@ -46,12 +45,11 @@ class FrameSampler:
     numbered: bool = False
 
     def __post_init__(self) -> None:
-        drawn = self.starts < self.ends
-        if not drawn.any():
+        lengths = np.array([len(part) for part in self.parts], dtype=np.int64)
+        if not lengths.any():
             raise MemobenchError("no episode has an execution frame; name a dataset of `memobench generate`")
-        self.starts, self.ends = self.starts[drawn], self.ends[drawn]
-        self.tasks = None if self.tasks is None else self.tasks[drawn]
-        self.frames = np.concatenate(list(map(np.arange, self.starts, self.ends)))
+        self.tasks = None if self.tasks is None else self.tasks[lengths > 0]
+        self.frames, self.ends = np.concatenate(self.parts), np.cumsum(lengths[lengths > 0])
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -65,11 +63,10 @@ class FrameSampler:
     def order(self, epoch: int) -> Tensor:
         """Return an epoch's order of the entries of ``frames``."""
         generator = torch.Generator().manual_seed(seed_of(self.seed, epoch, dtype=np.uint64))
-        ends = np.cumsum(self.ends - self.starts)
         if self.tasks is not None and self.weights is not None:
-            return weighted_order(ends, self.tasks, self.weights, self.together, generator)
+            return weighted_order(self.ends, self.tasks, self.weights, self.together, generator)
         if self.together > 1:
-            return grouped_order(ends, self.together, generator)
+            return grouped_order(self.ends, self.together, generator)
         return torch.randperm(len(self), generator=generator)
 
     def go_on(self, step: int, batch_size: int, processes: int) -> None:
@@ -121,20 +118,9 @@ def weighted_order(
     return (first[episode] + offset)[:count]
 
 
-def execution_starts(episodes: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """Return the first execution frame of each episode (E,); an episode without execution gives its end.
-
-    Args:
-        episodes: (E + 1,) first frame of each episode, and the number of frames N. phase: (N,) 0 in the prompt.
-    """
-    acting = np.append(np.flatnonzero(phase != PROMPT), episodes[-1])
-    found: np.ndarray = np.minimum(acting[acting.searchsorted(episodes[:-1])], episodes[1:])
-    return found
-
-
 def frame_sampler(
     episodes: np.ndarray,
-    phase: np.ndarray,
+    acts: np.ndarray,
     used: Collection[int] | None,
     *,
     together: int = 1,
@@ -142,17 +128,17 @@ def frame_sampler(
     seed: int = 0,
     numbered: bool = False,
 ) -> FrameSampler:
-    """Return the sampler of a dataset's execution frames.
+    """Return the sampler of a dataset's frames to learn from.
 
     Args:
-        episodes: (E + 1,) first frame of each episode, and N. phase: (N,) 0 in the prompt.
+        episodes: (E + 1,) first frame of each episode, and N. acts: (N,) whether a frame is one of them.
         used: the episodes to draw; None: all.
         tasks: result of `task_weights`. numbered: as of `FrameSampler`.
     """
-    chosen = np.arange(len(episodes) - 1) if used is None else np.array(sorted(used), dtype=np.int64)
-    starts = execution_starts(episodes, phase)[chosen]
+    chosen = range(len(episodes) - 1) if used is None else sorted(used)
+    parts = [episodes[k] + np.flatnonzero(acts[episodes[k] : episodes[k + 1]]) for k in chosen]
     numbers, weights = (None, None) if tasks is None else (tasks[0][chosen], tasks[1])
-    return FrameSampler(starts, episodes[1:][chosen], together, numbers, weights, seed, numbered=numbered)
+    return FrameSampler(parts, together, numbers, weights, seed, numbered=numbered)
 
 
 def task_weights(

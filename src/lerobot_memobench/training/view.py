@@ -1,8 +1,9 @@
-"""Write a view of a dataset for LeRobot's trainer: without prompt frames, and with the columns of chosen inputs.
+"""Write a view of a dataset for LeRobot's trainer: without prompt and held frames, and with columns of chosen inputs.
 
-LeRobot trains on all frames, including those of demonstration prompts, in which actions have no effect. It uses every
-column that begins with ``observation`` as an input: pictures, object state, phase and step. A view is a LeRobotDataset
-v3.0 with a part of the frames and columns; its videos are links to the dataset's.
+LeRobot trains on all frames, including those of demonstration prompts and holds, in which actions have no effect. It
+uses every column that begins with ``observation`` as an input: pictures, object state, phase and step. A view is a
+LeRobotDataset v3.0 with a part of the frames and columns; its videos are links to the dataset's. Each part of an
+episode between two holds is an episode of the view, so that chunks of actions and windows of inputs end at a hold.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +26,7 @@ from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS
-from lerobot_memobench.datasets.frames import read_frame_table
+from lerobot_memobench.datasets.frames import FrameTable, read_frame_table
 from lerobot_memobench.datasets.lerobot_format.layout import (
     INFO_FILE,
     LANGUAGE,
@@ -42,13 +43,15 @@ from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
-from lerobot_memobench.protocol import CLOCK, EXECUTION
+from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import LerobotArguments
 from lerobot_memobench.training.configuration import check_environment, read_config, with_features
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
 EPISODES_FOLDER = Path("meta") / "episodes"
+SOURCE_EPISODE = "source_episode_index"
+"""Column of a view's episodes: the dataset's episode of which each is a part."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Choice:
     """The frames and columns of a view.
 
     Attributes:
-        prompts: whether the view has the frames of demonstration prompts, and the clock.
+        prompts: whether the view has the frames of demonstration prompts and holds, and the clock.
         obs_type: `envs.observations.OBS_TYPES`; None: all observations.
     """
 
@@ -142,6 +145,10 @@ def viewed(
     if not (folder / INFO_FILE).is_file():
         write_view(root, folder, choice)
     notify(f"LeRobot's trainer reads {folder}: {described(choice)}")
+    if given.episodes is not None:
+        sources = LeRobotDatasetMetadata(given.repo_id, root=folder).episodes[SOURCE_EPISODE]
+        chosen = [number for number, source in enumerate(sources) if source in given.episodes]
+        completed = completed.changed("dataset.episodes", json.dumps(chosen))
     return completed.changed("dataset.root", folder).changed("dataset.repo_id", given.repo_id)
 
 
@@ -187,7 +194,7 @@ def needs_view(features: Mapping[str, Any], choice: Choice) -> bool:
 
 def described(choice: Choice) -> str:
     """Return a view's content in words."""
-    frames = "all frames" if choice.prompts else "without the frames of prompts"
+    frames = "all frames" if choice.prompts else "without the frames of prompts and holds"
     return f"{frames}, {choice.obs_type or 'all observations'}"
 
 
@@ -195,8 +202,8 @@ def described(choice: Choice) -> str:
 
 
 def view_hash(root: Path, choice: Choice) -> str:
-    """Return a hash of a dataset's path, tables and metadata, and of the choice."""
-    digest = hashlib.blake2b(f"{root.resolve()} {choice}".encode(), digest_size=8)
+    """Return a hash of a dataset's path, tables and metadata, of the choice, and of the layout of views."""
+    digest = hashlib.blake2b(f"{root.resolve()} {choice} {SOURCE_EPISODE}".encode(), digest_size=8)
     for path in (*files_below(root / "meta"), *files_below(root / "data", ".parquet")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -212,24 +219,24 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
         raise MemobenchError(f"{out} exists already; name another folder, or delete it")
     info, table = read_info(root), read_frame_table(root)
     kept = choice.columns(info["features"])
-    wanted = np.ones(len(table.phase), dtype=bool)
-    if _is_ours(info["features"]) and not choice.prompts:
-        wanted = table.phase == EXECUTION
-    ends = np.concatenate([[0], np.cumsum(wanted)])[table.episodes]
-    left_out = np.diff(table.episodes) - np.diff(ends)
+    part = Part.of(table, _is_ours(info["features"]) and not choice.prompts)
+    if not part.starts.size:
+        raise MemobenchError(f"{root} has no frame whose action has an effect; name a dataset of `memobench generate`")
     build = out.with_name(f".{out.name}.{os.getpid()}")
     with explaining_disk_errors(out):
         shutil.rmtree(build, ignore_errors=True)
         for path in files_below(root / "data", ".parquet"):
             with undamaged(path):
                 rows = pq.read_table(path)
-            _write_table(_part_of(rows, kept, wanted, left_out, info["fps"]), build / path.relative_to(root))
+            _write_table(_frames_of(rows, kept, part, info["fps"]), build / path.relative_to(root))
         for path in files_below(root / EPISODES_FOLDER, ".parquet"):
             with undamaged(path):
                 rows = pq.read_table(path)
-            _write_table(_episodes_of(rows, ends, left_out / info["fps"]), build / path.relative_to(root))
+            _write_table(_episodes_of(rows, part, info["fps"]), build / path.relative_to(root))
         features = {new: info["features"][name] for name, new in kept.items()}
-        info |= {"features": features, "total_frames": int(ends[-1])}
+        count = len(part.starts)
+        info |= {"features": features, "total_episodes": count, "total_frames": int(part.lengths.sum())}
+        info["splits"] = {"train": f"0:{count}"}
         write_file(build / INFO_FILE, json.dumps(info, indent=4))
         stats = recorded(root)
         write_file(build / STATS_FILE, json.dumps({kept[name]: one for name, one in stats.items() if name in kept}))
@@ -240,26 +247,47 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
         build.rename(out)
 
 
-def _part_of(rows: pa.Table, kept: Mapping[str, str], wanted: np.ndarray, left_out: np.ndarray, fps: float) -> pa.Table:
-    """Return the view's rows and columns of a data file, with new numbers.
+class Part(NamedTuple):
+    """The frames of a view: S stretches of a dataset's E episodes, each of which is an episode of the view.
 
-    Args:
-        wanted: (N,) whether the view has each frame. left_out: (E,) omitted frames at the start of each episode.
+    Attributes:
+        starts: (S,) first frame of each stretch in the dataset. lengths: (S,) number of its frames.
+        firsts: (S,) first frame in the view.
+        sources: (S,) its episode in the dataset. offsets: (S,) frames of that episode before it.
     """
+
+    starts: np.ndarray
+    lengths: np.ndarray
+    firsts: np.ndarray
+    sources: np.ndarray
+    offsets: np.ndarray
+
+    @classmethod
+    def of(cls, table: FrameTable, shortened: bool) -> Part:
+        """Return all episodes, or if ``shortened`` the stretches of frames whose action has an effect."""
+        acts = table.acts if shortened else np.ones(len(table.phase), np.bool_)
+        edges = table.runs(acts)
+        starts, lengths = edges[:-1], np.diff(edges)
+        starts, lengths = starts[acts[starts]], lengths[acts[starts]]
+        sources = np.searchsorted(table.episodes, starts, "right") - 1
+        return cls(starts, lengths, np.cumsum(lengths) - lengths, sources, starts - table.episodes[sources])
+
+
+def _frames_of(rows: pa.Table, kept: Mapping[str, str], part: Part, fps: float) -> pa.Table:
+    """Return the view's rows and columns of a data file, with new numbers."""
     index = rows.column("index").to_numpy()
-    rows = rows.filter(pa.array(wanted[index])).replace_schema_metadata(None)
-    before = left_out[rows.column("episode_index").to_numpy()]
-    numbers = {
-        "index": (np.cumsum(wanted) - 1)[index[wanted[index]]],
-        "frame_index": rows.column("frame_index").to_numpy() - before,
-    }
-    numbers["timestamp"] = (numbers["frame_index"] / fps).astype(np.float32)
+    stretch = np.searchsorted(part.starts, index, "right") - 1
+    wanted = (stretch >= 0) & (index < (part.starts + part.lengths)[stretch])
+    rows, index, stretch = rows.filter(pa.array(wanted)).replace_schema_metadata(None), index[wanted], stretch[wanted]
+    within = index - part.starts[stretch]
+    numbers = {"index": part.firsts[stretch] + within, "episode_index": stretch, "frame_index": within}
+    numbers["timestamp"] = (within / fps).astype(np.float32)
     for name, values in numbers.items():
         place = rows.column_names.index(name)
         rows = rows.set_column(place, name, pa.array(values, rows.schema.field(name).type))
     if LANGUAGE in rows.column_names:
-        place = rows.column_names.index(LANGUAGE)
-        rows = rows.set_column(place, LANGUAGE, _earlier(rows.column(LANGUAGE).combine_chunks(), before / fps))
+        place, seconds = rows.column_names.index(LANGUAGE), part.offsets[stretch] / fps
+        rows = rows.set_column(place, LANGUAGE, _earlier(rows.column(LANGUAGE).combine_chunks(), seconds))
     there = [name for name in rows.column_names if name in kept]
     return rows.select(there).rename_columns([kept[name] for name in there])
 
@@ -274,21 +302,23 @@ def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
     return pa.ListArray.from_arrays(offsets, pa.StructArray.from_arrays(list(columns.values()), fields=list(rows.type)))
 
 
-def _episodes_of(rows: pa.Table, ends: np.ndarray, seconds: np.ndarray) -> pa.Table:
-    """Return the episodes' table with the bounds of the view's frames and later starts of the videos.
-
-    Args:
-        ends: (E + 1,) first frame of each episode in the view, and the number of frames. seconds: (E,) omitted.
-    """
+def _episodes_of(rows: pa.Table, part: Part, fps: float) -> pa.Table:
+    """Return the view's rows of a file of the episodes' table: numbers, bounds of frames, and times in the videos."""
     numbers = rows.column("episode_index").to_numpy()
+    stretches = np.flatnonzero(np.isin(part.sources, numbers))
+    rows = rows.take(pa.array(np.searchsorted(numbers, part.sources[stretches])))  # they are in the order of numbers
+    firsts, lengths = part.firsts[stretches], part.lengths[stretches]
     changed = {
-        "dataset_from_index": ends[numbers],
-        "dataset_to_index": ends[numbers + 1],
-        "length": ends[numbers + 1] - ends[numbers],
+        "episode_index": stretches,
+        "dataset_from_index": firsts,
+        "dataset_to_index": firsts + lengths,
+        "length": lengths,
     }
     for name in rows.column_names:
         if name.endswith("/from_timestamp"):
-            changed[name] = rows.column(name).to_numpy() + seconds[numbers]
+            changed[name] = rows.column(name).to_numpy() + part.offsets[stretches] / fps
+            changed[name.replace("/from_", "/to_")] = changed[name] + lengths / fps
+    rows = rows.append_column(SOURCE_EPISODE, rows.column("episode_index"))
     for name, values in changed.items():
         rows = rows.set_column(rows.column_names.index(name), name, pa.array(values, rows.schema.field(name).type))
     kept = [name for name in rows.column_names if not name.startswith("stats/")]

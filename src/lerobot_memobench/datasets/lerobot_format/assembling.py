@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
 from lerobot_memobench.datasets.lerobot_format.card import write_card
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
@@ -204,7 +204,7 @@ def _move(build: Path, out: Path) -> None:
 def _write_frames(
     meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], versions: Mapping[str, str] | None
 ) -> dict[str, Stats]:
-    """Write data/, states/, videos/ and the metadata; return exact statistics of all numbers.
+    """Write data/, states/, videos/ and the metadata; return exact statistics of numbers without held frames.
 
     Each episode is one row group, in files of LeRobot's size.
     """
@@ -231,7 +231,8 @@ def _write_frames(
         data.write(frames_table(columns, episode, meta.features))
         states.write(states_table(arrays["states"], number))
         # LeRobot does not normalise columns without statistics: phase and step reach a policy as in a rollout.
-        counted = {key: value for key, value in columns.items() if value.dtype.kind in "bif" and key not in CLOCK}
+        numeric = {key: value for key, value in columns.items() if value.dtype.kind in "bif" and key not in CLOCK}
+        counted = {key: value[~arrays[HELD_COLUMN]] for key, value in numeric.items()}
         for key, value in counted.items():
             numbers.setdefault(key, []).append(value)
         stats = {key: numeric_stats(value) for key, value in counted.items()} | _camera_statistics(episode)

@@ -61,8 +61,9 @@ COLUMNS = {
     "not use as an input; `memobench_mem` with `perception=objects` reads them, others with `lerobot train "
     "obs_type=both`",
     "executed_action": "the applied action; differs from `action` where the arm was perturbed (`generate --perturb`)",
-    "observation.phase": "0 demonstration prompt or idling (the policy does not act), 1 execution",
+    "observation.phase": "0 demonstration prompt and the rest after it (the policy does not act), 1 execution",
     "observation.step": "control steps since that phase began; -1 in the execution of strict tasks",
+    "held": "the scene of a strict task is held at home in the execution: the action, zeros, has no effect",
     "checkpoint.index": "number of checkpoints completed in order before this frame",
     "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
     "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",
@@ -229,7 +230,8 @@ from torch.utils.data import Subset
 from lerobot.datasets import LeRobotDataset
 
 dataset = LeRobotDataset({where})
-execution = Subset(dataset, [i for i, phase in enumerate(dataset.hf_dataset["observation.phase"]) if phase == 1])
+frames = zip(dataset.hf_dataset["observation.phase"], dataset.hf_dataset["held"])
+execution = Subset(dataset, [i for i, (phase, held) in enumerate(frames) if phase == 1 and not held])
 ```"""
 
 
@@ -243,8 +245,9 @@ def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]
         "policies: `lerobot_memobench`.",
         *_world(infos),
         loading,
-        "`execution` leaves out the frames of demonstration prompts, in which the policy does not act, as `lerobot "
-        "train` of `lerobot_memobench` does. To load one memory type, use `episode_filter=lambda episode: "
+        "`execution` leaves out the frames of demonstration prompts and held frames, in which the policy does not act, "
+        "as `lerobot train` of `lerobot_memobench` does; an action chunk ends where the next held frame begins. To "
+        "load one memory type, use `episode_filter=lambda episode: "
         'episode["memory_type"] == "spatial"`. Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to your own '
         "DataLoader, as `lerobot-train` does: the number of language rows differs between episodes.",
     ]
@@ -254,7 +257,7 @@ def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a paragraph on the world of the scenes, none for the package's own."""
     found = [info for info in infos if info.get("world") == LIBERO]
     missing = sorted({name for info in found for name in info.get("stand_ins") or ()})
-    stand_ins = f" Boxes replace missing scans: {', '.join(missing)}." if missing else ""
+    stand_ins = f" This package's objects replace missing scans: {', '.join(missing)}." if missing else ""
     return [f"The scenes are the paper's, of LIBERO's assets (`world={LIBERO}`).{stand_ins}"] if found else []
 
 
@@ -276,8 +279,8 @@ def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
         'memory_type="spatial")` with `from lerobot_memobench.datasets.lerobot_format.reading import episodes_where`):',
         markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
         "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
-        "numbers are exact over all frames, those of images over sampled frames. `observation.phase` and "
-        "`observation.step` have none, so that LeRobot does not normalise them and they are as in a rollout.",
+        "numbers are exact over all frames that are not held, those of images over sampled frames. `observation.phase` "
+        "and `observation.step` have none, so that LeRobot does not normalise them and they are as in a rollout.",
     ]
 
 
@@ -317,7 +320,7 @@ def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
 
 
 def _shows_scans(info: Mapping[str, Any]) -> bool:
-    """Return whether an episode's scene has a scan of the authors: each object of a spatial task is one or a box."""
+    """Return whether an episode's scene has a scan: each object of a spatial task is one or a stand-in."""
     name = info["task_name"]
     if info["memory_type"] != "spatial" or suite_of(name) is None:
         return False

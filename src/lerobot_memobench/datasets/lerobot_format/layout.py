@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from lerobot_memobench.datasets.demonstration import (
+    HELD_COLUMN,
     INSTRUCTION_COLUMN,
     LEVEL_COLUMNS,
     MAX_CHECKPOINTS,
@@ -153,6 +154,7 @@ def dataset_features(
         "action": feature("float32", (ACTION_DIM,), ACTION_NAMES),
         EXECUTED_ACTION: feature("float32", (ACTION_DIM,), ACTION_NAMES),
         **{name: feature("float32", names=[name.rpartition(".")[2]]) for name in CLOCK},
+        HELD_COLUMN: feature("bool", names=["action_has_no_effect"]),
         "checkpoint.index": feature("int64", names=["completed_in_order"]),
         "checkpoint.operation": feature("int64", names=["0_storage_1_update_2_compression_-1_none"]),
         "checkpoint.completed": feature("bool", (MAX_CHECKPOINTS,), completed),

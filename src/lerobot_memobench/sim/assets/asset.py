@@ -94,7 +94,6 @@ class Asset:
     ``round``: whether the outline from above is a circle about the origin.
     ``upright``: rotation from the asset's frame to the body's if another body axis than z points up; all values are in
     the asset's frame.
-    ``seals``: body -> centre and half size of the board that closes a drawer's gaps, in the body's frame [m].
     """
 
     name: str
@@ -112,9 +111,6 @@ class Asset:
     glow_off: tuple[float, float, float, float] = (0.34, 0.34, 0.35, 1.0)
     round: bool = False
     upright: Quaternion | None = None
-    seals: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = field(
-        default_factory=lambda: MappingProxyType({})
-    )
 
     @property
     def bottom(self) -> float:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
-from types import MappingProxyType
 
 import mujoco
 
@@ -37,9 +35,6 @@ _FLOOR = 0.003
 _WALL_HIGH = 0.050
 _INNER_FRONT = _FACE + _PANEL
 _INNER_BACK = _INNER_FRONT + 0.150
-_SEAL = 0.010
-"""Depth of the board that closes the gaps behind a front; it hides the content until the drawer is pulled by this depth
-plus the thickness of the front."""
 _DRAWER_HIGH = _OPENING - 0.003
 
 _HANDLE_LENGTH = 0.056
@@ -105,7 +100,7 @@ def _cabinet(b: Builder) -> Asset:
         b.collision("box", part.half, 0.8, part.centre)
     middle, depth = (_FRONT + _BACK) / 2, (_BACK - _FRONT) / 2
     regions = {"top_side": b.site("top_side", (0, middle, _HIGH - 0.001), (_HALF_X, depth, 0.001), box=True)}
-    articulations, seals = {}, {}
+    articulations = {}
     bodies = [b.body]
     for k, level in enumerate(LEVELS):
         drawer = b.child(f"{level}_drawer", (0, 0, _BOARD + k * _PITCH + 0.0015))
@@ -116,16 +111,13 @@ def _cabinet(b: Builder) -> Asset:
         _fill_drawer(b, drawer)
         regions[f"{level}_region"] = _inside(b, drawer, level)
         articulations[f"{level}_region"] = _articulation(b, drawer, level, joint)
-        middle_of_opening = (0.0, _INNER_FRONT + _SEAL / 2, _OPENING / 2 - 0.0015)
-        seals[drawer.name] = middle_of_opening, (_HALF_X - _SIDE + 0.0005, _SEAL / 2, _OPENING / 2 + 0.0005)
-    asset = b.fixture(
+    return b.fixture(
         low=(-_HALF_X, _FRONT - _HANDLE_OUT, 0),
         high=(_HALF_X, _BACK, _HIGH),
         regions=regions,
         articulations=articulations,
         clear=depth,
     )
-    return replace(asset, seals=MappingProxyType(seals))
 
 
 def _fill_drawer(b: Builder, drawer: mujoco.MjsBody) -> None:

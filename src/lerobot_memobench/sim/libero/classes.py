@@ -172,31 +172,6 @@ CLASSES: dict[str, LiberoClass] = {
     "flat_stove": LiberoClass("articulated_objects/flat_stove.xml", parts=(("", _KNOB),)),
 }
 
-SCANS: dict[str, tuple[float, float, float]] = {
-    "artichoke": (0.029, 0.029, 0.026),
-    "bag_of_snacks": (0.023, 0.048, 0.060),
-    "bean_curd": (0.025, 0.030, 0.018),
-    "beefsteak_tomato__1": (0.031, 0.031, 0.026),
-    "biscuit": (0.029, 0.029, 0.012),
-    "bottle_of_coffee": (0.029, 0.029, 0.069),
-    "bottle_of_detergent__1": (0.029, 0.044, 0.075),
-    "bottle_of_fabric_softener": (0.027, 0.038, 0.078),
-    "bottle_of_olive_oil__1": (0.027, 0.027, 0.086),
-    "bottle_of_protein_powder__2": (0.033, 0.033, 0.060),
-    "box_of_cereal__2": (0.021, 0.050, 0.072),
-    "box_of_flour": (0.028, 0.043, 0.066),
-    "box_of_oatmeal__3": (0.024, 0.048, 0.069),
-    "broccoli": (0.032, 0.032, 0.026),
-    "brussels_sprouts__2": (0.025, 0.025, 0.024),
-    "cap__2": (0.026, 0.026, 0.015),
-    "carton_of_milk__6": (0.031, 0.031, 0.079),
-    "charger": (0.044, 0.027, 0.019),
-    "chestnut__2": (0.020, 0.024, 0.018),
-    "cork__3": (0.019, 0.019, 0.026),
-}
-"""Classes scanned by the paper's authors -> half extents of the box that replaces a missing scan, m. They are those of
-this package's object of the class, z up."""
-
 
 def parts_of(class_name: str) -> tuple[tuple[str, Part], ...]:
     """Return the parts of a class; objects and scans have none."""

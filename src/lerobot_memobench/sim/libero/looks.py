@@ -25,6 +25,9 @@ Arrays = Mapping[str, NDArray[Any]]
 """Cached content of a file: a NumPy record, which loads in a third of the time of an archive."""
 CACHE_FORMAT = "7"
 """Version of the cache files; increase it with each change of their content."""
+MESH_SETTINGS = ("scale", "refpos", "refquat", "smoothnormal", "inertia")
+TEXTURE_SETTINGS = ("type", "hflip", "vflip", "nchannel", "gridsize", "gridlayout")
+"""Attributes of a file's mesh or texture on which cached content depends."""
 THIN_ABOVE, THIN_TO = 6000, 4000
 """Number of triangles above which meshes are simplified, and the target; an object covers a thousandth of an image."""
 MAX_THINNED_SIZE = 0.5
@@ -75,8 +78,9 @@ def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
 
 def _key(part: mujoco.MjsMesh | mujoco.MjsTexture) -> str:
     """Return the cache key of a mesh or texture, a hash of everything its content depends on."""
-    scale = part.scale.tolist() if isinstance(part, mujoco.MjsMesh) else LAYER_SIZE
-    facts = CACHE_FORMAT, mujoco.__version__, file_hash(Path(part.file)), scale
+    names = MESH_SETTINGS if isinstance(part, mujoco.MjsMesh) else TEXTURE_SETTINGS
+    settings = [np.asarray(getattr(part, name)).tolist() for name in names]
+    facts = CACHE_FORMAT, mujoco.__version__, LAYER_SIZE, file_hash(Path(part.file)), settings
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:24]
 
 
@@ -164,7 +168,7 @@ def _shape(kept: Arrays) -> Triangles:
 
 def _use_placeholder(mesh: mujoco.MjsMesh) -> None:
     faces = [corner for a, b, c, d in PLACEHOLDER_FACES for corner in (a, b, c, a, c, d)]
-    mesh.file, mesh.scale = "", [1.0, 1.0, 1.0]
+    mesh.file, mesh.scale, mesh.refpos, mesh.refquat = "", [1.0] * 3, [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
     mesh.uservert, mesh.userface = (0.01 * PLACEHOLDER_POINTS).ravel().tolist(), faces
 
 

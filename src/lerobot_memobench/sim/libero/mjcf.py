@@ -10,20 +10,28 @@ import copy
 import posixpath
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.io import file_name, refusing
+from lerobot_memobench.sim.assets.kitchen import TABLE
 from lerobot_memobench.sim.libero import files
-from lerobot_memobench.sim.libero.classes import CLASSES, SCANS, Turn
+from lerobot_memobench.sim.libero.classes import CLASSES, Turn
+from lerobot_memobench.tasks.task import STRICT
 
 ARENA = "scenes/libero_kitchen_tabletop_base_style.xml"
 SCAN_TURNS: tuple[Turn, ...] = (("x", np.pi / 2),)
 REFERENCES = ("mesh", "material", "texture")
 """Attributes that reference an asset."""
+USER_TAGS = ("mujoco", "asset", "mesh", "texture", "material", "worldbody", "body", "geom", "site")
+"""Elements of a user's object file."""
+SIZE_SITES = ("bottom_site", "top_site", "horizontal_radius_site")
+GUIDE = "docs/develop/add_an_object_class.md"
 
 
 @dataclass(frozen=True)
@@ -36,7 +44,7 @@ class ClassFile:
         radius: horizontal radius that must be free of other objects, m.
         bottom, top: heights of underside and top above the origin, m.
         turns: initial rotations, applied in order.
-        stand_in: whether a box replaces a missing scan.
+        stand_in: whether this package's object replaces a missing scan.
     """
 
     body: ET.Element
@@ -58,43 +66,94 @@ def is_visual(element: ET.Element) -> bool:
     return element.tag == "geom" and element.get("contype") == element.get("conaffinity") == "0"
 
 
-def class_file(class_name: str) -> ClassFile:
-    """Return the content of a class's files; a missing scan is replaced by a box.
+def class_file(class_name: str, suite: str) -> ClassFile:
+    """Return the content of a class's files: LIBERO's, this package's, the user's or a scan's.
+
+    Published tasks use the authors' scan if the user has it; strict tasks use this package's objects for all users.
 
     Raises:
         MemobenchError: the class is unknown in LIBERO's world, or its files are missing or have unexpected content.
     """
+    own = {folder.name: folder / f"{folder.name}.xml" for folder in files.OWN_OBJECTS.iterdir()}
+    given = files.user_objects({TABLE, *CLASSES, *own})
     if class_name in CLASSES:
-        return _libero_class(class_name, files.asset(CLASSES[class_name].mjcf))
-    path = files.scan(class_name)
-    if path is not None:
-        return _scanned_class(path)
-    if class_name not in SCANS:
-        raise MemobenchError(
-            f"the world 'libero' has no object of class {class_name!r}, and no size for a replacement box; "
-            f"set {files.SCANS_VARIABLE} to the authors' folder new_objects"
-        )
-    return _box(class_name)
+        known = CLASSES[class_name]
+        return _object_class(files.asset(known.mjcf), known.turns, posixpath.dirname(known.mjcf))
+    if file_name(class_name, "the class of an object") in given:
+        return _user_class(given[class_name])
+    scan = files.scan(class_name) if suite != STRICT else None
+    if scan is not None:
+        return _scanned_class(scan)
+    if class_name not in own:
+        near = nearest(class_name, {*CLASSES, *own, *given})
+        add = f"set {files.OBJECTS_VARIABLE} to a folder with {class_name}/{class_name}.xml, see {GUIDE}"
+        raise MemobenchError(f"the world 'libero' has no class {class_name!r} ({near}); to add it, {add}")
+    return replace(_object_class(own[class_name], SCAN_TURNS), stand_in=suite != STRICT)
 
 
 @cache
-def _libero_class(class_name: str, path: Path) -> ClassFile:
-    known = CLASSES[class_name]
+def _user_class(path: Path) -> ClassFile:
+    """Read a file of the user's folder after checking that it is complete and references its own folder only."""
+
+    def expect(holds: bool, found: str, expected: str) -> None:
+        if not holds:
+            raise MemobenchError(f"{path}: found {found}, expected {expected}; see {GUIDE}")
+
+    with refusing(lambda reason: MemobenchError(f"{path} is no object file ({reason}); see {GUIDE}")):
+        root, real = ET.parse(path).getroot(), path.resolve()
+        expect(real == path.parents[1].resolve() / path.parent.name / path.name, f"a link to {real}", "a file")
+        for element in root.iter():
+            expect(element.tag in USER_TAGS, f"the element <{element.tag}>", f"only {', '.join(USER_TAGS)}")
+            for name in element.attrib:
+                expect(name == "file" or not name.startswith("file"), f"the attribute {name!r}", "'file' only")
+        expect(all(one.get("name") for one in root.iterfind("asset/*")), "an asset without a name", "a name for each")
+        found = root.findall("worldbody/body/body[@name='object']//geom"), root.findall("worldbody/body")
+        whole = len(found[0]) == len(list(root.iter("geom"))) and len(found[1]) == 1
+        expect(whole, "another structure", "one body in <worldbody>, and in it a body 'object' with all geoms")
+        missing = {*SIZE_SITES} - {one.get("name", "") for one in root.iterfind("worldbody/body/site[@pos]")}
+        expect(
+            not missing, f"no pos of {', '.join(sorted(missing))}", f"sites {', '.join(SIZE_SITES)} in the outer body"
+        )
+        list(_assets(root, _inside(path)))
+        model = mujoco.MjSpec.from_file(str(path)).compile()
+        touching = (model.geom_contype | model.geom_conaffinity) > 0
+        expect(touching[model.geom_group == 0].any(), "no contact geom in group 0", "at least one")
+        known = _object_class(path, SCAN_TURNS)
+        heights = f"bottom_site at z={known.bottom:g} and top_site at z={known.top:g}"
+        expect(-np.inf < known.bottom < known.top < np.inf, heights, "bottom_site below top_site, m")
+        expect(0 < known.radius < np.inf, f"horizontal_radius_site at x={known.radius:g}", "a positive radius, m")
+    return known
+
+
+@cache
+def _object_class(path: Path, turns: tuple[Turn, ...], folder: str | None = None) -> ClassFile:
+    """Read a file in LIBERO's layout; its assets are verified if it is in ``folder`` below LIBERO's assets."""
     root = _read(path)
     outer = root.find("worldbody/body")
     body = outer.find("body[@name='object']") if outer is not None else None
     if outer is None or body is None:
         raise MemobenchError(f"{path} contains no body 'object'; expected an object file of LIBERO")
     place = {site.get("name"): parse_numbers(site.get("pos", "")) for site in outer.findall("site")}
-    folder = posixpath.dirname(known.mjcf)
     return ClassFile(
         body=_with_defaults_resolved(body, _defaults(root)),
-        assets=lambda: assets_of(root, folder),
+        assets=lambda: list(_assets(root, _inside(path))) if folder is None else assets_of(root, folder),
         radius=place["horizontal_radius_site"][0],
         bottom=place["bottom_site"][2],
         top=place["top_site"][2],
-        turns=known.turns,
+        turns=turns,
     )
+
+
+def _inside(path: Path) -> Callable[[str], Path]:
+    """Return a function that finds the files that ``path`` references in its folder."""
+
+    def inside(name: str) -> Path:
+        file = (path.parent / name).resolve()
+        if not file.is_relative_to(path.parent.resolve()) or not file.is_file():
+            raise MemobenchError(f"{path} references the file {name!r}, which is not in its folder")
+        return file
+
+    return inside
 
 
 @cache
@@ -107,15 +166,9 @@ def _scanned_class(path: Path) -> ClassFile:
         raise MemobenchError(f"the scan {path} lacks its body or its visuals/*.obj; download the scans again")
     vertices = np.array(points, dtype=np.float64)
 
-    def inside(name: str) -> Path:
-        file = (path.parent / name).resolve()
-        if not file.is_relative_to(path.parent.resolve()) or not file.is_file():
-            raise MemobenchError(f"the scan {path} references the file {name!r}, which is not in its folder")
-        return file
-
     return ClassFile(
         body=_with_defaults_resolved(body, _defaults(root)),
-        assets=lambda: list(_assets(root, inside)),
+        assets=lambda: list(_assets(root, _inside(path))),
         radius=float(np.abs(vertices[:, :2]).max()),
         bottom=float(vertices[:, 2].min()),
         top=float(vertices[:, 2].max()),
@@ -125,18 +178,6 @@ def _scanned_class(path: Path) -> ClassFile:
 
 def _vertex_lines(file: Path) -> Iterator[str]:
     return (line for line in file.read_text().splitlines() if line.startswith("v "))
-
-
-@cache
-def _box(class_name: str) -> ClassFile:
-    """Return a box with the size of this package's object of the class and the contacts of LIBERO's objects."""
-    half = SCANS[class_name]
-    body = ET.Element("body")
-    contact = {"density": "100", "friction": "0.95 0.3 0.1", "solref": "0.001 1", "solimp": "0.998 0.998 0.001"}
-    shape = {"type": "box", "size": format_numbers(half), "rgba": "0.62 0.66 0.42 1"}
-    ET.SubElement(body, "geom", {**shape, **contact, "group": "0"})
-    ET.SubElement(body, "geom", {**shape, "group": "1", "contype": "0", "conaffinity": "0"})
-    return ClassFile(body, list, max(half[:2]), -half[2], half[2], SCAN_TURNS, stand_in=True)
 
 
 # --- MJCF ---

@@ -54,15 +54,20 @@ class LiberoPlacer:
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
         self._places = list(placing_atoms(task, assets).values())
-        self._files = {name: class_file(asset.class_name) for name, asset in assets.items()}
+        self._files = {name: class_file(asset.class_name, task.suite) for name, asset in assets.items()}
 
-    def place(self, seed: int) -> Placement:
-        """Sample the placement of a seed, write it into model and data, and return it.
+    def place(self, seed: int, draw: int = 0) -> Placement:
+        """Sample a placement of a seed, write it into model and data, and return it.
+
+        Args:
+            seed: seed of the scene.
+            draw: number of the placement; only 0 is LIBERO's.
 
         Raises:
             MemobenchError: a region has no free space for its object.
         """
-        rng = np.random.RandomState(seed)  # the stream of LIBERO's own `np.random.seed`
+        # The first one is the stream of LIBERO's own `np.random.seed`.
+        rng = np.random.RandomState([seed, draw] if draw else seed)
         rng.randn(7)
         joints = self._draw_joints(rng)
         self._centre_fixtures(joints)

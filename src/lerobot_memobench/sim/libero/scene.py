@@ -32,6 +32,7 @@ from lerobot_memobench.sim.assets.asset import (
 )
 from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP, VISUAL_GROUP
 from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
+from lerobot_memobench.sim.detents import add_detents
 from lerobot_memobench.sim.libero import mjcf
 from lerobot_memobench.sim.libero.classes import CLASSES, LiberoClass, Part, parts_of
 from lerobot_memobench.sim.libero.looks import drawing_model
@@ -45,7 +46,7 @@ from lerobot_memobench.sim.scene import (
     scene_key,
 )
 from lerobot_memobench.tasks.bddl import Region
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 TABLE_HALF = (0.5, 0.6, 0.025)
 """Half size of the table's board, m."""
@@ -78,14 +79,18 @@ def build_scene(task: Task) -> Scene:
     with _naming(task):
         model = scene_spec(task).compile()
     assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
-    boxes = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name).stand_in]
+    if task.suite == STRICT:
+        strict = scene_spec(task)
+        add_detents(strict, assets)
+        model = strict.compile()
+    missing = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name, task.suite).stand_in]
 
     @cache
     def drawing() -> tuple[mujoco.MjModel, DrawList]:
         with _naming(task):
             return drawing_model(scene_spec(task, visuals=True))
 
-    return Scene(scene_key(task), model, assets, tuple(sorted(set(boxes))), drawing, COLLISION_GROUP)
+    return Scene(scene_key(task), model, assets, tuple(sorted(set(missing))), drawing, COLLISION_GROUP)
 
 
 @contextlib.contextmanager
@@ -150,7 +155,7 @@ def scene_xml(task: Task, visuals: bool) -> str:
         world.insert(place, element)
     classes: dict[str, mjcf.ClassFile] = {}
     for name, class_name in instances(task):
-        classes[class_name] = known = mjcf.class_file(class_name)
+        classes[class_name] = known = mjcf.class_file(class_name, task.suite)
         body = mjcf.instance(class_name, name, known)
         if name in task.objects:
             joint = {"name": f"{name}_joint0", "type": "free", "damping": FREE_DAMPING}

@@ -1,0 +1,93 @@
+"""The simulation is bit-identical between variants of a hiding task until a drawer with a hidden object is ajar."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.sim.hiding import PARKING_HEIGHT
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.formula import Atom
+
+ONE = "find_the_tomato_hidden_in_one_of_the_drawers"
+TWO = "find_the_broccoli_or_the_bean_curd_hidden_in_two_of_the_drawers"
+DRAWERS = [f"wooden_cabinet_1_{name}_region" for name in ("top", "middle", "bottom")]
+
+
+def _begun(task: str, seed: int, variant: int) -> Episode:
+    episode = Episode(get_task(task), demonstration_prompt=False)
+    episode.reset(seed, variant=variant, keep_prompt=True)
+    while not episode.action_has_effect:
+        episode.step(np.zeros(7, np.float32))
+    return episode
+
+
+def _pull(episode: Episode, drawer: str) -> Iterator[NDArray[np.float32]]:
+    expert = Expert(episode.task, episode.sim, np.random.default_rng(0))
+    for action in expert.achieve(Atom("open", (drawer,))):
+        yield np.clip(action, -1, 1).astype(np.float32)
+
+
+def _shift(episode: Episode, drawer: str) -> float:
+    return abs(float(episode.sim.world.articulation(drawer)[1]))
+
+
+@pytest.mark.parametrize(
+    ("task", "variants", "pulled"),
+    [
+        (ONE, (0, 1, 2), "top"),
+        *(pytest.param(TWO, range(12), name, marks=pytest.mark.slow) for name in ("top", "bottom")),
+    ],
+)
+def test_variants_are_equal_until_a_drawer_is_ajar(task: str, variants: range, pulled: str) -> None:
+    episodes = [_begun(task, 20_003, k) for k in variants]
+    first, *others = episodes
+    drawer = f"wooden_cabinet_1_{pulled}_region"
+    rng = np.random.default_rng(3)
+    steps = ajar = 0
+    for action in _pull(first, drawer):
+        action = np.clip(action + 0.03 * np.r_[rng.normal(size=6), 0], -1, 1).astype(np.float32)
+        for episode in episodes:
+            episode.step(action)
+        steps += 1
+        now = first.sim.holds(Atom("ajar", (drawer,)))
+        if now:
+            ajar += 1
+            break
+        for episode in others:
+            assert episode.sim.state().tobytes() == first.sim.state().tobytes()
+            assert episode.objects().tobytes() == first.objects().tobytes()
+            if steps % 20 == 0:
+                for camera in CAMERAS.values():
+                    np.testing.assert_array_equal(episode.sim.render(camera), first.sim.render(camera))
+    assert ajar == 1
+    assert steps > 40
+    inside = [drawer in dict(map(reversed, episode.task.prompt.places)) for episode in episodes]  # type: ignore[arg-type, union-attr]
+    heights = [min(episode.sim.body_pose(name)[0][2] for name, _ in episode.task.prompt.places) for episode in episodes]  # type: ignore[union-attr]
+    assert [height < PARKING_HEIGHT / 2 for height in heights] == inside
+    assert 0 < sum(inside) < len(inside)
+
+
+def test_an_object_appears_at_rest_in_its_drawer_and_leaves_when_the_scene_is_restored() -> None:
+    episode = _begun(ONE, 20_003, 0)
+    (name, drawer), *_ = episode.task.prompt.places  # type: ignore[union-attr]
+    expert = Expert(episode.task, episode.sim, np.random.default_rng(0))
+    assert episode.sim.body_pose(name)[0][2] > PARKING_HEIGHT / 2
+    assert not episode.sim.holds(Atom("in", (name, drawer)))
+    for atom in (Atom("open", (drawer,)), Atom("close", (drawer,))):
+        for action in expert.achieve(atom):
+            episode.step(np.clip(action, -1, 1))
+            if episode.sim.body_pose(name)[0][2] < PARKING_HEIGHT / 2:
+                assert episode.sim.holds(Atom("in", (name, drawer)))
+                assert not episode.sim.holds(Atom("lifted", (name,)))
+    assert episode.sim.body_pose(name)[0][2] < PARKING_HEIGHT / 2
+    for action in expert.achieve(Atom("handhome", ())):
+        episode.step(np.clip(action, -1, 1))
+    if episode.sim.holds(Atom("asbegun", ())):
+        assert episode.sim.body_pose(name)[0][2] > PARKING_HEIGHT / 2
