@@ -429,3 +429,8 @@ def test_export_for_vla_evaluation_harness(board: Path) -> None:
         import jsonschema
 
         jsonschema.Draft7Validator(json.loads(Path(schema).read_text())).validate(found)
+
+
+@pytest.mark.parametrize("name", ["β-VAE", "Δ-ACT", "π0.5 of Team Ω", "清华 Robotics Lab", "ロボット研究室", "Étude 2"])
+def test_names_of_words_in_different_alphabets_are_accepted(name: str) -> None:
+    assert About(model=name, submitter=name, training_data="none", date="2026-11-29").model == name

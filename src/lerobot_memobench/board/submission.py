@@ -52,6 +52,8 @@ ROW_NAME = re.compile(r"(?!(con|prn|aux|nul|com\d|lpt\d)$)[a-z0-9][a-z0-9_-]{1,6
 """Without the names of devices in Windows."""
 TEXT = re.compile(r"[\w(][\w .,:;+()/%~–-]{0,199}")
 FIRST_DAY = "2026-01-01"
+LOOK_ALIKE = {"LATIN", "CYRILLIC", "GREEK"}
+"""Alphabets with letters of one shape; a word that mixes them imitates another name."""
 ACCOUNT = re.compile(r"@[A-Za-z0-9-]{1,39}")
 LINK = re.compile(
     r"https://(?!(.*\.)?xn--|.*/(\.|%2e){1,2}(/|$))[A-Za-z0-9.-]+(/[\w.~/%+@=-]*)?", re.ASCII | re.IGNORECASE
@@ -66,10 +68,14 @@ def row_name(name: str) -> str:
     return name
 
 
+def _alphabets(word: str) -> set[str]:
+    return {unicodedata.name(letter, "").split(" ")[0] for letter in word if letter.isalpha()}
+
+
 def _text(value: str) -> str:
-    alphabets = {unicodedata.name(letter, "").split(" ")[0] for letter in value if letter.isalpha() and letter != "π"}
-    if not TEXT.fullmatch(value) or len(alphabets) > 1 or unicodedata.normalize("NFKC", value) != value:
-        raise ValueError("expected 1 to 200 letters of one alphabet, digits, spaces and . , : ; + ( ) / % ~ - _")
+    mixed = any(len(_alphabets(word) & LOOK_ALIKE) > 1 for word in re.findall(r"\w+", value.replace("π", "")))
+    if not TEXT.fullmatch(value) or mixed or unicodedata.normalize("NFKC", value) != value:
+        raise ValueError("expected 1 to 200 letters, words of one alphabet, digits, spaces and . , : ; + ( ) / % ~ - _")
     return value
 
 
