@@ -9,6 +9,7 @@ from scipy.stats import binom, gamma
 from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.protocol import LONGEST_HOLD
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from research.necessity.adversaries import (
     DECLARED,
@@ -21,7 +22,7 @@ from research.necessity.adversaries import (
     counted,
     rollout,
 )
-from research.necessity.clock import BINS, WAIT, WIDTH, counting
+from research.necessity.clock import BINS, EPISODES, WAIT, WIDTH, counting
 
 FINDING = "find_the_artichoke_hidden_in_one_of_the_drawers"
 COUNTING = "check_the_middle_drawer_a_given_number_of_times"
@@ -76,12 +77,16 @@ def test_the_ceiling_of_counting_is_the_best_probability_to_go_on(number: int) -
     assert counted(number) == pytest.approx(float(np.max(going_on**number * (1 - going_on))), abs=1e-5)
 
 
-def test_waiting_for_a_step_of_the_clock_beats_the_ceiling_without_one() -> None:
+def test_waiting_for_a_step_of_the_clock_needs_a_short_first_hold() -> None:
     """Begin the one event at step 800 if home is released by then, and rest at every later release."""
-    clock, plan = counting(1), np.full(BINS, 1)
+    plan = np.full(BINS, 1)
     plan[: 800 // WIDTH], plan[800 // WIDTH] = WAIT, 0
-    assert clock.rate(plan) == pytest.approx(gamma.cdf(840, 0.5, scale=1200), abs=0.03)
-    assert clock.rate(plan) > 2.5 * counted(1)
+    rate = counting(1, lambda rng, count: rng.gamma(0.5, 1200, (EPISODES, count))).rate(plan)
+    assert rate == pytest.approx(gamma.cdf(840, 0.5, scale=1200), abs=0.03)
+    assert rate > 2.5 * counted(1)
+    clock = counting(1)
+    assert clock.rate(plan) == pytest.approx(840 / LONGEST_HOLD, abs=0.03)
+    assert clock.rate(plan) < counted(1)
     assert clock.rate(np.full(BINS, 0)) == clock.rate(np.full(BINS, 1)) == 0.0
 
 
