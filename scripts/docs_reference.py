@@ -6,6 +6,7 @@ are read from their source, without importing torch.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import dataclasses
 import html
@@ -673,7 +674,9 @@ def on_page_content(content: str, **_: Any) -> str:
 
 def main() -> None:
     """Write the generated pages into the given folder."""
-    out = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description="Write the generated pages of the site into a folder.")
+    parser.add_argument("folder", type=Path)
+    out = parser.parse_args().folder
     for path, make in PAGES.items():
         (out / path).parent.mkdir(parents=True, exist_ok=True)
         (out / path).write_text(make())

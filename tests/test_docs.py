@@ -515,6 +515,16 @@ def test_links_to_files_outside_the_site_are_adapted() -> None:
     )
 
 
+def test_reference_pages_take_no_option_for_a_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """`--help` prints the usage; it once made a folder of this name, which was committed."""
+    monkeypatch.chdir(tmp_path)
+    for argument in ("--help", "--out"):
+        monkeypatch.setattr(sys, "argv", ["docs_reference.py", argument])
+        with pytest.raises(SystemExit):
+            reference.main()
+    assert not list(tmp_path.iterdir())
+
+
 def test_memory_guides_are_complete() -> None:
     index = (ROOT / "docs/guides/memories.md").read_text()
     assert [name for name in OURS if f"| [`{name}`](memory/{name}.md)" not in index] == []
