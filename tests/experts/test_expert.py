@@ -20,7 +20,7 @@ from lerobot_memobench.experts.hand import (
     Hand,
 )
 from lerobot_memobench.experts.travel import PRESS_STEPS
-from lerobot_memobench.protocol import EXECUTION
+from lerobot_memobench.protocol import EXECUTION, HORIZON
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -55,9 +55,10 @@ def play(
     prompt: bool = False,
     referent: str = "fixed",
     disturb: Callable[[Episode, np.ndarray], np.ndarray] | None = None,
+    horizon: int = HORIZON,
 ) -> Played:
     """Run the expert until the episode ends; collect faults."""
-    episode = Episode(task, demonstration_prompt=prompt, referent=referent)
+    episode = Episode(task, demonstration_prompt=prompt, referent=referent, horizon=horizon)
     episode.reset(seed)
     actions = []
     while not episode.done:
