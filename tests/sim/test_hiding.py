@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import CAMERAS
-from lerobot_memobench.sim.hiding import PARKING_HEIGHT
+from lerobot_memobench.sim.hiding import PARKING_HEIGHT, HiddenObjects
+from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
 
@@ -91,3 +92,16 @@ def test_an_object_appears_at_rest_in_its_drawer_and_leaves_when_the_scene_is_re
         episode.step(np.clip(action, -1, 1))
     if episode.sim.holds(Atom("asbegun", ())):
         assert episode.sim.body_pose(name)[0][2] > PARKING_HEIGHT / 2
+
+
+def test_an_object_stays_parked_when_another_one_appears() -> None:
+    sim = Simulation(get_task(TWO))
+    sim.reset(20_003)
+    (first, one), (second, other) = get_task(TWO).prompt.places  # type: ignore[union-attr]
+    hidden = HiddenObjects(sim.model, sim.data)
+    hidden.absent = (hidden.describe(first, one), hidden.describe(second, other))
+    hidden.park()
+    parked = sim.data.joint(f"{second}_joint0").qpos.copy()
+    assert hidden.reveal([one]) == [first]
+    hidden.park()
+    np.testing.assert_array_equal(sim.data.joint(f"{second}_joint0").qpos, parked)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 PARKING_HEIGHT = 1000.0
-"""Height of the first parked object, m: outside the cameras' range, without contact. The others follow at 1 m."""
+"""Height of parked objects, m, plus 1 m times the body's number: outside the cameras' range, without contact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,9 @@ class HiddenObjects:
 
     def park(self) -> None:
         """Write the poses of absent objects; the derived quantities of ``data`` are not updated."""
-        for place, hidden in enumerate(self.absent):
-            self._write(hidden.name, np.array([0.0, 0.0, PARKING_HEIGHT + place, 1.0, 0.0, 0.0, 0.0]), np.zeros(3))
+        for hidden in self.absent:
+            height = PARKING_HEIGHT + self._model.body(hidden.name).id
+            self._write(hidden.name, np.array([0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0]), np.zeros(3))
 
     def reveal(self, regions: Sequence[str]) -> list[str]:
         """Put absent objects into the drawers of ``regions``, with the drawers' velocities; return their names."""
