@@ -19,7 +19,7 @@ from packaging.version import InvalidVersion
 
 from lerobot_memobench.board.submission import EVIDENCE, PAUSES, RERUNS, Evaluation, Submission, read_submission
 from lerobot_memobench.datasets.generation import task_hash
-from lerobot_memobench.envs.episode_log import INPUTS, OF_THE_POLICY, OMITTED, POLICY, differences, evidence_line
+from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, OMITTED, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
 from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PIXELS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
@@ -92,7 +92,7 @@ def check_partners(submissions: Sequence[Submission]) -> None:
             raise MemobenchError(
                 f"{mine}: the partner without a memory, {partner!r}, is no other row; {nearest(partner, others)}"
             )
-        if found := differences(protocols[mine], protocols[partner], ignore=OF_THE_POLICY):
+        if found := differences(protocols[mine], protocols[partner], ignore=OF_ONE_EVALUATION):
             raise MemobenchError(
                 f"{mine} and its partner without a memory, {partner}, differ in {found[0]}; evaluate both with the "
                 "same settings"
