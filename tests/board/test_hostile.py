@@ -23,6 +23,7 @@ from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.board import (
     ABOUT,
     FILES,
+    SALT,
     evaluation,
     first_failure,
     in_card,
@@ -39,11 +40,10 @@ KEPT = Path(__file__).parents[2] / "results" / "board"
 
 @pytest.fixture(scope="module")
 def row(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A valid row with both controls; do not change it."""
+    """A valid row with a control; do not change it."""
     place = tmp_path_factory.mktemp("hostile")
     folders = {
         "": evaluation(place / "m"),
-        "evidence": evaluation(place / "e", evidence=True),
         "pauses": evaluation(place / "p", pause_steps=100),
     }
     return write_submission(place / "one", About(**ABOUT), folders)
@@ -94,6 +94,10 @@ def features(kinds: dict[str, str]) -> Change:
 
 def both(*changes: Change) -> Change:
     return lambda folder: [change(folder) for change in changes]
+
+
+def protocol(**settings: Any) -> Change:
+    return in_card(lambda card: card["protocol"].update(settings))
 
 
 def twice(file: str, text: str) -> Change:
@@ -241,6 +245,16 @@ STRICT: dict[str, tuple[Change, str]] = {
     "sealed for another policy": (both(sealed, commit(policy="5" * 64)), r"match \(policy"),
     "sealed in another release": (both(sealed, commit(release="0.1.0")), r"match \(release"),
     "run 0 of the sealed test": (both(sealed, commit(run=0)), "run|greater"),
+    "sealed without a salt": (
+        both(sealed, every(lambda record: record.pop("salt")), protocol(salt=None), commit()),
+        "drew the variants",
+    ),
+    "a salt that draws other variants": (
+        both(sealed, every(lambda record: record.update(salt="6" * 32)), protocol(salt="6" * 32), commit()),
+        "drew the variants",
+    ),
+    "another salt on the card": (both(sealed, protocol(salt="6" * 32), commit()), "salt=555"),
+    "sealed for another salt": (both(sealed, commit(scenes="7" * 64)), r"match \(scenes"),
     "a second run without a first": (both(sealed, commit(run=2)), r"match \(run: 2 there, 1"),
     # statements
     "a key twice on the card": (twice(CARD, '"protocol": {},'), "a key twice"),
@@ -292,7 +306,7 @@ def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
     others = [read_submission(KEPT / "memobench_small")]
     folder = shutil.copytree(KEPT / "memobench_blind", tmp_path / "one")
     check_submission(read_submission(folder), others)
-    both(relabelled, commit())(folder)
+    both(relabelled, every(lambda record: record.update(salt=SALT)), protocol(salt=SALT), commit())(folder)
     check_submission(read_submission(folder))
     with pytest.raises(MemobenchError, match="equal for equal seeds only"):
         check_submission(read_submission(folder), others)
@@ -309,8 +323,8 @@ def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
         stating("model", "Other"),
         in_card(lambda card: card["checkpoint"].update(path="user/other")),
         lambda folder: in_card(lambda card: card["checkpoint"].update(path="user/other"))(folder / "pauses"),
-        lambda folder: one(lambda record: record.update(wall_s=1.0))(folder / "evidence"),
-        lambda folder: shutil.rmtree(folder / "evidence"),
+        lambda folder: one(lambda record: record.update(wall_s=1.0))(folder / "pauses"),
+        lambda folder: shutil.rmtree(folder / "pauses"),
     ],
     ids=["another model", "other weights", "a control's card", "a control's log", "a control less"],
 )

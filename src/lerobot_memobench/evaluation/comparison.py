@@ -30,6 +30,7 @@ from lerobot_memobench.evaluation.metrics import (
     prefix,
     satisfied,
     value_of,
+    varies,
 )
 from lerobot_memobench.evaluation.records import APART, Run, other_draws, other_hashes, other_physics
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
@@ -309,12 +310,22 @@ def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
         if by_checkpoint:
             reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
             values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
-        episodes = rng.integers(len(both), size=(DRAWS, len(both)))
+        scenes = _scenes(group)
+        episodes = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
         family = get_task(name).family if name in known else None
         applicable = {metric: value for metric, value in values.items() if value is not None}
         drawn = {metric: value[episodes].mean(axis=1) for metric, value in applicable.items()}
         found.append(_Task(name, str(group[0]["memory_type"]), family, applicable, drawn))
     return found
+
+
+def _scenes(group: Sequence[Record]) -> NDArray[np.int64]:
+    """Return the rollouts of each scene of a task by their index, (S, V): V is 1 unless each scene has V variants."""
+    scenes: dict[Any, list[int]] = {}
+    for k, record in enumerate(group):
+        scenes.setdefault(record.get("seed") if varies(record) else (k,), []).append(k)
+    whole = len({len(scene) for scene in scenes.values()}) == 1
+    return np.array(list(scenes.values()) if whole else [[k] for k in range(len(group))])
 
 
 def _values(pairs: Sequence[Pair], metric: str) -> Array | None:

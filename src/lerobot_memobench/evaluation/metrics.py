@@ -95,6 +95,11 @@ def seed_base(record: Record) -> int:
     return int(record["seed"]) - int(record["episode"]) // int(record.get("variants") or 1)
 
 
+def varies(record: Record) -> bool:
+    """Return whether the scene of a rollout is run with several variants."""
+    return (record.get("variants") or 1) > 1
+
+
 PROTOCOL: dict[str, Callable[[Record], Any]] = {
     "referent settings": lambda record: str(record.get("referent")),
     "replan intervals": lambda record: str(record.get("replan_steps")),
@@ -179,8 +184,8 @@ class Rate:
         value: fraction in [0, 1]; None when not applicable.
         n: number of trials: rollouts, because checkpoints of one rollout are dependent; checkpoint records in pooled
             rates.
-        effective: of a mean of rates, the number of rollouts of a plain rate with the same standard error; None where
-            it is n.
+        effective: of a mean of rates, the number of rollouts of a plain rate with the same standard error; of rollouts
+            of each scene with each variant, the number of scenes; None where it is n.
     """
 
     value: float | None
@@ -227,7 +232,15 @@ def percent(value: float | None) -> float | None:
 
 def success_rate(records: Sequence[Record]) -> Rate:
     """Return the share of rollouts that succeeded."""
-    return Rate(sum(bool(record["success"]) for record in records) / len(records), len(records))
+    return Rate(sum(bool(record["success"]) for record in records) / len(records), len(records), _scenes(records))
+
+
+def _scenes(records: Sequence[Record]) -> int | None:
+    """Return the number of scenes where scenes are run with several variants, None elsewhere.
+
+    Rollouts of one scene depend on each other. An interval over scenes is at least as wide as one that knows how much.
+    """
+    return len({(record["task"], record.get("seed")) for record in records}) if any(map(varies, records)) else None
 
 
 def task_row(records: Sequence[Record]) -> Row:
@@ -235,7 +248,7 @@ def task_row(records: Sequence[Record]) -> Row:
     row = {"SR": success_rate(records)}
     for metric, operation in PROCESS_METRICS.items():
         found = checkpoint_rate(records, operation)
-        row[metric] = Rate(found.value, len(records) if found.n else 0)
+        row[metric] = Rate(found.value, len(records) if found.n else 0, _scenes(records))
     return row
 
 
