@@ -49,8 +49,8 @@ from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.difficulty import STANDARD
 from lerobot_memobench.tasks.task import PUBLISHED
 
-MOST_STEPS = 100 * HORIZON
-"""Most control steps of an episode with its pauses."""
+MOST_STEPS = 400 * HORIZON
+"""Most control steps of an episode with its pauses and holds."""
 MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
 """Setting of the environment -> its largest number."""
 NAMED = {"success", "steps", "checkpoints"}
