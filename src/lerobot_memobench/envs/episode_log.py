@@ -144,6 +144,7 @@ class Outcome(TypedDict, total=False):
         lost: strict tasks: whether the goal became unreachable.
         fault: reason why the episode was aborted: an invalid action or unstable physics.
         scene_hash: hash of the initial scene.
+        settled: false if an object was thrown, or still moved, when the scene began; absent otherwise.
     """
 
     seed: Whole | None
@@ -174,6 +175,7 @@ class Outcome(TypedDict, total=False):
     lost: bool
     fault: str
     scene_hash: Name | None
+    settled: bool
 
 
 class EpisodeRecord(Outcome):
@@ -251,6 +253,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         **({} if task.world == MEMOBENCH else {"world": task.world, "stand_ins": list(episode.stand_ins)}),
         **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),
         "scene_hash": episode.scene_hash,
+        **({} if episode.sim.settled else {"settled": False}),
         "wall_s": round(wall_s, 3),
     }
 

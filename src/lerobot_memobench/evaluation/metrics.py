@@ -131,7 +131,7 @@ def mixtures(records: Iterable[Record]) -> list[str]:
 
 def notes_on(records: Sequence[Record]) -> list[str]:
     """Return notes for a reader of the rollouts' figures, a sentence each."""
-    return faults(records) + unshown_prompts(records) + mixtures(records) + missing_scans(records)
+    return faults(records) + unshown_prompts(records) + unsettled(records) + mixtures(records) + missing_scans(records)
 
 
 def stand_ins_of(records: Iterable[Record]) -> list[str]:
@@ -153,6 +153,21 @@ def unshown_prompts(records: Iterable[Record]) -> list[str]:
         f"in episode {group[0]['episode']}; no memory of it can solve the task"
         for task, group in by_task(record for record in records if record.get("prompt_shown") is False).items()
     ]
+
+
+def unsettled(records: Iterable[Record]) -> list[str]:
+    """Return a sentence on the scenes in which an object was thrown, or still moved, before the first action."""
+    counts = []
+    for task, group in by_task(records).items():
+        scenes = {record.get("seed"): record.get("settled", True) for record in group}
+        if thrown := sum(not settled for settled in scenes.values()):
+            counts.append(f"{thrown} of {count_of(len(scenes), 'scene')} of {task}")
+    place = "results/unsettled_scenes.md lists those of the paper's seeds"
+    return (
+        [f"an object is thrown or still moves before the first action in {', '.join(counts)}; {place}"]
+        if counts
+        else []
+    )
 
 
 def faults(records: Iterable[Record]) -> list[str]:
