@@ -5,12 +5,13 @@
 prints the table of ``results/unsettled_scenes.md`` for the paper's seeds, and how many strict scenes are drawn again.
 It takes two minutes.
 
-    PYTHONPATH=FOLDER:src python scripts/unsettled_scenes.py 3.4.0.npz    # after pip install --target FOLDER mujoco==3.4.0
+    PYTHONPATH=FOLDER:src python scripts/unsettled_scenes.py 3.4.0.npz
     python scripts/unsettled_scenes.py 3.9.0.npz
     python scripts/unsettled_scenes.py 3.9.0.npz 3.4.0.npz
 
-writes the positions of the objects after settling, 25 seeds of each published task, under two versions of MuJoCo, and
-prints the largest and the median distance per task, mm.
+writes the positions of the objects after settling, 25 seeds of each published task, under two versions of MuJoCo
+(FOLDER: ``pip install --no-deps --target FOLDER mujoco==3.4.0``), and prints the largest and the median distance per
+task, mm.
 """
 
 from __future__ import annotations
