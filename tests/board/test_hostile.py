@@ -17,6 +17,7 @@ from lerobot_memobench.board.__main__ import main as check_board
 from lerobot_memobench.board.check import check_author, check_paths, check_submission, read_board
 from lerobot_memobench.board.rows import board_rows
 from lerobot_memobench.board.submission import CARD, LOG, About, read_submission, write_submission
+from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.sealed import policy_hash, scenes_hash
 from lerobot_memobench.tasks.catalogue import get_task
@@ -98,6 +99,16 @@ def both(*changes: Change) -> Change:
 
 def protocol(**settings: Any) -> Change:
     return in_card(lambda card: card["protocol"].update(settings))
+
+
+def drawn(salt: str | None) -> Callable[[Json], object]:
+    """The variant that seed and salt draw."""
+
+    def change(record: Json) -> None:
+        record["variant"] = referent_of(get_task(record["task"]), record["seed"], salt).variant_index
+        record.update({} if salt is None else {"salt": salt})
+
+    return change
 
 
 def twice(file: str, text: str) -> Change:
@@ -253,6 +264,11 @@ STRICT: dict[str, tuple[Change, str]] = {
         both(sealed, every(lambda record: record.update(salt="6" * 32)), protocol(salt="6" * 32), commit()),
         "drew the variants",
     ),
+    "sealed as by an earlier version": (
+        both(relabelled, every(drawn(None)), commit()),
+        "expected a salt with the sealed",
+    ),
+    "a salt of public seeds": (both(every(drawn(SALT)), protocol(salt=SALT)), "and none with others"),
     "another salt on the card": (both(sealed, protocol(salt="6" * 32), commit()), "salt=555"),
     "sealed for another salt": (both(sealed, commit(scenes="7" * 64)), r"match \(scenes"),
     "a second run without a first": (both(sealed, commit(run=2)), r"match \(run: 2 there, 1"),
