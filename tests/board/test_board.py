@@ -7,24 +7,28 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lerobot_memobench.board.__main__ import main as check_board
-from lerobot_memobench.board.check import check_partners, check_paths, check_submission, read_board
+from lerobot_memobench.board.check import check_partners, check_paths, check_submission, ranked, read_board
 from lerobot_memobench.board.exports import huggingface_yaml, vla_eval_json
 from lerobot_memobench.board.rows import board_row, board_rows
 from lerobot_memobench.board.submission import CARD, LOG, About, read_submission, write_submission
 from lerobot_memobench.board.text import PROMISES
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.evidence import evidence_of
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.policies.lerobot_config import tree_hash
 from lerobot_memobench.run.card import with_episodes, write_card
 from lerobot_memobench.run.sealed import scenes_hash
+from lerobot_memobench.tasks.catalogue import get_task
 from research.kept import keep, restore
 from tests.support.board import (
     ABOUT,
@@ -58,11 +62,10 @@ def board(evaluated: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def with_controls(board: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A valid submission with both controls, whose partner is the row of ``board``; do not change it."""
+    """A valid submission with a control, whose partner is the row of ``board``; do not change it."""
     place = tmp_path_factory.mktemp("controls")
     folders = {
         "": evaluation(place / "m", speed=60),
-        "evidence": evaluation(place / "e", evidence=True),
         "pauses": evaluation(place / "p", pause_steps=100),
     }
     about = About(**ABOUT | {"without_memory": "one", "links": {"code": "https://one.example/code"}})
@@ -105,7 +108,7 @@ def linked(folder: Path) -> None:
 
 
 def traversing(folder: Path) -> None:
-    (folder / "evidence").symlink_to("../../elsewhere")
+    (folder / "pauses").symlink_to("../../elsewhere")
 
 
 def other_variant(records: list[Json]) -> None:
@@ -173,9 +176,6 @@ DOCTORED_CONTROLS: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "short pauses": ("pauses", in_card(lambda card: card["protocol"].update(pause_steps=1)), "pause_steps: 1 and 100"),
     "log without pauses": ("pauses", in_log(lambda log: [each.pop("paused_steps") for each in log]), "paused_steps"),
     "missing setting": ("pauses", in_card(lambda card: card["protocol"].pop("horizon")), "lacks horizon"),
-    "lower chance": ("evidence", in_log(lambda log: [each.update(chance=0.0) for each in log]), "'chance': 0.0"),
-    "no answer chosen": ("evidence", in_log(lambda log: log[1].update(answered=False), card=True), "answered"),
-    "parts of scenes": ("evidence", in_card(lambda card: card["protocol"].update(episodes=10)), "expected 12 to 600"),
 }
 
 
@@ -184,6 +184,67 @@ def test_doctored_control_is_refused(with_controls: Path, tmp_path: Path, name: 
     control, change, reason = DOCTORED_CONTROLS[name]
     folder = shutil.copytree(with_controls, tmp_path / "two")
     change(folder / control)
+    with pytest.raises(MemobenchError, match=reason):
+        check_submission(read_submission(folder))
+
+
+# --- rows that rank ---
+
+
+@pytest.fixture(scope="module")
+def each_variant(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A valid submission of each scene with each variant; do not change it."""
+    place = tmp_path_factory.mktemp("evidence")
+    return write_submission(place / "one", About(**ABOUT), {"": evaluation(place / "e", evidence=True)})
+
+
+def test_row_of_each_scene_with_each_variant_ranks(each_variant: Path) -> None:
+    check_submission(found := read_submission(each_variant))
+    row = board_row(found)
+    assert (row.ranked, row.episodes, row.seeds) == (True, 36, "paper")
+    assert row.rates["SR"].value == pytest.approx(2 / 3)
+    assert row.evidence is not None
+    assert row.evidence.rates["follows"].value == pytest.approx(2 / 3)
+    low, high = row.rates["SR"].interval or (0.0, 0.0)
+    assert high - low > 0.1, "225 scenes, not 1,080 rollouts"
+    with pytest.raises(MemobenchError, match="has the episodes of the row 'one'"):
+        check_submission(replace(found, name="two"), [found])
+    (entry,) = json.loads(vla_eval_json(read_runs([each_variant])[0]))["results"]
+    assert entry["overall_score"] == pytest.approx(66.7)
+
+
+def test_table_of_public_scenes_is_no_better_than_chance(each_variant: Path, board: Path) -> None:
+    """It knows the variant that the seed draws in each scene. It would be right in all rollouts of a plain row."""
+    assert not ranked(read_submission(board / "one").evaluation)
+    records = []
+    for record in read_submission(each_variant).evaluation.records:
+        task = get_task(record["task"])
+        if task.prompt is not None:
+            records.append({**record, "choice": referent_of(task, record["seed"]).variant_index, "answered": True})
+    found = evidence_of(records).average
+    assert found is not None
+    assert found.chance is not None
+    assert found.rates["follows"].high < 0.5
+    assert (found.rates["follows"].value or 1.0) <= found.chance
+
+
+DOCTORED_VARIANTS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "lower chance": (in_log(lambda log: [each.update(chance=0.0) for each in log]), "'chance': 0.0"),
+    "no answer chosen": (in_log(lambda log: log[1].update(answered=False), card=True), "answered"),
+    "parts of scenes": (in_card(lambda card: card["protocol"].update(episodes=10)), "expected 12 to 36"),
+    "the drawn variant only": (in_log(lambda log: [each.update(variant=1) for each in log], card=True), "variant"),
+    "a task less": (
+        in_card(lambda card: card["protocol"].update(tasks=card["protocol"]["tasks"][1:])),
+        "expected 12 to 36 episodes of each",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DOCTORED_VARIANTS)
+def test_doctored_variants_are_refused(each_variant: Path, tmp_path: Path, name: str) -> None:
+    change, reason = DOCTORED_VARIANTS[name]
+    folder = shutil.copytree(each_variant, tmp_path / "one")
+    change(folder)
     with pytest.raises(MemobenchError, match=reason):
         check_submission(read_submission(folder))
 
@@ -260,10 +321,8 @@ def test_row_with_controls(with_controls: Path, board: Path, tmp_path: Path) -> 
     check_submission(found := read_submission(folder), others)
     row = board_row(found, others)
     assert row.pauses is not None
-    assert row.evidence is not None
     assert row.without_memory is not None
     assert (row.pauses.value, row.without_memory.value) == (0.0, pytest.approx(0.6))
-    assert row.evidence.rates["follows"].value == pytest.approx(2 / 3, abs=0.01)
     page = load_script("board_page")
     html = page._line(None, row)
     assert '<tr class="unverified">' in html
@@ -359,7 +418,7 @@ def test_page_template_and_form_ask_for_the_same() -> None:
     form = (ROOT / ".github/ISSUE_TEMPLATE/results.yml").read_text()
     page = (ROOT / "docs/benchmark/board.md").read_text()
     assert all(promise in text for promise in PROMISES for text in (template, form))
-    assert all(name in text for name in (CARD, LOG, "evidence", "pauses") for text in (template, form, page))
+    assert all(name in text for name in (CARD, LOG, "pauses") for text in (template, form, page))
 
 
 # --- exports ---
@@ -396,11 +455,9 @@ def test_export_for_hugging_face(board: Path) -> None:
     assert "inputs: pixels" in str(entries[0].notes)
 
 
-def test_export_names_other_settings(evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_names_other_settings(evaluated: Path, tmp_path: Path) -> None:
     """A result at another difficulty has no overall score, even with all episodes."""
-    monkeypatch.setattr("lerobot_memobench.board.exports.MOST", 10)
-    folder = shutil.copytree(evaluated, tmp_path / "easy")
-    assert json.loads(vla_eval_json(read_runs([folder])[0]))["results"][0]["overall_score"] == pytest.approx(60.0)
+    folder = evaluation(tmp_path / "easy", evidence=True)
     in_card(lambda card: card["protocol"].update(difficulty="easy"))(folder)
     write_episodes(folder, [{**each, "difficulty": "easy"} for each in read_episodes(folder)])
     (run,) = read_runs([folder])

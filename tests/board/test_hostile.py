@@ -17,12 +17,14 @@ from lerobot_memobench.board.__main__ import main as check_board
 from lerobot_memobench.board.check import check_author, check_paths, check_submission, read_board
 from lerobot_memobench.board.rows import board_rows
 from lerobot_memobench.board.submission import CARD, LOG, About, read_submission, write_submission
+from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.sealed import policy_hash, scenes_hash
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.board import (
     ABOUT,
     FILES,
+    SALT,
     evaluation,
     first_failure,
     in_card,
@@ -39,11 +41,10 @@ KEPT = Path(__file__).parents[2] / "results" / "board"
 
 @pytest.fixture(scope="module")
 def row(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A valid row with both controls; do not change it."""
+    """A valid row with a control; do not change it."""
     place = tmp_path_factory.mktemp("hostile")
     folders = {
         "": evaluation(place / "m"),
-        "evidence": evaluation(place / "e", evidence=True),
         "pauses": evaluation(place / "p", pause_steps=100),
     }
     return write_submission(place / "one", About(**ABOUT), folders)
@@ -94,6 +95,20 @@ def features(kinds: dict[str, str]) -> Change:
 
 def both(*changes: Change) -> Change:
     return lambda folder: [change(folder) for change in changes]
+
+
+def protocol(**settings: Any) -> Change:
+    return in_card(lambda card: card["protocol"].update(settings))
+
+
+def drawn(salt: str | None) -> Callable[[Json], object]:
+    """The variant that seed and salt draw."""
+
+    def change(record: Json) -> None:
+        record["variant"] = referent_of(get_task(record["task"]), record["seed"], salt).variant_index
+        record.update({} if salt is None else {"salt": salt})
+
+    return change
 
 
 def twice(file: str, text: str) -> Change:
@@ -241,6 +256,21 @@ STRICT: dict[str, tuple[Change, str]] = {
     "sealed for another policy": (both(sealed, commit(policy="5" * 64)), r"match \(policy"),
     "sealed in another release": (both(sealed, commit(release="0.1.0")), r"match \(release"),
     "run 0 of the sealed test": (both(sealed, commit(run=0)), "run|greater"),
+    "sealed without a salt": (
+        both(sealed, every(lambda record: record.pop("salt")), protocol(salt=None), commit()),
+        "drew the variants",
+    ),
+    "a salt that draws other variants": (
+        both(sealed, every(lambda record: record.update(salt="6" * 32)), protocol(salt="6" * 32), commit()),
+        "drew the variants",
+    ),
+    "sealed as by an earlier version": (
+        both(relabelled, every(drawn(None)), commit()),
+        "expected a salt with the sealed",
+    ),
+    "a salt of public seeds": (both(every(drawn(SALT)), protocol(salt=SALT)), "and none with others"),
+    "another salt on the card": (both(sealed, protocol(salt="6" * 32), commit()), "salt=555"),
+    "sealed for another salt": (both(sealed, commit(scenes="7" * 64)), r"match \(scenes"),
     "a second run without a first": (both(sealed, commit(run=2)), r"match \(run: 2 there, 1"),
     # statements
     "a key twice on the card": (twice(CARD, '"protocol": {},'), "a key twice"),
@@ -292,7 +322,7 @@ def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
     others = [read_submission(KEPT / "memobench_small")]
     folder = shutil.copytree(KEPT / "memobench_blind", tmp_path / "one")
     check_submission(read_submission(folder), others)
-    both(relabelled, commit())(folder)
+    both(relabelled, every(lambda record: record.update(salt=SALT)), protocol(salt=SALT), commit())(folder)
     check_submission(read_submission(folder))
     with pytest.raises(MemobenchError, match="equal for equal seeds only"):
         check_submission(read_submission(folder), others)
@@ -309,8 +339,8 @@ def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
         stating("model", "Other"),
         in_card(lambda card: card["checkpoint"].update(path="user/other")),
         lambda folder: in_card(lambda card: card["checkpoint"].update(path="user/other"))(folder / "pauses"),
-        lambda folder: one(lambda record: record.update(wall_s=1.0))(folder / "evidence"),
-        lambda folder: shutil.rmtree(folder / "evidence"),
+        lambda folder: one(lambda record: record.update(wall_s=1.0))(folder / "pauses"),
+        lambda folder: shutil.rmtree(folder / "pauses"),
     ],
     ids=["another model", "other weights", "a control's card", "a control's log", "a control less"],
 )

@@ -126,7 +126,7 @@ def first_frames(
     env = MemobenchEnv(name, obs_type=BOTH, referent="random", prompt_in=RESET, render="fast")
     for variant in variants:
 
-        def chosen(published: Task, seed: int, variant: int = variant) -> Task:
+        def chosen(published: Task, seed: int, salt: str | None, *, variant: int = variant) -> Task:
             return published.variant(variant)
 
         monkeypatch.setattr(episode_module, "referent_of", chosen)

@@ -123,7 +123,7 @@ def test_a_complete_run_has_an_overall_score(tmp_path: Path) -> None:
 # --- settings ---
 
 RESULTS = {
-    *("prompt_steps", "prompt_shown", "success", "checkpoints", "failure", "fault", "scene_hash", "wall_s"),
+    *("prompt_steps", "prompt_shown", "success", "checkpoints", "failure", "fault", "scene_hash", "settled", "wall_s"),
     *("not_run", "run", "written_at"),
 }
 """Fields of a line that state no setting."""

@@ -174,6 +174,27 @@ def test_another_mujoco_is_named(tmp_path: Path) -> None:
     assert sentence not in compared(a, b, allow=["scene_hash"]).notes
 
 
+def test_two_salts_are_two_draws_of_one_protocol(tmp_path: Path) -> None:
+    """Episodes whose variants both salts drew alike are paired, and the reader is informed."""
+    both = []
+    for name, salt, variants in (("a", "1" * 32, [0, 1, 0, 1]), ("b", "2" * 32, [0, 0, 1, 1])):
+        records = [
+            logs.rollout("t", "object", "S", [True], name == "b", k, referent="drawn", variant=variant, salt=salt)
+            for k, variant in enumerate(variants)
+        ]
+        write_episodes(tmp_path / name, records)
+        settings = {**logs.SETTINGS, "referent": "drawn", "replan_steps": 5, "salt": salt}
+        (tmp_path / name / "protocol.json").write_text(json.dumps(settings))
+        both.append(tmp_path / name)
+    found = compared(*both)
+    assert (found.pairs, find(found, AVERAGE, "SR").value) == (2, 1.0)
+    assert [note.partition(":")[0] for note in found.notes] == [
+        f"a has the salt {'1' * 32} and b {'2' * 32}",
+        *("2 episodes only in a left out", "2 episodes only in b left out"),
+    ]
+    assert unlike(read_runs(both)) == [found.notes[0]]
+
+
 def test_all_that_must_be_allowed_is_named_at_once(tmp_path: Path) -> None:
     settings = {"seed_base": 7, "horizon": 1200, "render": "default", "referent": "fixed"}
     a = logs.evaluation(tmp_path / "a")

@@ -11,8 +11,10 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.evaluation.comparison import compare
 from lerobot_memobench.evaluation.evidence import evidence_of
 from lerobot_memobench.evaluation.html.data import facts
+from lerobot_memobench.evaluation.metrics import summarise
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.logs import SETTINGS, rollout
@@ -122,6 +124,29 @@ def test_scenes_that_were_not_run_with_every_variant_are_left_out() -> None:
     found = evidence_of(rollouts("bowl", "object", remembers) + rollouts("milk", "object", remembers, 1)[:-1])
     assert set(found.tasks) == {"bowl"}
     assert found.notes[0].endswith("no rate of milk")
+
+
+def test_intervals_of_all_rates_are_over_scenes(tmp_path: Path) -> None:
+    """Ten scenes whose three variants end alike are no thirty independent rollouts; the rate itself is the same."""
+    plain = [rollout("bowl", "object", "SC", [True, k < 15], k < 15, k) for k in range(30)]
+    alike = rollouts("bowl", "object", lambda scene, variant: variant if scene < 5 else None)
+    rate, independent = (summarise(records).average["SR"] for records in (alike, plain))
+    assert (rate.value, rate.n, rate.trials, independent.trials) == (0.5, 30, 10, 30)
+    widths = []
+    for records in (alike, plain):
+        none = [{**record, "success": False, "failure": "storage_failure"} for record in records]
+        for name, lines in (("a", none), ("b", records)):
+            write_episodes(tmp_path / f"{name}{len(widths)}", lines)
+        first, second = read_runs([tmp_path / f"{name}{len(widths)}" for name in "ab"])
+        low, high = compare(first, second, permutations=10).differences[0].interval
+        widths.append(high - low)
+    assert widths[0] > 1.4 * widths[1], "by about the square root of three"
+
+
+def test_tasks_of_one_variant_have_no_rate_of_evidence() -> None:
+    found = evidence_of(rollouts("bowl", "object", remembers) + rollouts("stove", "temporal", remembers, variants=1))
+    assert set(found.tasks) == {"bowl"}
+    assert found.notes[0].startswith("the average has 10 effective scenes")
 
 
 def evaluation(folder: Path, policy: Policy) -> str:

@@ -230,6 +230,15 @@ def test_scenes_of_evidence_are_counted_once() -> None:
         plan_line([*butter, "episodes=151"])
 
 
+@pytest.mark.parametrize("split", ["paper", "sealed"])
+def test_strict_evidence_is_of_all_tasks(split: str) -> None:
+    """A ranked row of the board is one command; a task with one variant runs each of its scenes once."""
+    plan = plan_line(["env=memobench", "suite=strict", "evidence=true", f"split={split}"])
+    assert (len(plan.grid.tasks), plan.grid.runs, plan.seeds) == (30, 36, SPLITS[split][:36])
+    assert all(plan.grid.runs % variants == 0 for variants in plan.variants.values()), "whole scenes"
+    assert {*plan.variants.values()} == {1, 2, 3, 6, 9, 12}
+
+
 @pytest.mark.parametrize(
     ("words", "found"),
     [

@@ -207,6 +207,14 @@ def test_a_card_runs_no_more_than_its_episodes(settings: dict[str, Any], named: 
         rerun.repeat(Path(), None, None, lambda plan: pytest.fail("it was run"), print)
 
 
+@pytest.mark.parametrize("difficulty", ["standard", "extreme"])
+def test_a_strict_card_may_be_held_as_long_as_the_protocol_says(difficulty: str) -> None:
+    line = ["env=memobench", "suite=strict", f"difficulty={difficulty}", "replan=50", "pause_steps=100"]
+    plan = plan_line([*line, f"tasks={COUNTING}", "episodes=1", "policy=memobench_random"])
+    held = card(plan.settings.portable, episodes=[{**RECORD, "task": COUNTING, "steps": 1}])
+    rerun.check_extent({**held, "protocol": {"tasks": [COUNTING], "episodes": 1}}, plan)
+
+
 @pytest.mark.parametrize("hold", [0, 1200])
 def test_a_strict_card_of_an_earlier_version_is_refused(hold: int) -> None:
     asked = {"tasks": [COUNTING], "episodes": 1, "suite": "strict", **({"hold": hold} if hold else {})}

@@ -15,6 +15,7 @@ from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.protocol import EVIDENCE_EPISODES
 from lerobot_memobench.run.card import new_card, with_episodes, write_card
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.evidence import chance, scene_and_variant
@@ -24,6 +25,7 @@ ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_da
 VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
 FILES = {"config.json": "1" * 64, "model.safetensors": "2" * 64}
 PICTURES = {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}}
+SALT = "5" * 32
 Json = dict[str, Any]
 
 
@@ -64,17 +66,16 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
 
 
 def evaluation(folder: Path, first: int = 7, speed: int = 50, **settings: Any) -> Path:
-    """Write the folder of an evaluation of the strict suite: 10 episodes of each task, of those with variants 12."""
-    names = [name for name in TASKS if not settings.get("evidence") or get_task(name).num_variants > 1]
-    count = 12 if settings.get("evidence") else 10
-    records = [line(name, episode, first, speed, **settings) for name in names for episode in range(count)]
+    """Write the folder of an evaluation of the strict suite: 10 episodes of each task, 36 with evidence."""
+    count = EVIDENCE_EPISODES if settings.get("evidence") else 10
+    records = [line(name, episode, first, speed, **settings) for name in TASKS for episode in range(count)]
     block = EnvSettings(suite="strict", seed_base=first, replan_steps=5, **settings).protocol_block
     card = new_card(
-        protocol={"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
+        protocol={"tasks": sorted(TASKS), "episodes": count, **block, "inputs": "pixels"},
         policy={"type": "act", "seed": first, "settings": {"input_features": PICTURES}, "sha256": tree_hash(FILES)},
         checkpoint={"path": "user/one", "revision": "abc", "files": FILES},
         trained_on={"repo_id": "user/data", "revision": "def"},
-        task_files={name: task_hash(get_task(name)) for name in names},
+        task_files={name: task_hash(get_task(name)) for name in TASKS},
         settings={},
         runs=[{"command": ["lerobot"], "batch_size": 1, "versions": VERSIONS, "git_commit": None, "machine": {}}],
     )
@@ -119,14 +120,16 @@ def stating(key: str, value: Any) -> Callable[[Path], None]:
 
 
 def sealed(folder: Path) -> None:
-    """Move all seeds to the sealed ones, with the variants that they draw, without a commitment."""
+    """Move all seeds to the sealed ones, with a salt and the variants that both draw, without a commitment."""
 
     def move(records: list[Json]) -> None:
         for record in records:
             record["seed"] = 100_007 + record["episode"]
             task = get_task(record["task"])
-            record["variant"] = referent_of(task, record["seed"]).variant_index
+            record["variant"] = referent_of(task, record["seed"], SALT).variant_index
+            record["salt"] = SALT
             record["scene_hash"] = scene_of(task.name, record["seed"])
 
     in_log(move, card=True)(folder)
-    in_card(lambda card: (card["protocol"].update(seed_base=100_007), card["policy"].update(seed=100_007)))(folder)
+    protocol = {"seed_base": 100_007, "salt": SALT}
+    in_card(lambda card: (card["protocol"].update(protocol), card["policy"].update(seed=100_007)))(folder)

@@ -17,16 +17,23 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.version import InvalidVersion
 
-from lerobot_memobench.board.submission import EVIDENCE, PAUSES, RERUNS, Evaluation, Submission, read_submission
+from lerobot_memobench.board.submission import PAUSES, RERUNS, Evaluation, Submission, read_submission
 from lerobot_memobench.datasets.generation import task_hash
-from lerobot_memobench.envs.episode_log import INPUTS, OF_THE_POLICY, OMITTED, POLICY, differences, evidence_line
+from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, OMITTED, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
 from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PIXELS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.metrics import failure_of, operations, seed_base
 from lerobot_memobench.policies.lerobot_config import tree_hash
-from lerobot_memobench.protocol import EVALUATION_EPISODES, PAPER, PROMPT_HORIZON, SEALED, SPLITS
+from lerobot_memobench.protocol import (
+    EVALUATION_EPISODES,
+    EVIDENCE_EPISODES,
+    PAPER,
+    PROMPT_HORIZON,
+    SEALED,
+    SPLITS,
+)
 from lerobot_memobench.run.card import PACKAGES, first_variant_mismatch
 from lerobot_memobench.run.sealed import policy_hash, scenes_hash
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -35,16 +42,17 @@ from lerobot_memobench.tasks.formula import And, Formula, Then, children, format
 from lerobot_memobench.tasks.task import STRICT, Task
 
 FEWEST, MOST = 10, EVALUATION_EPISODES
-"""Episodes of each task; a row is ranked with the most."""
+"""Episodes of each task, without evidence."""
 SEEDS = {SPLITS[name].start: name for name in (PAPER, SEALED)}
 """Seed of the first episode -> split of seeds that count."""
 MAY_DIFFER = {
     *("suite", "world", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
+    *("evidence", "salt"),
 }
 """Settings of the protocol that a submission may choose; all others have their defaults."""
-CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {EVIDENCE: {"evidence": True}, PAUSES: {"pause_steps": 100}}
+CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {PAUSES: {"pause_steps": 100}}
 CONTROL_FIELDS = ("paused_steps", "choice", "answered", "variants", "chance")
-"""Fields of a line of the log that only a control has."""
+"""Fields of a line of the log that only evaluations with pauses or evidence have."""
 KNOWN_INPUTS = (PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, NO_INPUT)
 COPIED, CLOSE = 0.5, 2
 """Share of similar successful episodes above which a log counts as a copy, and steps by which similar ones differ."""
@@ -92,7 +100,7 @@ def check_partners(submissions: Sequence[Submission]) -> None:
             raise MemobenchError(
                 f"{mine}: the partner without a memory, {partner!r}, is no other row; {nearest(partner, others)}"
             )
-        if found := differences(protocols[mine], protocols[partner], ignore=OF_THE_POLICY):
+        if found := differences(protocols[mine], protocols[partner], ignore=OF_ONE_EVALUATION):
             raise MemobenchError(
                 f"{mine} and its partner without a memory, {partner}, differ in {found[0]}; evaluate both with the "
                 "same settings"
@@ -198,10 +206,8 @@ def _check_control(run: Evaluation, control: Evaluation, name: str, names: Seque
         mine, other = (each.card[POLICY].get(key) for each in (run, control))
         if mine != other:
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
-    if found := differences(run.protocol, control.protocol, ignore=CONTROL_SETTING[name]):
+    if found := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
         raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
-    if name == EVIDENCE:
-        names = [task for task in names if get_task(task).num_variants > 1]
     _check_evaluation(control, names, least)
 
 
@@ -255,7 +261,7 @@ def _check_extent(run: Evaluation, names: Sequence[str], least: int) -> None:
     count, base = protocol["episodes"], protocol["seed_base"]
     most = MOST
     if protocol["evidence"]:  # whole scenes
-        least, most = max((len(get_task(name).random_variants) for name in names), default=1), 12 * MOST
+        least, most = max((len(get_task(name).random_variants) for name in names), default=1), EVIDENCE_EPISODES
     if base not in list(SEEDS) or seed != base:
         raise MemobenchError(
             f"{run.place}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
@@ -280,7 +286,7 @@ def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
     """Check one line: settings as on the card, seed, and an outcome that this task can have."""
     protocol, named = run.protocol, (run.records[0].get(POLICY), str(run.card[POLICY].get("type")))
     where = f"{run.place}: {record['task']}, episode {record['episode']}"
-    settings = ("suite", "world", "difficulty", "protocol", "convention", "referent", "replan_steps", INPUTS)
+    settings = ("suite", "world", "difficulty", "protocol", "convention", "referent", "salt", "replan_steps", INPUTS)
     for key in (*settings, *MEMORY_CONTROLS):
         value = record.get(key, OMITTED.get(key))
         expected = protocol.get(key)
@@ -439,8 +445,14 @@ def _check_scenes(runs: Sequence[Evaluation]) -> None:
 
 
 def _check_sealed(run: Evaluation) -> None:
-    """Check that a sealed evaluation was committed to this policy and these scenes when it started."""
-    if SEEDS[run.protocol["seed_base"]] != SEALED:
+    """Check that a sealed evaluation, and no other, has a salt, and was committed to its policy and scenes."""
+    is_sealed = SEEDS[run.protocol["seed_base"]] == SEALED
+    if is_sealed != bool(run.protocol["salt"]):
+        raise MemobenchError(
+            f"{run.place} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "
+            "others: evaluate them by `memobench test-sealed`"
+        )
+    if not is_sealed:
         return
     sealed: Mapping[str, Any] = run.card.get("sealed", {})
     release = run.card["runs"][0]["versions"].get(PACKAGES[0])
@@ -473,16 +485,21 @@ def _copied(mine: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any
     trainings on the same demonstrations share at most a third of them. Steps after the last checkpoint are easily
     edited. Failures do not count: two policies may reach nothing.
     """
-    scenes = {(record["task"], record["seed"]): _reached(record) for record in theirs if record["success"]}
+    scenes = {_drawn(record): _reached(record) for record in theirs if record["success"]}
     pairs = [
         [a - b for a, b in zip(_reached(record), scenes[key], strict=True)]
         for record in mine
-        if record["success"] and (key := (record["task"], record["seed"])) in scenes
+        if record["success"] and (key := _drawn(record)) in scenes
     ]
     if len(pairs) < FEWEST:
         return 0.0
     shift = statistics.median(itertools.chain(*pairs))
     return sum(all(abs(each - shift) <= CLOSE for each in steps) for steps in pairs) / len(pairs)
+
+
+def _drawn(record: Mapping[str, Any]) -> tuple[str, int, int]:
+    """Return the scene and the variant of a rollout."""
+    return record["task"], record["seed"], record["variant"]
 
 
 def _reached(record: Mapping[str, Any]) -> list[int]:
@@ -491,5 +508,15 @@ def _reached(record: Mapping[str, Any]) -> list[int]:
 
 
 def ranked(run: Evaluation) -> bool:
-    """Return whether an evaluation enters the ranking: strict suite, all scenes."""
-    return bool(run.protocol["suite"] == STRICT and run.protocol["episodes"] == MOST)
+    """Return whether an evaluation enters the ranking: strict suite, each scene with each variant, all scenes."""
+    return run.protocol["suite"] == STRICT and is_complete(run.protocol)
+
+
+def is_complete(protocol: Mapping[str, Any]) -> bool:
+    """Return whether a protocol has the episodes of a complete evaluation; of the strict suite one with evidence.
+
+    Without evidence a table from first observations to answers would be right: both follow from public seeds.
+    """
+    if protocol["suite"] == STRICT or protocol["evidence"]:
+        return bool(protocol["evidence"] and protocol["episodes"] == EVIDENCE_EPISODES)
+    return bool(protocol["episodes"] == MOST)

@@ -9,11 +9,11 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from lerobot_memobench.board.check import MOST, SEEDS, departures
+from lerobot_memobench.board.check import SEEDS, departures, is_complete
 from lerobot_memobench.board.submission import ABOUT, About
 from lerobot_memobench.envs.episode_log import INPUTS, with_omitted
 from lerobot_memobench.evaluation.headline import extent_phrase
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, Row, by_task, percent, wilson
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record, Row, by_task, percent, success_rate
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.io import checked
 from lerobot_memobench.run.card import PACKAGES
@@ -63,7 +63,7 @@ def lerobot_json(run: Run) -> str:
 
 def _counts(records: Sequence[Record]) -> dict[str, Any]:
     count, done = len(records), sum(bool(record["success"]) for record in records)
-    interval = [100 * end for end in wilson(done / count, count)]
+    interval = [100 * end for end in success_rate(records).interval or ()]
     return {"n_episodes": count, "n_success": done, "pc_success": 100 * done / count, "pc_success_ci95": interval}
 
 
@@ -151,13 +151,13 @@ HANDLE, NO_HANDLE = re.compile(r"@[\w-]+"), "human"
 def vla_eval_json(run: Run) -> str:
     """Return the entry of a result in the form of vla-evaluation-harness' ``leaderboard.json``.
 
-    ``overall_score`` is set for the standard protocol only: all tasks of the suite, 50 episodes each, seeds that count.
+    ``overall_score`` is set for the standard protocol only: all tasks of the suite, all episodes, seeds that count.
     Otherwise the average is ``reported_avg`` of ``task_scores``, as that board asks.
     """
     about, protocol, summary = about_of(run), with_omitted(run.protocol), run.summary
     model = model_of(run)
-    whole = {(record["task"], record["episode"]) for record in run.records} == {
-        *itertools.product(task_names(suite=protocol["suite"]), range(MOST))
+    whole = is_complete(protocol) and {(record["task"], record["episode"]) for record in run.records} == {
+        *itertools.product(task_names(suite=protocol["suite"]), range(protocol["episodes"]))
     }
     day = about.date if about else str(run.card.get("written", ""))[:10]
     submitter = about.submitter if about else ""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_memobench.board.check import SEEDS, ranked, read_board
-from lerobot_memobench.board.submission import EVIDENCE, PAUSES, RERUNS, About, Submission
+from lerobot_memobench.board.submission import PAUSES, RERUNS, About, Submission
 from lerobot_memobench.envs.episode_log import INPUTS
 from lerobot_memobench.evaluation.comparison import Difference, compare
 from lerobot_memobench.evaluation.evidence import Evidence
@@ -33,7 +33,7 @@ class BoardRow:
         seeds: split, with the number of the run of a sealed one.
         episodes: of each task.
         rates: average of SR, MSR, MUR and MCR.
-        evidence: average of the evidence control.
+        evidence: average over scenes that were run with each variant.
         pauses: change of SR by the pauses.
         without_memory: SR of the partner without a memory.
     """
@@ -68,7 +68,6 @@ def board_row(
     """Return the row of a checked submission; ``others`` may hold its partner without a memory."""
     evaluation, controls = submission.evaluation, submission.controls
     protocol, run = evaluation.protocol, evaluation.run
-    evidence = controls[EVIDENCE].run.evidence if EVIDENCE in controls else None
     changes: tuple[Difference, ...] = ()
     if PAUSES in controls:
         changes = compare(run, controls[PAUSES].run, permutations=100).differences
@@ -85,7 +84,7 @@ def board_row(
         seeds=split if split == PAPER else f"{split}, run {evaluation.card['sealed']['run']}",
         episodes=protocol["episodes"],
         rates=run.summary.average,
-        evidence=evidence.average if evidence else None,
+        evidence=run.evidence.average if run.evidence else None,
         pauses=next((each for each in changes if each.kind == "average" and each.metric == "SR"), None),
         without_memory=None if partner is None else partner.evaluation.run.summary.average["SR"],
     )

@@ -33,7 +33,7 @@ from lerobot_memobench.io import PACKED, Malformed, checked, in_words, parsed, r
 from lerobot_memobench.run.card import write_card
 
 CARD, LOG = EVALUATION_FILE, MERGED_FILE + PACKED
-CONTROLS = EVIDENCE, PAUSES = ("evidence", "pauses")
+CONTROLS = (PAUSES,) = ("pauses",)
 """Subfolders for evaluations of the same policy under a control."""
 LARGEST = {CARD: 2 << 20, LOG: 1 << 20}
 """File -> its largest size, bytes."""

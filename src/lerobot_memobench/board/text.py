@@ -35,8 +35,8 @@ def pull_request(row: BoardRow) -> str:
     lines = [
         f"# Result of {about.model}",
         "",
-        f"This pull request adds `results/board/{row.name}` and changes nothing else: `{CARD}`, `{LOG}` and, for "
-        f"controls, the same two files in {' and '.join(f'`{name}`' for name in CONTROLS)}.",
+        f"This pull request adds `results/board/{row.name}` and changes nothing else: `{CARD}`, `{LOG}` and, for a "
+        f"control, the same two files in {' and '.join(f'`{name}`' for name in CONTROLS)}.",
         "",
         "| | |",
         "|---|---|",

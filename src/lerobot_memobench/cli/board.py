@@ -43,9 +43,6 @@ def submit(
     code: Annotated[str | None, typer.Option(help="Address of the code, https://…")] = None,
     weights: Annotated[str | None, typer.Option(help="Address of the weights, https://…")] = None,
     paper: Annotated[str | None, typer.Option(help="Address of the paper, https://…")] = None,
-    evidence: Annotated[
-        Path | None, typer.Option(help="Folder of an evaluation of the same policy with evidence=true.")
-    ] = None,
     pauses: Annotated[
         Path | None, typer.Option(help="Folder of an evaluation of the same policy with pause_steps=100.")
     ] = None,
@@ -81,7 +78,7 @@ def submit(
         },
         About,
     )
-    sources = {key: folder for key, folder in (("", card), ("evidence", evidence), ("pauses", pauses)) if folder}
+    sources = {key: folder for key, folder in (("", card), ("pauses", pauses)) if folder}
     others = [row for row in read_board(BOARD) if row.name != name] if BOARD.is_dir() else []
     with tempfile.TemporaryDirectory() as draft:
         written = write_submission(Path(draft) / "board" / name, about, sources)

@@ -36,6 +36,7 @@ from lerobot_memobench.envs.settings import AUTO, INTACT, PIXELS, STEPS, EnvSett
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
 from lerobot_memobench.sim.convention import UPRIGHT
+from lerobot_memobench.tasks.task import STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
 """Called with a task's folder, the number of rows, and whether each row runs in its own process."""
@@ -106,7 +107,7 @@ class MemobenchEnvConfig(_WithSettings):
     def selected(self) -> list[tuple[str, int, Path]]:
         """Return memory type, task id and folder of each chosen task that the controls apply to.
 
-        `evidence` needs variants; corruption at step 0, `reshow` and `interference` need a prompt.
+        `evidence` needs variants of published tasks; corruption at step 0, `reshow` and `interference` need a prompt.
 
         Raises:
             MemobenchError: a task is unknown or of another suite, or a control applies to no chosen task.
@@ -133,7 +134,7 @@ class MemobenchEnvConfig(_WithSettings):
                     "corrupt= (at step 0), reshow= and interference= act on the demonstration prompt, and no chosen "
                     "task has one; choose object or procedural tasks, or set corrupt_step="
                 )
-        if not self.evidence:
+        if not self.evidence or self.suite == STRICT:  # its tasks with one variant run each scene once
             return tasks
         found = [task for task in tasks if load_task(task[2]).num_variants > 1]
         if not found:

@@ -113,7 +113,8 @@ class Episode:
         self.seed = int(seed)
         self.fault: Fault | None = None
         if variant is None:
-            task = self.published if self.referent == "fixed" else referent_of(self.published, self.seed)
+            drawn = self.referent != "fixed"
+            task = referent_of(self.published, self.seed, self.settings.salt) if drawn else self.published
         else:
             task = self.published.variant(variant)
         self.task = task
@@ -151,7 +152,7 @@ class Episode:
 
     def _draw_holds(self) -> Iterator[int]:
         """Return the lengths of the episode's holds, which do not depend on the variant."""
-        rng = self._rng(5)
+        rng = generator(self.published, self.seed, 5, self.settings.salt)
         drawn = rng.gamma(HOLD_SHAPE, HOLD_MEAN / HOLD_SHAPE, MOST_HOLDS)
         if self.published.prompt is None:
             drawn[0] = rng.uniform(0, LONGEST_HOLD)
@@ -383,24 +384,28 @@ class Episode:
         return texts[min(self.progress.index, len(texts) - 1)]
 
 
-def referent_of(task: Task, seed: int) -> Task:
+def referent_of(task: Task, seed: int, salt: str | None = None) -> Task:
     """Return the variant of a task that the seed draws.
 
     Draws are balanced: from the first seed of a split (`protocol.SPLITS`), each block of as many seeds as variants
     contains every variant once, in random order. All variants are equally frequent and independent of the layout.
+
+    Args:
+        salt: of a sealed evaluation (`EnvSettings.salt`): another order of each block.
     """
     if task.num_variants == 1:
         return task
     choices = task.random_variants
     first = max((split.start for split in SPLITS.values() if split.start <= seed), default=0)
     position = (seed - first) % len(choices)
-    order = generator(task, seed - position, 1).permutation(choices)
+    order = generator(task, seed - position, 1, salt).permutation(choices)
     return task.variant(int(order[position]))
 
 
-def generator(task: Task, seed: int, stream: int) -> np.random.Generator:
+def generator(task: Task, seed: int, stream: int, salt: str | None = None) -> np.random.Generator:
     """Return an independent generator per stream, so that streams cannot shift each other's draws."""
-    return np.random.default_rng([seed, zlib.crc32(task.name.encode()), stream])
+    salted = [int(f"1{salt}", 16)] if salt else []  # numpy ignores zeros at the end
+    return np.random.default_rng([seed, zlib.crc32(task.name.encode()), stream, *salted])
 
 
 def _wrong_atoms(task: Task) -> Iterator[Atom]:

@@ -119,6 +119,7 @@ class Outcome(TypedDict, total=False):
         seed: seed of the scene: seed base + episode, except in evidence episodes.
         referent: fixed, random, or drawn (strict tasks).
         variant: index of the task's variant; 0 is the published one.
+        salt: mixed into the draws of variant and holds; sealed test only.
         replan_steps: actions executed per prediction, if known.
         prompt_steps: control steps before the execution.
         steps: execution steps.
@@ -143,11 +144,13 @@ class Outcome(TypedDict, total=False):
         lost: strict tasks: whether the goal became unreachable.
         fault: reason why the episode was aborted: an invalid action or unstable physics.
         scene_hash: hash of the initial scene.
+        settled: false if an object was thrown, or still moved, when the scene began; absent otherwise.
     """
 
     seed: Whole | None
     referent: Name
     variant: Count | None
+    salt: Name
     replan_steps: Count | None
     prompt_steps: Count | None
     steps: Count | None
@@ -172,6 +175,7 @@ class Outcome(TypedDict, total=False):
     lost: bool
     fault: str
     scene_hash: Name | None
+    settled: bool
 
 
 class EpisodeRecord(Outcome):
@@ -228,6 +232,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         "seed": episode.seed,
         "referent": episode.referent,
         "variant": task.variant_index,
+        **({"salt": episode.settings.salt} if episode.settings.salt else {}),
         "replan_steps": episode.settings.replan_steps,
         "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
         "prompt_shown": episode.prompt_shown,
@@ -248,6 +253,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         **({} if task.world == MEMOBENCH else {"world": task.world, "stand_ins": list(episode.stand_ins)}),
         **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),
         "scene_hash": episode.scene_hash,
+        **({} if episode.sim.settled else {"settled": False}),
         "wall_s": round(wall_s, 3),
     }
 
@@ -502,13 +508,14 @@ OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, "world": MEMOBENCH, "difficulty": STANDARD, "protocol": BY_PAPER},
     "convention": UPRIGHT,
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, HOLD: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
-    **{"window_steps": 1, "delay_steps": 0},
+    **{"window_steps": 1, "delay_steps": 0, "salt": None},
     **MEMORY_CONTROLS,
 }
 """Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
 steps per rendered picture, exists in earlier versions only."""
-OF_THE_POLICY = ("prompt_in", "window_steps", "delay_steps", INPUTS)
-"""Settings that follow from the policy. They may differ between compared evaluations, not between parts of one."""
+OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", INPUTS, "salt")
+"""Settings that follow from the policy, and the salt, which the start of a sealed evaluation draws. They may differ
+between compared evaluations, not between parts of one."""
 EXTENT = ("tasks", "episodes")
 """Extent of an evaluation. It may differ between compared evaluations, which use their common episodes."""
 MOST_EPISODES = 100_000

@@ -171,7 +171,7 @@ class SealedRun(TypedDict):
     Attributes:
         started: time.
         policy: hash of the files that the policy loads.
-        scenes: hash of task files, referent, seed and episodes.
+        scenes: hash of task files, referent, seed, episodes and salt.
         release: version of this package.
         run: number of this start, from 1, among those of the policy with the release.
         earlier: the starts before it.

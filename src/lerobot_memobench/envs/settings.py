@@ -6,6 +6,7 @@ To add a setting, add a field here and the code that applies it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
@@ -47,6 +48,8 @@ EVERY = -1
 SLOWEST = 10
 """Maximum number of control steps per action, see ``speed``."""
 
+SALT = re.compile("[0-9a-f]{32}")
+"""Form of a ``salt``."""
 INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 """Values of ``corrupt``: what happens to the memory of the policy."""
@@ -113,6 +116,7 @@ class EnvSettings:
     pause_steps: int = setting(0, "control steps of each pause, at moments drawn by the seed (pause control)", least=0)
     speed: float = setting(1.0, "1, 0.5, 0.33, ...: an action takes 1, 2, 3, ... control steps (speed control)")
     evidence: bool = setting(False, "run each scene with each variant of its task (evidence control)")
+    salt: str | None = setting(None, "32 hexadecimal digits, mixed into the draws of variants and holds (sealed test)")
     corrupt: str = setting(INTACT, "delete, swap (between rows) or noise the policy's memory once", CORRUPTIONS)
     corrupt_step: int = setting(0, "execution step at which corrupt acts; 0: at the end of the prompt", least=0)
     reshow: bool = setting(False, "the prompt plays a second time, after corrupt has acted")
@@ -131,6 +135,8 @@ class EnvSettings:
                 f"speed is {self.speed!r}; expected 1, 0.5, 0.33, 0.25 and so on down to {1 / SLOWEST}, so that an "
                 "action takes a whole number of control steps"
             )
+        if self.salt is not None and not SALT.fullmatch(str(self.salt)):
+            raise MemobenchError(f"salt is {self.salt!r}; expected 32 hexadecimal digits in lower case")
         if self.convention != UPRIGHT and self.obs_type == OBJECTS:
             raise MemobenchError(f"convention={self.convention} is of pictures, and obs_type={OBJECTS} has none")
         if self.suite == STRICT:

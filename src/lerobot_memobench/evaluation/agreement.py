@@ -17,7 +17,7 @@ OUTCOME = (
 
 def outcome(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a log line that a card keeps: its identity and its outcome, without times."""
-    identity = ("task", "memory_type", "episode", "seed", "referent", "difficulty")
+    identity = ("task", "memory_type", "episode", "seed", "referent", "difficulty", "salt")
     return {key: record[key] for key in (*identity, *OUTCOME) if key in record}
 
 

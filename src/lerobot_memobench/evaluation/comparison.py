@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode_log import OF_THE_POLICY, differences
+from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences
 from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.agreement import SCENES
@@ -30,8 +30,9 @@ from lerobot_memobench.evaluation.metrics import (
     prefix,
     satisfied,
     value_of,
+    varies,
 )
-from lerobot_memobench.evaluation.records import APART, Run, other_hashes, other_physics
+from lerobot_memobench.evaluation.records import APART, Run, other_draws, other_hashes, other_physics
 from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
 from lerobot_memobench.evaluation.statistics import (
     DRAWS,
@@ -72,7 +73,7 @@ Pair = tuple[Record, Record]
 
 
 def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
-    """Return the episodes that both hold: same task, number and referent.
+    """Return the episodes that both hold: same task, number and referent; under different salts, same variant too.
 
     Args:
         allow: which of `ALLOWED` may differ.
@@ -81,9 +82,11 @@ def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
         MemobenchError: there are none, or a pair differs in its checkpoints.
     """
 
-    def key(record: Record) -> tuple[str, int, str]:
+    redrawn = other_draws(a, b)
+
+    def key(record: Record) -> tuple[str, int, str, int | None]:
         referent = "" if "referent" in allow else str(record.get("referent", "fixed"))
-        return record["task"], record["episode"], referent
+        return record["task"], record["episode"], referent, record.get("variant") if redrawn else None
 
     others = {key(record): record for record in b.records}
     pairs = [(record, others[key(record)]) for record in a.records if key(record) in others]
@@ -250,7 +253,7 @@ def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
             raise MemobenchError(
                 f"found --allow {name!r}, expected a setting of the protocol, {nearest(name, ALLOWED)}"
             )
-    found = differences(a.protocol, b.protocol, ignore={*OF_THE_POLICY, *allow})
+    found = differences(a.protocol, b.protocol, ignore={*OF_ONE_EVALUATION, *allow})
     names = [one.split(":")[0] for one in found]
     pairs = common_episodes(a, b, {*allow, *names})
     unlike = unlike_pairs(pairs, {*allow, *names})
@@ -269,8 +272,8 @@ def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
 def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> list[str]:
     """Return warnings for the reader: differing settings, episodes left out, gaps of the logs."""
     meant = () if control is None else (control.setting, *control.also)
-    notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol, ignore=meant)]
-    notes += other_physics(a, b) + other_hashes(a.protocol, b.protocol)
+    notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol, ignore=(*meant, "salt"))]
+    notes += other_draws(a, b) + other_physics(a, b) + other_hashes(a.protocol, b.protocol)
     left = {run.name: len(run.records) - len(pairs) for run in (a, b)}
     notes += [f"{count_of(count, 'episode')} only in {name} left out" for name, count in left.items() if count]
     if paused := [record["paused_steps"] for _, record in pairs if "paused_steps" in record]:
@@ -307,12 +310,22 @@ def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
         if by_checkpoint:
             reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
             values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
-        episodes = rng.integers(len(both), size=(DRAWS, len(both)))
+        scenes = _scenes(group)
+        episodes = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
         family = get_task(name).family if name in known else None
         applicable = {metric: value for metric, value in values.items() if value is not None}
         drawn = {metric: value[episodes].mean(axis=1) for metric, value in applicable.items()}
         found.append(_Task(name, str(group[0]["memory_type"]), family, applicable, drawn))
     return found
+
+
+def _scenes(group: Sequence[Record]) -> NDArray[np.int64]:
+    """Return the rollouts of each scene of a task by their index, (S, V): V is 1 unless each scene has V variants."""
+    scenes: dict[Any, list[int]] = {}
+    for k, record in enumerate(group):
+        scenes.setdefault(record.get("seed") if varies(record) else (k,), []).append(k)
+    whole = len({len(scene) for scene in scenes.values()}) == 1
+    return np.array(list(scenes.values()) if whole else [[k] for k in range(len(group))])
 
 
 def _values(pairs: Sequence[Pair], metric: str) -> Array | None:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import Record, by_task, percent, wilson
+from lerobot_memobench.evaluation.metrics import Record, by_task, percent, varies, wilson
 from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, percentiles
 from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, figure, with_interval
 from lerobot_memobench.io import count_of
@@ -88,12 +88,12 @@ class _Task:
 
 
 def ran_evidence(records: Sequence[Record]) -> bool:
-    """Return whether each scene was run with each variant."""
+    """Return whether each scene was run with each variant, of a task that has several."""
     return any(map(_has_choice, records))
 
 
 def _has_choice(record: Record) -> bool:
-    return "choice" in record and bool(record.get("variants"))
+    return "choice" in record and varies(record)
 
 
 def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:

@@ -66,6 +66,7 @@ def protocol_phrases(run: Run) -> list[str]:
             for name in CONTROLLED
             if run.protocol.get(name, OMITTED[name]) != OMITTED[name]
         ),
+        *([f"salt {salt}"] if (salt := run.protocol.get("salt")) else []),
         *(["each scene with each variant"] if run.protocol.get("evidence") else []),
     ]
 

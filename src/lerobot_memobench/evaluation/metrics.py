@@ -95,6 +95,11 @@ def seed_base(record: Record) -> int:
     return int(record["seed"]) - int(record["episode"]) // int(record.get("variants") or 1)
 
 
+def varies(record: Record) -> bool:
+    """Return whether the scene of a rollout is run with several variants."""
+    return (record.get("variants") or 1) > 1
+
+
 PROTOCOL: dict[str, Callable[[Record], Any]] = {
     "referent settings": lambda record: str(record.get("referent")),
     "replan intervals": lambda record: str(record.get("replan_steps")),
@@ -126,7 +131,7 @@ def mixtures(records: Iterable[Record]) -> list[str]:
 
 def notes_on(records: Sequence[Record]) -> list[str]:
     """Return notes for a reader of the rollouts' figures, a sentence each."""
-    return faults(records) + unshown_prompts(records) + mixtures(records) + missing_scans(records)
+    return faults(records) + unshown_prompts(records) + unsettled(records) + mixtures(records) + missing_scans(records)
 
 
 def stand_ins_of(records: Iterable[Record]) -> list[str]:
@@ -148,6 +153,21 @@ def unshown_prompts(records: Iterable[Record]) -> list[str]:
         f"in episode {group[0]['episode']}; no memory of it can solve the task"
         for task, group in by_task(record for record in records if record.get("prompt_shown") is False).items()
     ]
+
+
+def unsettled(records: Iterable[Record]) -> list[str]:
+    """Return a sentence on the scenes in which an object was thrown, or still moved, before the first action."""
+    counts = []
+    for task, group in by_task(records).items():
+        scenes = {record.get("seed"): record.get("settled", True) for record in group}
+        if thrown := sum(not settled for settled in scenes.values()):
+            counts.append(f"{thrown} of {count_of(len(scenes), 'scene')} of {task}")
+    place = "results/unsettled_scenes.md lists those of the paper's seeds"
+    return (
+        [f"an object is thrown or still moves before the first action in {', '.join(counts)}; {place}"]
+        if counts
+        else []
+    )
 
 
 def faults(records: Iterable[Record]) -> list[str]:
@@ -179,8 +199,8 @@ class Rate:
         value: fraction in [0, 1]; None when not applicable.
         n: number of trials: rollouts, because checkpoints of one rollout are dependent; checkpoint records in pooled
             rates.
-        effective: of a mean of rates, the number of rollouts of a plain rate with the same standard error; None where
-            it is n.
+        effective: of a mean of rates, the number of rollouts of a plain rate with the same standard error; of rollouts
+            of each scene with each variant, the number of scenes; None where it is n.
     """
 
     value: float | None
@@ -227,7 +247,15 @@ def percent(value: float | None) -> float | None:
 
 def success_rate(records: Sequence[Record]) -> Rate:
     """Return the share of rollouts that succeeded."""
-    return Rate(sum(bool(record["success"]) for record in records) / len(records), len(records))
+    return Rate(sum(bool(record["success"]) for record in records) / len(records), len(records), _scenes(records))
+
+
+def _scenes(records: Sequence[Record]) -> int | None:
+    """Return the number of scenes where scenes are run with several variants, None elsewhere.
+
+    Rollouts of one scene depend on each other. An interval over scenes is at least as wide as one that knows how much.
+    """
+    return len({(record["task"], record.get("seed")) for record in records}) if any(map(varies, records)) else None
 
 
 def task_row(records: Sequence[Record]) -> Row:
@@ -235,7 +263,7 @@ def task_row(records: Sequence[Record]) -> Row:
     row = {"SR": success_rate(records)}
     for metric, operation in PROCESS_METRICS.items():
         found = checkpoint_rate(records, operation)
-        row[metric] = Rate(found.value, len(records) if found.n else 0)
+        row[metric] = Rate(found.value, len(records) if found.n else 0, _scenes(records))
     return row
 
 

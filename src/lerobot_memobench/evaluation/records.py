@@ -177,13 +177,24 @@ def unlike(runs: Sequence[Run]) -> list[str]:
     notes = []
     for run in runs[1:]:
         first = runs[0].name
-        if found := differences(runs[0].protocol, run.protocol, extent=True, ignore=("replan_steps",)):
+        if found := differences(runs[0].protocol, run.protocol, extent=True, ignore=("replan_steps", "salt")):
             notes.append(
                 f"{first} and {run.name} have different protocols ({'; '.join(found)}; the first value is that of "
                 f"{first}): do not compare their rates; `memobench compare` compares common episodes"
             )
-        notes += other_physics(runs[0], run) + other_hashes(runs[0].protocol, run.protocol)
+        notes += other_physics(runs[0], run) + other_hashes(runs[0].protocol, run.protocol) + other_draws(runs[0], run)
     return notes
+
+
+def other_draws(a: Run, b: Run) -> list[str]:
+    """Return a sentence where two evaluations of the sealed test have different salts."""
+    mine, other = (with_omitted(run.protocol)["salt"] for run in (a, b))
+    if mine == other:
+        return []
+    return [
+        f"{a.name} has the salt {mine or 'none'} and {b.name} {other or 'none'}: their variants and holds are two "
+        "draws of the same protocol; comparisons pair the episodes of equal variants"
+    ]
 
 
 def other_hashes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:

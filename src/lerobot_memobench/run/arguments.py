@@ -57,7 +57,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
             key: (f"env.{key}",)
             for key in (
                 *("convention", "difficulty", "protocol", "demonstration_prompt", "prompt_in", "horizon"),
-                *("pause_steps", "speed", "evidence", "videos"),
+                *("pause_steps", "speed", "evidence", "salt", "videos"),
                 *("corrupt", "corrupt_step", "reshow", "interference"),
             )
         },

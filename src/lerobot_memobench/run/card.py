@@ -300,7 +300,7 @@ def first_variant_mismatch(records: Iterable[Mapping[str, Any]]) -> str | None:
         if "choice" in record:  # each scene was run with each variant
             here = scene_and_variant(found, record["episode"])[1]
         else:
-            here = referent_of(found, seed).variant_index
+            here = referent_of(found, seed, record.get("salt")).variant_index
         if here != variant:
             return f"{task}, episode {record['episode']}: variant {variant} there, {here} by its seed here"
     return None

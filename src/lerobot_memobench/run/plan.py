@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import datetime as dt
 import itertools
+import secrets
 import shlex
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from lerobot_memobench.envs.evaluation_file import read_evaluation
+from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
 from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
 from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
 from lerobot_memobench.errors import MemobenchError, check_choice
@@ -158,7 +159,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     check_convention(asked.policy_path, policy, asked.env.get("convention"))
     output = _output(asked, options, policy)
     log = Path(asked.env.get("log_dir") or output)
-    asked = with_batch_size(with_protocol(asked, options, policy), options, log, policy)
+    asked = with_salt(with_batch_size(with_protocol(asked, options, policy), options, log, policy), options, log)
     environment = MemobenchEnvConfig(**{**asked.env, "log_dir": None, "resume": False})
     for name, value in vars(environment.settings_for(policy)).items():
         setattr(environment, name, value)
@@ -252,7 +253,7 @@ def check_corruption(plan: EvaluationPlan) -> None:
 
 
 def check_split(plan: EvaluationPlan) -> None:
-    """Refuse seeds outside the split that was named, and the sealed seeds where it was not.
+    """Refuse seeds outside the split that was named, and the sealed seeds or a salt where it was not.
 
     Raises:
         MemobenchError: they are refused.
@@ -264,6 +265,8 @@ def check_split(plan: EvaluationPlan) -> None:
             f"split={asked} has the seeds {split[0]} to {split[-1]}, and {seeds[0]} to {seeds[-1]} were asked for; "
             f"leave seed= out, and ask for at most {len(split)} episodes"
         )
+    if plan.environment.salt and asked != SEALED:
+        raise MemobenchError("found salt=, which is of the sealed test; leave it out, or run `memobench test-sealed`")
     if asked is None and seeds[0] <= sealed[-1] and seeds[-1] >= sealed[0]:
         raise MemobenchError(
             f"found seeds {seeds[0]} to {seeds[-1]}; {sealed[0]} to {sealed[-1]} are sealed: run them once per release "
@@ -330,6 +333,26 @@ def with_protocol(asked: EvaluationSettings, options: RunOptions, policy: PreTra
     if policy.type in SCRIPTED:
         asked = asked.env_default(**{SCRIPTED[policy.type]: True})
     return asked.env_default(videos=0 if asked.env.get("obs_type") == OBJECTS else VIDEO_EPISODES)
+
+
+def with_salt(asked: EvaluationSettings, options: RunOptions, log: Path) -> EvaluationSettings:
+    """Return settings with a random salt for a sealed evaluation; a resumed one, or a part of it, keeps its salt.
+
+    Raises:
+        MemobenchError: a part that was started by itself has no salt; it would differ from that of the other parts.
+    """
+    if options.split != SEALED or "salt" in asked.env:
+        return asked
+    if options.resume:
+        for folder in (log, *sorted(log.glob(Shard.FOLDERS))):
+            if protocol := protocol_of(folder):
+                return asked.env_default(salt=protocol.get("salt"))
+    if options.shard is not None:
+        raise MemobenchError(
+            f"found shard={options.shard} of a sealed test without salt=; start all parts by shards=, or give each "
+            "part the same 32 random hexadecimal digits as salt="
+        )
+    return asked.env_default(salt=secrets.token_hex(16))
 
 
 def with_batch_size(
@@ -440,6 +463,7 @@ class Shard:
 
     number: int
     count: int
+    FOLDERS: ClassVar = "shard-*-of-*"
 
     @classmethod
     def parse(cls, text: str) -> Shard:

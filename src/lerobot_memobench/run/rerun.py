@@ -49,8 +49,8 @@ from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.difficulty import STANDARD
 from lerobot_memobench.tasks.task import PUBLISHED
 
-MOST_STEPS = 100 * HORIZON
-"""Most control steps of an episode with its pauses."""
+MOST_STEPS = 400 * HORIZON
+"""Most control steps of an episode with its pauses and holds."""
 MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
 """Setting of the environment -> its largest number."""
 NAMED = {"success", "steps", "checkpoints"}
@@ -141,7 +141,7 @@ def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> Evaluation
     out = out or Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_rerun"
     shard = None if card["shard"] is None else Shard.parse(card["shard"])
     options = RunOptions(split=SEALED if "sealed" in card else None, shard=shard)
-    asked = card["asked"].env_default(convention=UPRIGHT)  # earlier cards do not name it
+    asked = card["asked"].env_default(convention=UPRIGHT, salt=None)  # earlier cards do not name them
     return make_plan(replace(asked, output_dir=str(out)), options, ("memobench", "rerun"))
 
 

@@ -131,12 +131,13 @@ def policy_hash(card: Mapping[str, Any]) -> str:
 
 
 def scenes_hash(card: Mapping[str, Any]) -> str:
-    """Return one hash for the scenes of an evaluation, from its card: task files, referent, seed, episodes."""
+    """Return one hash for the scenes of an evaluation, from its card: task files, referent, seed, episodes, salt."""
     protocol = card["protocol"]
     return _hash(
         [
             *(card["task_files"], card["policy"].get("seed"), protocol["episodes"]),
             *(protocol.get("referent"), protocol.get("evidence", False), *_world(protocol).values()),
+            *filter(None, [protocol.get("salt")]),  # earlier versions draw none
         ]
     )
 

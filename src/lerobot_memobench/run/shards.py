@@ -44,8 +44,6 @@ from lerobot_memobench.run.run import (
 )
 
 LOGS = "logs"
-SHARDS = "shard-*-of-*"
-"""Folders of the parts of an evaluation, in its own."""
 
 
 # --- parts as jobs ---
@@ -151,7 +149,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
     if options.shards > (batches := len(grid.cells())):
         raise MemobenchError(f"found shards={options.shards} and only {batches} batches of episodes; ask for fewer")
     own = dict.fromkeys(("shards", "workers", "slurm", "output_dir", "resume"))
-    words = with_changes(plan.command[2:], **own, batch_size=plan.batch)
+    words = with_changes(plan.command[2:], **own, batch_size=plan.batch, salt=plan.environment.salt)
     jobs = [
         ShardJob(
             program=tuple(program),
@@ -171,7 +169,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
         for folder in (out, *(job.folder for job in jobs)):
             resumed_card(folder, card, note)
     else:
-        for folder in (out, *out.glob(SHARDS)):
+        for folder in (out, *out.glob(Shard.FOLDERS)):
             check_new(folder)
     return jobs
 
@@ -218,7 +216,7 @@ def run_shards(
 
 def part_folders(out: Path) -> list[Path]:
     """Return the folders of an evaluation's parts that hold episodes."""
-    return sorted(folder for folder in out.glob(SHARDS) if folder.is_dir() and has_log(folder))
+    return sorted(folder for folder in out.glob(Shard.FOLDERS) if folder.is_dir() and has_log(folder))
 
 
 def merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
@@ -253,7 +251,7 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
     """
     sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
-        raise MemobenchError(f"{out} holds no parts ({SHARDS}); name the folders to merge")
+        raise MemobenchError(f"{out} holds no parts ({Shard.FOLDERS}); name the folders to merge")
     records = {source: read_log(source) for source in sources}
     protocols = {source: read_protocol(source) for source in sources}
     for source, lines in records.items():

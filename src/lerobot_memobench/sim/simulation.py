@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 MJCF_CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
 STABILISATION_STEPS = 10
 SETTLED_SHIFT, SETTLED_SPEED = 0.01, 0.02
-"""Largest horizontal shift of an object while a strict scene settles, m, and largest speed after it, m/s or rad/s."""
+"""Largest horizontal shift of an object while a scene settles, m, and largest speed after it, m/s or rad/s."""
 MAX_SCENES = 200
 """Maximum number of draws of a strict scene."""
 NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
@@ -92,6 +92,10 @@ class Simulation:
     Args:
         task: task that defines the scene; its goal is not used.
         render: size and quality of frames.
+
+    Attributes:
+        settled: whether objects rest where they were placed, and nothing moves, after `reset`; False in some published
+            scenes, whose placements are LIBERO's.
     """
 
     def __init__(self, task: Task, render: RenderSettings | None = None) -> None:
@@ -111,7 +115,7 @@ class Simulation:
         self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
         self._hidden = HiddenObjects(self.model, self.data)
         self._at_home: Snapshot | None = None
-        self.caught_at_home = False
+        self.caught_at_home, self.settled = False, True
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
         self._drawn: tuple[mujoco.MjModel, mujoco.MjData, DrawList | None] | None = None
@@ -142,8 +146,8 @@ class Simulation:
         self._at_home, self.caught_at_home = None, False
         self._hidden.absent = ()
         for draw in range(MAX_SCENES):
-            placement = self._set_up(seed, draw, settling)
-            if not self._strict or self._has_settled(placement):
+            self.settled = self._has_settled(self._set_up(seed, draw, settling))
+            if self.settled or not self._strict:
                 break
         else:
             raise MemobenchError(
@@ -174,7 +178,8 @@ class Simulation:
     def _has_settled(self, placement: Placement) -> bool:
         """Return whether objects rest where they were placed, and nothing moves."""
         others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
-        shifts = [self.data.body(name).xpos[:2] - placement.poses[name][:2] for name in self.task.objects]
+        poses = {name: pose for name, pose in placement.poses.items() if name in self.task.objects}
+        shifts = [self.data.body(name).xpos[:2] - pose[:2] for name, pose in poses.items()]
         moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
         return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[others:]).max(initial=0.0)) <= SETTLED_SPEED
 
