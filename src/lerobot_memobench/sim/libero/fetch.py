@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import httpx
+from huggingface_hub import snapshot_download
+
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import disk_refusal, file_hash, write_file
 from lerobot_memobench.sim.libero import files
@@ -16,28 +19,18 @@ def obtain() -> files.Place:
         MemobenchError: the hub cannot be reached, or has other files.
     """
     found = files.places()
-    if not found or found[-1].fault:
-        _download(again=any(place.source == files.HUB_CACHE for place in found))
-        files.check_assets()
-        found = files.places()
-    return found[-1]
-
-
-def _download(again: bool) -> None:
-    """Download the files that scenes read; those in the cache too if ``again``, because one of them is damaged."""
-    import httpx
-    from huggingface_hub import snapshot_download
-
-    wanted = [*files.known_hashes()]
+    if found and not found[-1].fault:
+        return found[-1]
+    wanted, damaged = [*files.known_hashes()], any(place.source == files.HUB_CACHE for place in found)
     try:
-        snapshot_download(files.REPOSITORY, repo_type="dataset", allow_patterns=wanted, force_download=again)
+        snapshot_download(files.REPOSITORY, repo_type="dataset", allow_patterns=wanted, force_download=damaged)
     except (OSError, httpx.TransportError) as error:
         if disk_refusal(error):
             raise
-        reason = " ".join(str(error).split())[:300]
-        raise MemobenchError(
-            f"{files.REPOSITORY} could not be fetched from the hub ({reason}); run: {files.INSTALL}, or {files.CARRY}"
-        ) from None
+        problem = f"{files.REPOSITORY} could not be fetched from the hub ({' '.join(str(error).split())[:300]})"
+        raise MemobenchError(f"{problem}; run: {files.INSTALL}, or {files.CARRY}") from None
+    files.check_assets()
+    return files.places()[-1]
 
 
 def copy_to(folder: Path) -> int:

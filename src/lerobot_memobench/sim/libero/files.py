@@ -11,11 +11,13 @@ import contextlib
 import hashlib
 import importlib.util
 import os
-import stat
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+
+import yaml
+from huggingface_hub import constants
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, file_hash
@@ -57,16 +59,11 @@ def known_hashes() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Place:
-    """A folder of this machine with LIBERO's assets.
-
-    Attributes:
-        source: how it was found, for messages.
-        fault: why it is not used; empty if every file that scenes read has its known hash.
-    """
+    """A folder with LIBERO's assets, how it was found, and why it is not used; "" if all files have their hashes."""
 
     source: str
     folder: Path
-    fault: str
+    fault: str = ""
 
 
 def places() -> list[Place]:
@@ -78,7 +75,7 @@ def places() -> list[Place]:
         except MemobenchError as error:
             found.append(Place(source, folder, str(error)))
         else:
-            return [*found, Place(source, folder, "")]
+            return [*found, Place(source, folder)]
     return found
 
 
@@ -88,11 +85,15 @@ def check_assets() -> Path:
     Raises:
         MemobenchError: no place has all files; the message lists incomplete places and how to obtain the files.
     """
-    found = places()
-    if not found or found[-1].fault:
-        skipped = "".join(f"; not used: {place.source}, {place.fault}" for place in found)
-        raise MemobenchError(f"LIBERO's assets, which every scene needs, are not on this machine{skipped}; {OBTAIN}")
-    return found[-1].folder
+    for place in (found := places()):
+        if not place.fault:
+            return place.folder
+    raise MemobenchError(f"LIBERO's assets, which every scene needs, are not on this machine{unused(found)}; {OBTAIN}")
+
+
+def unused(found: Iterable[Place]) -> str:
+    """Return the part of a message that names places with a fault."""
+    return "".join(f"; not used: {place.source}, {place.fault}" for place in found if place.fault)
 
 
 def asset(name: str) -> Path:
@@ -113,28 +114,18 @@ def _candidates() -> Iterator[tuple[str, Path]]:
         folder = Path(os.path.expanduser(named)).absolute()
         checkout = folder / "libero/libero/assets"
         yield ASSETS_VARIABLE, checkout if checkout.is_dir() else folder
-    found = [(f"LIBERO's {config}", folder) for config, folder in _configured()]
-    found.append(("LeRobot's download", Path(os.path.expanduser("~/.cache/libero/assets"))))
-    yield from (each for each in found if each[1].is_dir())
-    from huggingface_hub import constants
-
+    config = Path(os.path.expanduser(os.environ.get("LIBERO_CONFIG_PATH") or "~/.libero"), "config.yaml")
+    with contextlib.suppress(OSError, ValueError, yaml.YAMLError):
+        content = yaml.safe_load(config.read_bytes())
+        if isinstance(content, dict) and (folder := Path(os.path.expanduser(str(content.get("assets"))))).is_dir():
+            yield f"LIBERO's {config}", folder
+    if (folder := Path(os.path.expanduser("~/.cache/libero/assets"))).is_dir():
+        yield "LeRobot's download", folder
     snapshots = Path(constants.HF_HUB_CACHE, f"datasets--{REPOSITORY.replace('/', '--')}", "snapshots")
     yield from ((HUB_CACHE, folder) for folder in sorted(snapshots.glob("*/")))
     installed = importlib.util.find_spec(PACKAGE)
     for place in (installed.submodule_search_locations or ()) if installed else ():
         yield f"the packages {DISTRIBUTIONS}", Path(place, "assets")
-
-
-def _configured() -> Iterator[tuple[Path, Path]]:
-    """Yield LIBERO's configuration file and its folder of assets, if the file exists and names one."""
-    config = Path(os.path.expanduser(os.environ.get("LIBERO_CONFIG_PATH") or "~/.libero"), "config.yaml")
-    if config.is_file():
-        import yaml
-
-        with contextlib.suppress(OSError, ValueError, yaml.YAMLError):
-            content = yaml.safe_load(config.read_bytes())
-            if isinstance(content, dict) and isinstance(folder := content.get("assets"), str):
-                yield config, Path(os.path.expanduser(folder))
 
 
 @cache
@@ -147,9 +138,16 @@ def _verified(folder: Path) -> dict[str, Path]:
     Raises:
         MemobenchError: naming the first file that is missing or has another content.
     """
-    paths = {name: folder / name for name in known_hashes()}
+    paths, versions = {name: folder / name for name in known_hashes()}, [*known_hashes().items()]
     try:
-        stamp = cache_folder() / "libero" / f"{_version(paths.values())}.verified"
+        for path in paths.values():
+            state = path.stat()
+            if not path.is_file():
+                raise MemobenchError(f"{path} is no file")
+            # Programs can set the time of modification, but not the time of the last change.
+            times = state.st_mtime_ns, state.st_ctime_ns
+            versions.append((str(path), repr((state.st_dev, state.st_ino, state.st_size, *times))))
+        stamp = cache_folder() / "libero" / f"{hashlib.sha256(repr(versions).encode()).hexdigest()}.verified"
         if not stamp.exists():
             for name, path in paths.items():
                 if file_hash(path) != known_hashes()[name]:
@@ -160,19 +158,6 @@ def _verified(folder: Path) -> dict[str, Path]:
     except OSError as error:
         raise MemobenchError(f"{error.filename} cannot be read ({error.strerror})") from None
     return paths
-
-
-def _version(paths: Iterable[Path]) -> str:
-    """Return a hash of the known content of LIBERO's files and the present state of these files."""
-    found = hashlib.sha256(repr(known_hashes()).encode())
-    for path in paths:
-        state = path.stat()
-        if not stat.S_ISREG(state.st_mode):
-            raise MemobenchError(f"{path} is no file")
-        # Programs can set the time of modification, but not the time of the last change.
-        times = state.st_mtime_ns, state.st_ctime_ns
-        found.update(repr((str(path), state.st_dev, state.st_ino, state.st_size, *times)).encode())
-    return found.hexdigest()
 
 
 def user_objects(built_in: Collection[str]) -> dict[str, Path]:
