@@ -41,19 +41,18 @@ def compile_imports(folders: Iterable[Path]) -> None:
 
 
 def render() -> None:
-    """Step and render a simulation, which makes numba compile and cache its functions."""
-    with contextlib.suppress(Exception):
-        from lerobot_memobench.sim.rendering import RenderSettings
-        from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
-        from lerobot_memobench.tasks.catalogue import get_task, task_names
+    """Step and render a simulation, so that numba compiles and caches its functions, and meshes are cached."""
+    from lerobot_memobench.sim.rendering import QUALITIES, RenderSettings
+    from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
+    from lerobot_memobench.tasks.catalogue import get_task, task_names
 
-        for quality in ("fast", "default"):
-            simulation = Simulation(get_task(task_names()[0]), RenderSettings(64, 64, quality))
-            simulation.reset(0)
-            simulation.step(NO_OP)
-            for camera in MJCF_CAMERAS:
-                simulation.render(camera)
-                simulation.geoms(camera)
+    for quality in QUALITIES:
+        simulation = Simulation(get_task(task_names()[0]), RenderSettings(64, 64, quality))
+        simulation.reset(0)
+        simulation.step(NO_OP)
+        for camera in MJCF_CAMERAS:
+            simulation.render(camera)
+            simulation.geoms(camera)
 
 
 if __name__ == "__main__":

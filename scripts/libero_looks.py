@@ -3,7 +3,7 @@
     python scripts/libero_looks.py errors [--sheet FILE]     # one scene of each task without scans
     python scripts/libero_looks.py worlds FILE               # both worlds, side by side
 
-Needs ``PYTHONPATH=src:.`` and the extra [libero]; `errors` also needs MuJoCo's renderer (``MUJOCO_GL=egl``).
+Needs ``PYTHONPATH=src:.``; `errors` also needs MuJoCo's renderer (``MUJOCO_GL=egl``).
 """
 
 from __future__ import annotations

@@ -209,7 +209,7 @@ def as_path(word: str) -> str:
 def file_hash(path: Path) -> str:
     """Return the sha256 (hex) of a file; cached per process until the file changes."""
     found = os.stat(path)
-    return _hash_of(str(path), found.st_ino, found.st_size, found.st_mtime_ns)
+    return _hash_of(str(path), found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -15,6 +15,8 @@ import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
 
+from lerobot_memobench.sim.rendering import QUALITIES
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from tests.support.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
@@ -86,6 +88,13 @@ def test_late_imports_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.syspath_prepend(library)
     script.compile_imports([source])
     assert Path(importlib.util.cache_from_source(str(library / "found_late.py"))).is_file()
+
+
+def test_setup_renders_all_qualities(monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered = []
+    monkeypatch.setattr(Simulation, "geoms", lambda simulation, camera: rendered.append(camera))
+    load_script("compile_imports").render()
+    assert rendered == [*MJCF_CAMERAS] * len(QUALITIES)
 
 
 def executable(path: Path, text: str) -> None:

