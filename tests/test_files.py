@@ -46,6 +46,20 @@ def test_folders_are_read_through_links_once(tmp_path: Path) -> None:
         (elsewhere / "broken.h5").symlink_to("nothing")
 
 
+def test_a_folder_that_cannot_be_read_is_not_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "secret").mkdir()
+    scan = os.scandir
+
+    def refusing(path: str) -> object:
+        if os.path.basename(path) == "secret":  # permissions do not bind root
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refusing)
+    with pytest.raises(MemobenchError, match=r"secret cannot be read \(Permission denied\)"):
+        files_below(tmp_path)
+
+
 def test_every_tree_is_read_by_the_one_function() -> None:
     source = Path(lerobot_memobench.__file__).parent
     used = [

@@ -115,11 +115,19 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
     Links to folders are followed. Each folder is read once, so links in a circle end.
 
     Raises:
-        MemobenchError: one of them is a pipe, a device or a broken link, which would block or end its reader.
+        MemobenchError: one of them is a pipe, a device or a broken link, which would block or end its reader; or a
+            folder cannot be read.
     """
+
+    def refuse(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError | NotADirectoryError):
+            raise MemobenchError(
+                f"{error.filename} cannot be read ({error.strerror}); change its permissions"
+            ) from None
+
     found: list[Path] = []
     seen: set[tuple[int, int]] = set()
-    for place, folders, names in os.walk(folder, followlinks=True):
+    for place, folders, names in os.walk(folder, onerror=refuse, followlinks=True):
         there = os.stat(place)
         if (there.st_dev, there.st_ino) in seen:
             folders.clear()
