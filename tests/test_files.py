@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -176,3 +178,17 @@ def test_a_word_is_a_path_for_every_library(
     monkeypatch.chdir(tmp_path)
     Path("run: 2").mkdir()
     assert as_path(word) == leads_to.format(here=tmp_path)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no /dev/full")
+def test_a_full_disk_of_the_output_is_not_that_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = open("/dev/full", "w")  # noqa: SIM115 - closing it fails
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "stdout", full)
+        with (
+            pytest.raises(MemobenchError, match=r"^the output of this command cannot be written \(No space .*; kept$"),
+            explaining_disk_errors(tmp_path, "kept"),
+        ):
+            print("a report", flush=True)
+    with contextlib.suppress(OSError):
+        full.close()

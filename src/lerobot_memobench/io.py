@@ -258,10 +258,24 @@ def explaining_disk_errors(out: Path, kept: str = "") -> Iterator[None]:
         named = getattr(error, "filename", None)
         if refusal is None or (named is not None and not _is_of(Path(os.fsdecode(named)), out)):
             raise
+        if _output_refuses():
+            raise MemobenchError(
+                f"the output of this command cannot be written ({refusal}): send it elsewhere{kept and '; ' + kept}"
+            ) from error
         raise MemobenchError(
             f"{out} cannot be written ({refusal}; {in_words(free_bytes(out))} are free there): make room, or name "
             f"another folder{kept and '; ' + kept}"
         ) from error
+
+
+def _output_refuses() -> bool:
+    """Return whether an output of this process holds text that it cannot write, as after an error of `print`."""
+    try:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            stream.flush()
+    except (OSError, ValueError):  # ValueError: it is closed
+        return True
+    return False
 
 
 def _is_of(path: Path, out: Path) -> bool:
