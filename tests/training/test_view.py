@@ -159,6 +159,10 @@ def test_command_writes_a_view(pictured: Path, tmp_path: Path, capsys: pytest.Ca
     assert set(inputs(out)) == {STATE, SLOTS}
     for words in (["--out", str(out)], ["--out", str(tmp_path / "b"), "--obs-type", "some"]):
         assert memobench(["view", str(pictured), *words]) == 2
+    assert memobench(["view", str(out), "--out", str(tmp_path / "again")]) == 0
+    first, again = opened(out), opened(tmp_path / "again")
+    assert len(first) == len(again)
+    assert [*again.meta.episodes["source_episode_index"]] == [*range(first.num_episodes)], "those of the view"
 
 
 @pytest.mark.parametrize(

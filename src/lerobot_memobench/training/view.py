@@ -326,6 +326,7 @@ def _episodes_of(rows: pa.Table, part: Part, fps: float) -> pa.Table:
         if name.endswith("/from_timestamp"):
             changed[name] = rows.column(name).to_numpy() + part.offsets[stretches] / fps
             changed[name.replace("/from_", "/to_")] = changed[name] + lengths / fps
+    rows = rows.select([name for name in rows.column_names if name != SOURCE_EPISODE])  # a view of a view has it
     rows = rows.append_column(SOURCE_EPISODE, rows.column("episode_index"))
     for name, values in changed.items():
         rows = rows.set_column(rows.column_names.index(name), name, pa.array(values, rows.schema.field(name).type))
