@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -44,6 +46,20 @@ def test_folders_are_read_through_links_once(tmp_path: Path) -> None:
         assert len(files_below(tree, ".txt")) == 1
         (elsewhere / name).unlink()
         (elsewhere / "broken.h5").symlink_to("nothing")
+
+
+def test_a_folder_that_cannot_be_read_is_not_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "secret").mkdir()
+    scan = os.scandir
+
+    def refusing(path: str) -> object:
+        if os.path.basename(path) == "secret":  # permissions do not bind root
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refusing)
+    with pytest.raises(MemobenchError, match=r"secret cannot be read \(Permission denied\)"):
+        files_below(tmp_path)
 
 
 def test_every_tree_is_read_by_the_one_function() -> None:
@@ -162,3 +178,17 @@ def test_a_word_is_a_path_for_every_library(
     monkeypatch.chdir(tmp_path)
     Path("run: 2").mkdir()
     assert as_path(word) == leads_to.format(here=tmp_path)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no /dev/full")
+def test_a_full_disk_of_the_output_is_not_that_of_the_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = open("/dev/full", "w")  # noqa: SIM115 - closing it fails
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "stdout", full)
+        with (
+            pytest.raises(MemobenchError, match=r"^the output of this command cannot be written \(No space .*; kept$"),
+            explaining_disk_errors(tmp_path, "kept"),
+        ):
+            print("a report", flush=True)
+    with contextlib.suppress(OSError):
+        full.close()

@@ -115,11 +115,19 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
     Links to folders are followed. Each folder is read once, so links in a circle end.
 
     Raises:
-        MemobenchError: one of them is a pipe, a device or a broken link, which would block or end its reader.
+        MemobenchError: one of them is a pipe, a device or a broken link, which would block or end its reader; or a
+            folder cannot be read.
     """
+
+    def refuse(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError | NotADirectoryError):
+            raise MemobenchError(
+                f"{error.filename} cannot be read ({error.strerror}); change its permissions"
+            ) from None
+
     found: list[Path] = []
     seen: set[tuple[int, int]] = set()
-    for place, folders, names in os.walk(folder, followlinks=True):
+    for place, folders, names in os.walk(folder, onerror=refuse, followlinks=True):
         there = os.stat(place)
         if (there.st_dev, there.st_ino) in seen:
             folders.clear()
@@ -250,10 +258,24 @@ def explaining_disk_errors(out: Path, kept: str = "") -> Iterator[None]:
         named = getattr(error, "filename", None)
         if refusal is None or (named is not None and not _is_of(Path(os.fsdecode(named)), out)):
             raise
+        if _output_refuses():
+            raise MemobenchError(
+                f"the output of this command cannot be written ({refusal}): send it elsewhere{kept and '; ' + kept}"
+            ) from error
         raise MemobenchError(
             f"{out} cannot be written ({refusal}; {in_words(free_bytes(out))} are free there): make room, or name "
             f"another folder{kept and '; ' + kept}"
         ) from error
+
+
+def _output_refuses() -> bool:
+    """Return whether an output of this process holds text that it cannot write, as after an error of `print`."""
+    try:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            stream.flush()
+    except (OSError, ValueError):  # ValueError: it is closed
+        return True
+    return False
 
 
 def _is_of(path: Path, out: Path) -> bool:

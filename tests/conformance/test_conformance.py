@@ -252,7 +252,17 @@ def test_strides_that_an_interval_divides_conform(
     check = "remembers every control step"
     assert run_check(check, Behaviour(subject)).outcome is Outcome.PASSED
     assert subject.policy.config.n_action_steps == 3
-    monkeypatch.setattr(subject.policy, "__class__", flaws(type(subject.policy))[check])
+    made: Any = type(subject.policy)
+
+    class Refusing(made):
+        def select_action(self, batch: Any, **settings: Any) -> Any:
+            if self.config.n_action_steps == 5:
+                raise ValueError("no such interval")
+            return super().select_action(batch, **settings)
+
+    monkeypatch.setattr(subject.policy, "__class__", Refusing)
+    assert run_check(check, Behaviour(subject)).outcome is Outcome.PASSED, "other intervals are tried"
+    monkeypatch.setattr(subject.policy, "__class__", flaws(made)[check])
     assert run_check(check, Behaviour(subject)).outcome is not Outcome.PASSED
 
 

@@ -8,6 +8,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -15,9 +16,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
+from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.io_utils import load_tasks, write_tasks
 
 from lerobot_memobench.cli import data as commands
+from lerobot_memobench.datasets import statistics
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS
 from lerobot_memobench.datasets.frames import holds_texts, read_frame_table
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
@@ -25,6 +29,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import image_key, read_inf
 from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes, read_episode
 from lerobot_memobench.datasets.statistics import check_statistics, complete, lacking, measured
 from lerobot_memobench.datasets.validate import Verdict, images_of, replay, validate
+from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import LEVELS
@@ -273,3 +278,27 @@ def test_other_statistics_are_found(synthetic, copy):
         path.write_text(json.dumps(stats))
         with pytest.raises(MemobenchError, match=f"^{key} of {name} is"):
             check_statistics(root, [name] if name in names else names)
+
+
+def test_statistics_of_images_weight_episodes_as_lerobot_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long bright episode and a short dark one: each counts by LeRobot's number of sampled frames."""
+    lengths = [4000, 100]
+    episodes = [np.full((length, 4, 4, 3), level, np.uint8) for length, level in zip(lengths, (255, 0), strict=True)]
+
+    def read(episode: int, frames: list[int]) -> torch.Tensor:
+        return torch.from_numpy(episodes[episode][frames]).permute(0, 3, 1, 2) / 255
+
+    monkeypatch.setattr(statistics, "frame_reader", lambda *_: read)
+    monkeypatch.setattr(statistics, "read_frame_table", lambda _: SimpleNamespace(episodes=np.cumsum([0, *lengths])))
+    monkeypatch.setattr(statistics, "read_info", lambda _: {"features": {"a": {"dtype": "video"}}})
+    monkeypatch.setattr(statistics, "read_recorded", lambda *_: ({}, None))
+    written = []
+    for episode in episodes:
+        seen = ImageHistograms()
+        for frame in episode:
+            seen.add(frame)
+        written.append({"a": seen.stats()})
+    expected, found = aggregate_stats(written)["a"], statistics.compute(tmp_path, ["a"])["a"]
+    assert {name: value.tolist() for name, value in found.items()} == {
+        name: value.tolist() for name, value in expected.items()
+    }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,16 @@ def test_a_log_of_plain_lerobot_eval_is_resumed(fake_loop: FakeLoop, capsys: pyt
     record = {"task": STOVE, "memory_type": "temporal", "episode": 0, "success": True, "checkpoints": []}
     EpisodeLog("foreign/shard-1-of-2").append(record)
     assert evaluate("output_dir=foreign", "shard=1/2") == 2
+
+
+def test_a_part_has_the_settings_of_the_other_parts(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate("output_dir=out", "shard=1/2") == 0
+    fake_loop.ran.clear()
+    assert evaluate("output_dir=out", "shard=2/2", "horizon=40") == 2
+    assert re.search(r"shard-1-of-2 holds an evaluation with another protocol \(horizon: ", capsys.readouterr().err)
+    assert not fake_loop.ran
+    assert not Path("out/shard-2-of-2").exists()
+    assert evaluate("output_dir=out", "shard=2/2") == 0
 
 
 def test_parts_have_whole_batches_on_any_machine(

@@ -55,7 +55,7 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
         **{"variant": task.variant_index, "replan_steps": 5, "prompt_shown": None if task.prompt is None else True},
         **{"prompt_steps": published.prompt_steps, "steps": steps, "success": success},
         **(choice if settings.get("evidence") else {}),
-        **({"paused_steps": 500} if settings.get("pause_steps") else {}),
+        **({"paused_steps": steps // 50 * 100} if settings.get("pause_steps") else {}),
         "checkpoints": [
             {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
             for c, step in zip(task.checkpoints, marks, strict=True)

@@ -141,10 +141,14 @@ def test_trainings_share_a_view(pictured: Path, tmp_path: Path, monkeypatch: pyt
         found = viewed(given, None, OBJECTS, notes.append)
     folder = Path(str(found.get("dataset.root")))
     assert set(inputs(folder)) == {STATE, SLOTS}
+    assert not [note for note in notes if "pixels" in note]
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
     kept = viewed(given, True, None, notes.append)
     assert "observation.phase" not in str(kept.get("policy.input_features"))
     assert "observation.images.image" in str(kept.get("policy.input_features"))
+    (note,) = (note for note in notes if "pixels" in note)
+    assert "pixels, and policy=act does not resize them" in note
+    assert "256 x 256" in note
     with pytest.raises(MemobenchError, match=r"episodes=\[7\]"):
         viewed(given.default("dataset.episodes", "[7]"), None, None, notes.append)
 
@@ -155,6 +159,10 @@ def test_command_writes_a_view(pictured: Path, tmp_path: Path, capsys: pytest.Ca
     assert set(inputs(out)) == {STATE, SLOTS}
     for words in (["--out", str(out)], ["--out", str(tmp_path / "b"), "--obs-type", "some"]):
         assert memobench(["view", str(pictured), *words]) == 2
+    assert memobench(["view", str(out), "--out", str(tmp_path / "again")]) == 0
+    first, again = opened(out), opened(tmp_path / "again")
+    assert len(first) == len(again)
+    assert [*again.meta.episodes["source_episode_index"]] == [*range(first.num_episodes)], "those of the view"
 
 
 @pytest.mark.parametrize(

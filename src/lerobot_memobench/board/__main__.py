@@ -23,7 +23,7 @@ def main(words: list[str]) -> int:
     try:
         if words[1:]:
             changed = check_paths(filter(None, Path(words[1]).read_bytes().decode(errors="replace").split("\0")))
-            if author := "".join(words[2:]):
+            for author in words[2:]:
                 check_author(author, changed, Path(words[0]), BOARD)
         rows = read_board(Path(words[0]))
     except (MemobenchError, OSError) as error:  # quoted lines could be commands of the workflow

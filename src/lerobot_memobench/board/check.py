@@ -21,7 +21,8 @@ from lerobot_memobench.board.submission import PAUSES, RERUNS, Evaluation, Submi
 from lerobot_memobench.datasets.generation import task_hash
 from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, OMITTED, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PIXELS, EnvSettings
+from lerobot_memobench.envs.pacing import paused
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PIXELS, SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.metrics import failure_of, operations, seed_base
@@ -36,6 +37,7 @@ from lerobot_memobench.protocol import (
 )
 from lerobot_memobench.run.card import PACKAGES, first_variant_mismatch
 from lerobot_memobench.run.sealed import policy_hash, scenes_hash
+from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS
 from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
@@ -62,7 +64,7 @@ REQUIRED = {
     found.name: found.specifier for found in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not found.marker
 }
 """Package -> its versions under which this package runs."""
-SCENE, HASH_VERSION = re.compile(r"[0-9a-f]{16}"), "scene_hash_version"
+SCENE = re.compile(r"[0-9a-f]{16}")
 SCRIPTS = ("memobench_expert", "memobench_blind")
 """Policies whose actions the simulator computes."""
 OBJECTS_READ = "objects"
@@ -161,10 +163,10 @@ def check_submission(submission: Submission, others: Sequence[Submission] = (), 
     run = submission.evaluation
     _check_protocol(run)
     names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
-    least = 1 if part else FEWEST
-    _check_evaluation(run, names, least)
+    fewest = 1 if part else FEWEST
+    _check_evaluation(run, names, fewest)
     for name, control in submission.controls.items():
-        _check_control(run, control, name, names, least)
+        _check_control(run, control, name, names, fewest)
     for other in others:
         _check_original(submission, other)
     _check_scenes([run for each in (*others, submission) for run in (each.evaluation, *each.controls.values())])
@@ -199,7 +201,7 @@ def _check_protocol(run: Evaluation, **control: Any) -> None:
         raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
 
 
-def _check_control(run: Evaluation, control: Evaluation, name: str, names: Sequence[str], least: int) -> None:
+def _check_control(run: Evaluation, control: Evaluation, name: str, names: Sequence[str], fewest: int) -> None:
     """Check that an evaluation is of the same policy under one control."""
     _check_protocol(control, **CONTROL_SETTING[name])
     for key in ("type", "sha256", "settings"):
@@ -208,7 +210,7 @@ def _check_control(run: Evaluation, control: Evaluation, name: str, names: Seque
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
     if found := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
         raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
-    _check_evaluation(control, names, least)
+    _check_evaluation(control, names, fewest)
 
 
 # --- the log against card, catalogue and seeds ---
@@ -255,22 +257,21 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
             )
 
 
-def _check_extent(run: Evaluation, names: Sequence[str], least: int) -> None:
+def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
     """Check that the log holds each episode of each task once, from the first seed of a split on."""
     protocol, seed = run.protocol, run.card[POLICY].get("seed")
-    count, base = protocol["episodes"], protocol["seed_base"]
-    most = MOST
+    count, base, most = protocol["episodes"], protocol["seed_base"], MOST
     if protocol["evidence"]:  # whole scenes
-        least, most = max((len(get_task(name).random_variants) for name in names), default=1), EVIDENCE_EPISODES
+        fewest, most = max((len(get_task(name).random_variants) for name in names), default=1), EVIDENCE_EPISODES
     if base not in list(SEEDS) or seed != base:
         raise MemobenchError(
             f"{run.place}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
             "of the seeds that count"
         )
-    if not least <= count <= most or sorted(protocol["tasks"]) != sorted(names):
+    if not fewest <= count <= most or sorted(protocol["tasks"]) != sorted(names):
         raise MemobenchError(
             f"{run.place}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
-            f"{len(names)} tasks; expected {least} to {most} episodes of each"
+            f"{len(names)} tasks; expected {fewest} to {most} episodes of each"
         )
     asked = set(itertools.product(names, range(count)))
     there = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
@@ -364,7 +365,9 @@ def _conjuncts(formula: Formula, kinds: Any) -> set[Formula]:
 
 def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mapping[str, Any]) -> None:
     """Check that a line has the fields of its control and no others, with the catalogue's variants and chance."""
-    expected = {"paused_steps": record.get("paused_steps")} if protocol["pause_steps"] else {}
+    steps = record.get("paused_steps")
+    possible = paused(protocol["pause_steps"], protocol["replan_steps"], record.get("steps") or 0)
+    expected: dict[str, Any] = {"paused_steps": steps if steps in possible else possible} if possible else {}
     if protocol["evidence"]:
         choice = record.get("choice")
         answered = choice is not None or record.get("answered", False)
@@ -424,23 +427,25 @@ def _check_scenes(runs: Sequence[Evaluation]) -> None:
 
     Hashes of scenes depend on MuJoCo, on LIBERO's missing scans and on the version of the hash.
     """
-    scenes: dict[Any, str] = {}
-    seeds: dict[Any, int] = {}
+    scenes: dict[Any, tuple[str, Path]] = {}
+    seeds: dict[Any, tuple[int, Path]] = {}
     for run in runs:
-        simulator = (
-            run.card["runs"][-1]["versions"].get("mujoco"),
-            run.protocol.get(HASH_VERSION, 1),
-            run.protocol["world"],
-        )
+        version = run.protocol[SCENE_HASHES]
+        if version > SCENE_HASH_VERSION:
+            raise MemobenchError(
+                f"{run.place}: {SCENE_HASHES} is {version}; expected at most {SCENE_HASH_VERSION}, that of this version"
+            )
+        simulator = run.card["runs"][-1]["versions"].get("mujoco"), version, run.protocol["world"]
         for record in run.records:
             kind = (*simulator, *record.get("stand_ins", ()), record["task"])
             scene, seed = str(record.get("scene_hash")), record["seed"]
-            known = scenes.setdefault((kind, seed), scene), seeds.setdefault((kind, scene), seed)
-            if not SCENE.fullmatch(scene) or known != (scene, seed):
+            of_seed, at = scenes.setdefault((kind, seed), (scene, run.place))
+            of_scene, there = seeds.setdefault((kind, scene), (seed, run.place))
+            if not SCENE.fullmatch(scene) or (of_seed, of_scene) != (scene, seed):
                 raise MemobenchError(
                     f"{run.place}: {record['task']}, episode {record['episode']} has the scene {scene[:20]!r} of seed "
-                    f"{seed}; another rollout of the board has {known[0][:20]!r} for this seed, and this scene for "
-                    f"{known[1]}; expected hashes of 16 digits, equal for equal seeds only"
+                    f"{seed}; {at} has {of_seed[:20]!r} for this seed, and {there} this scene for {of_scene}; expected "
+                    "hashes of 16 digits, equal for equal seeds only: one of these folders was changed"
                 )
 
 

@@ -70,7 +70,7 @@ def _image_stats(folder: Path, camera: str) -> Stats:
             images = read(episode, sampled[first : first + BLOCK])
             for image in (images * 255).round().byte().permute(0, 2, 3, 1).numpy():
                 seen.add(np.ascontiguousarray(image))
-        found.append({camera: seen.stats()})
+        found.append({camera: seen.stats(sampled=True)})
     stats: Stats = aggregate_stats(found)[camera]
     return stats
 

@@ -146,14 +146,17 @@ class ImageHistograms:
         counts = [cv2.calcHist([frame], [channel], None, [256], [0, 256])[:, 0] for channel in range(3)]
         self._counts.append(np.array(counts, dtype=np.int32))
 
-    def stats(self) -> Stats:
+    def stats(self, *, sampled: bool = False) -> Stats:
         """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,).
 
         They are over LeRobot's sample of frames, but exact over its pixels: values of eight bits need 256 bins.
+
+        Args:
+            sampled: whether the added frames are the sample, not the episode.
         """
         from lerobot.datasets.compute_stats import sample_indices
 
-        chosen = sample_indices(len(self._counts))
+        chosen = range(len(self._counts)) if sampled else sample_indices(len(self._counts))
         counts = np.stack([self._counts[index] for index in chosen]).sum(axis=0, dtype=np.int64)
         levels, total = np.arange(256) / 255.0, counts[0].sum()
         mean = counts @ levels / total

@@ -147,12 +147,16 @@ def _length(policy: Any, name: str, feature: PolicyFeature | None, trained: Mapp
     return None if padded is not None and feature.shape == (padded,) else int(feature.shape[0])
 
 
+def keeps_sizes(policy: PreTrainedConfig) -> bool:
+    """Return whether a policy reads pictures in the size of its training data alone."""
+    resizes = SIZE_COUNTS.get(policy.type)
+    return policy.type in SIZE_COUNTS and (resizes is None or getattr(policy, resizes) is None)
+
+
 def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, PolicyFeature]) -> None:
-    if policy.type not in SIZE_COUNTS:
+    if not keeps_sizes(policy):
         return
     resizes = SIZE_COUNTS[policy.type]
-    if resizes is not None and getattr(policy, resizes) is not None:
-        return
     for name, feature in policy.image_features.items():
         if name in there and tuple(there[name].shape) != tuple(feature.shape):
             here, seen = (" x ".join(map(str, shape[1:])) for shape in (there[name].shape, feature.shape))

@@ -64,7 +64,7 @@ class EvaluationPlan:
         policy: configuration of the policy.
         environment: configuration of the environment.
         grid: episodes of each task, in batches.
-        output: folder of the evaluation; contains the shards.
+        output: folder of the evaluation, or of its part (``shard=``).
         log: folder of the episode log, the report and the card.
         options: options of the run, such as shards and memory reads.
         command: the typed command line, for the card.

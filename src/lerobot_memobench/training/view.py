@@ -43,7 +43,8 @@ from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
-from lerobot_memobench.protocol import CLOCK
+from lerobot_memobench.policies.compatibility import keeps_sizes
+from lerobot_memobench.protocol import CLOCK, IMAGE_SIZE
 from lerobot_memobench.run.arguments import LerobotArguments
 from lerobot_memobench.training.configuration import check_environment, read_config, with_features
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
@@ -119,6 +120,13 @@ def viewed(
     features = {new: meta.features[name] for name, new in kept.items()}
     check_environment(config, meta, features)
     check_inputs(policy, meta, features)
+    sizes = [tuple(features[name]["shape"][:2]) for name in cameras_of(features)]
+    if _is_ours(meta.features) and keeps_sizes(policy) and any(size != (IMAGE_SIZE, IMAGE_SIZE) for size in sizes):
+        height, width = sizes[0]
+        notify(
+            f"note: {meta.root} has pictures of {height} x {width} pixels, and policy={policy.type} does not resize "
+            f"them; it cannot be evaluated on the benchmark, which has {IMAGE_SIZE} x {IMAGE_SIZE}"
+        )
     if given.streaming and not (Path(meta.root) / "data").is_dir():
         if needs_view(meta.features, choice):
             raise MemobenchError(
@@ -318,6 +326,7 @@ def _episodes_of(rows: pa.Table, part: Part, fps: float) -> pa.Table:
         if name.endswith("/from_timestamp"):
             changed[name] = rows.column(name).to_numpy() + part.offsets[stretches] / fps
             changed[name.replace("/from_", "/to_")] = changed[name] + lengths / fps
+    rows = rows.select([name for name in rows.column_names if name != SOURCE_EPISODE])  # a view of a view has it
     rows = rows.append_column(SOURCE_EPISODE, rows.column("episode_index"))
     for name, values in changed.items():
         rows = rows.set_column(rows.column_names.index(name), name, pa.array(values, rows.schema.field(name).type))
