@@ -13,7 +13,7 @@ import pytest
 from lerobot_memobench.datasets.recording import HOLD_FRAMES
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.expert import Expert, steps_of
+from lerobot_memobench.experts.expert import Expert, final_atoms, steps_of
 from lerobot_memobench.experts.hand import (
     MAX_OPENING_STEPS,
     OPEN,
@@ -98,6 +98,13 @@ def with_goal(name: str, goal: list[object]) -> Task:
 )
 def test_steps_of_a_formula(formula: list[object], expected: list[str]) -> None:
     assert [" ".join((atom.predicate, *atom.args)) for atom in steps_of(parse_formula(formula))] == expected
+
+
+def test_a_repair_does_not_repeat_what_only_precedes_the_end() -> None:
+    goal = parse_formula(
+        ["and", ["when", ["on", "a", "b"], ["then", ["on", "c", "d"]]], ["hold", 10, ["on", "a", "b"]]]
+    )
+    assert [str(atom) for atom in final_atoms(goal)] == ["(On a b)"]
 
 
 @pytest.mark.parametrize(
