@@ -240,7 +240,8 @@ def test_waits_for_late_opening_fingers(
 ) -> None:
     """Three steps with an opening command count; steps in which the command stays closed do not."""
     commands = iter([1.0] * (kept_shut + 1) + [0.75, 0.5, 0.25])
-    sim = SimpleNamespace(eef_pose=lambda: (np.zeros(3), np.eye(3)), command=1.0)
+    task = SimpleNamespace(suite="strict")
+    sim = SimpleNamespace(eef_pose=lambda: (np.zeros(3), np.eye(3)), command=1.0, task=task)
     sim.gripper_command = lambda: sim.command
     monkeypatch.setattr(Hand, "toward", lambda self, position, rotation, gripper: np.full(7, gripper, np.float32))
     actions = []

@@ -128,7 +128,7 @@ def _handle_roll(hand: Hand, articulation: Articulation, tilt: float) -> float:
         return max(hand_penetration(hand, "", way, rotation, HANDLE_MARGIN) for way in ways)
 
     rolls = (0.0,) if articulation.handle.length < OPEN_WIDTH else (WIDE_HANDLE_ROLL, -WIDE_HANDLE_ROLL)
-    return min(rolls, key=collision)
+    return min(rolls if hand.strict else rolls[:1], key=collision)
 
 
 def open_drawer(hand: Hand, region: str) -> Steps:
@@ -197,7 +197,7 @@ def _free_side(hand: Hand, articulation: Articulation, rotation: Array, out: Arr
     def collision(aside: float) -> float:
         return hand_penetration(hand, "", handle + PUSH_GAP * out + aside * rotation[:, 0], rotation, HANDLE_MARGIN)
 
-    return min(PUSH_SIDES, key=collision) * rotation[:, 0]
+    return min(PUSH_SIDES if hand.strict else PUSH_SIDES[:1], key=collision) * rotation[:, 0]
 
 
 def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, out: Array, aside: Array) -> Steps:

@@ -54,7 +54,6 @@ from lerobot_memobench.experts.travel import (
 )
 from lerobot_memobench.sim.assets.asset import Asset, Grasp
 from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
-from lerobot_memobench.tasks.task import STRICT
 
 MAX_ATTEMPTS = 4
 """Maximum attempts at grasping an object or moving a handle, door or knob."""
@@ -103,8 +102,7 @@ them and move to the middle."""
 WIDE_GRASP = 0.068
 """Width from which a grasp is difficult, m."""
 TIGHT_GRASP, TIGHT_GRASP_SPEED, TIGHT_COST = 0.074, 0.3, 1.5
-"""Width from which a grasp leaves so little room that the hand descends slowly, m, its speed there, and its cost on
-strict tasks, because it often misses."""
+"""Width from which a grasp leaves little room and the hand descends slowly, m; its speed, and cost in strict tasks."""
 MAX_RIM_LEAN = np.radians(14)
 """Largest lean along a bowl's wall, rad."""
 MAX_RIGHTING_TILT = np.radians(35)
@@ -274,7 +272,7 @@ def _options(
 ) -> list[tuple[float, _Approach]]:
     """Return approaches to the grasps with their costs, sorted by cost."""
     options: list[tuple[float, _Approach]] = []
-    shifted = _shifted_grasps(hand.sim.assets[name])
+    shifted = _shifted_grasps(hand.sim.assets[name]) if hand.strict else ()
     for grasp in (*grasps, *shifted):
         for spin in np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]:
             way = _Approach(hand, name, grasp, float(spin), place, reaching, grasp in shifted)
@@ -331,7 +329,7 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
     else:
         cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
     cost += 0.3 if way.grasp.width > WIDE_GRASP else 0.0
-    cost += TIGHT_COST if way.grasp.width >= TIGHT_GRASP and hand.sim.task.suite == STRICT else 0.0
+    cost += TIGHT_COST if way.grasp.width >= TIGHT_GRASP and hand.strict else 0.0
     position, _ = hand.sim.asset_pose(name)
     if _is_rim(hand, name, way.grasp):
         cost += FAR_SIDE_COST * (1.0 + float(unit(target - position) @ hand.radial(position)))
@@ -486,9 +484,8 @@ def put_on(hand: Hand, held: Held, support: str) -> Steps:
         drop = -asset.bottom if tilt[2, 2] > 0.9 else asset.radius * 0.6
         return position + rotation @ np.array([0.0, 0.0, height]) + (drop + gap) * UP
 
-    # An object that falls further is caught by a rising finger, such as LIBERO's milk carton by its eaves. Published
-    # tasks keep the motions of their published demonstrations.
-    gap, tolerance = (0.0, 0.004) if hand.sim.task.suite == STRICT else (0.008, 0.006)
+    # An object that falls further is caught by a rising finger, such as LIBERO's milk carton by its eaves.
+    gap, tolerance = (0.0, 0.004) if hand.strict else (0.008, 0.006)
     clearance = max(0.08, below.top - height + 0.06)
     yield from carry(hand, held, destination, turn, clearance, tolerance, support=support)
     yield from release_object(hand)
