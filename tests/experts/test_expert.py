@@ -13,7 +13,7 @@ import pytest
 from lerobot_memobench.datasets.recording import HOLD_FRAMES
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.expert import Expert, steps_of
+from lerobot_memobench.experts.expert import Expert, final_atoms, steps_of
 from lerobot_memobench.experts.hand import (
     MAX_OPENING_STEPS,
     OPEN,
@@ -98,6 +98,13 @@ def with_goal(name: str, goal: list[object]) -> Task:
 )
 def test_steps_of_a_formula(formula: list[object], expected: list[str]) -> None:
     assert [" ".join((atom.predicate, *atom.args)) for atom in steps_of(parse_formula(formula))] == expected
+
+
+def test_a_repair_does_not_repeat_what_only_precedes_the_end() -> None:
+    goal = parse_formula(
+        ["and", ["when", ["on", "a", "b"], ["then", ["on", "c", "d"]]], ["hold", 10, ["on", "a", "b"]]]
+    )
+    assert [str(atom) for atom in final_atoms(goal)] == ["(On a b)"]
 
 
 @pytest.mark.parametrize(
@@ -233,7 +240,8 @@ def test_waits_for_late_opening_fingers(
 ) -> None:
     """Three steps with an opening command count; steps in which the command stays closed do not."""
     commands = iter([1.0] * (kept_shut + 1) + [0.75, 0.5, 0.25])
-    sim = SimpleNamespace(eef_pose=lambda: (np.zeros(3), np.eye(3)), command=1.0)
+    task = SimpleNamespace(suite="strict")
+    sim = SimpleNamespace(eef_pose=lambda: (np.zeros(3), np.eye(3)), command=1.0, task=task)
     sim.gripper_command = lambda: sim.command
     monkeypatch.setattr(Hand, "toward", lambda self, position, rotation, gripper: np.full(7, gripper, np.float32))
     actions = []

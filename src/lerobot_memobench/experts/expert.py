@@ -83,6 +83,12 @@ def steps_of(formula: Formula) -> list[Atom]:
     return [atom for part in children(formula) for atom in steps_of(part)]
 
 
+def final_atoms(formula: Formula) -> list[Atom]:
+    """Return the atoms that a goal requires at its end: those of a `When` may have become false again."""
+    parts = formula.children if isinstance(formula, And) else (formula,)
+    return [atom for part in parts if not isinstance(part, When) for atom in steps_of(part)]
+
+
 def hold_steps_of(formula: Formula) -> int:
     """Return the maximum number of steps for which a goal's atoms must hold, summed over nested operators."""
     own = formula.number if isinstance(formula, Hold) else HOLD_STEPS if isinstance(formula, Then) else 0
@@ -193,7 +199,7 @@ class Expert:
             for atom in steps_of(checkpoint.goal):
                 yield from self.achieve(atom)
         for _ in range(MAX_REPAIRS):
-            missing = [atom for atom in steps_of(self.task.goal) if not self._holds(atom)]
+            missing = [atom for atom in final_atoms(self.task.goal) if not self._holds(atom)]
             if not missing:
                 break
             for atom in missing:

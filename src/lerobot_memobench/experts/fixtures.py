@@ -31,6 +31,7 @@ from lerobot_memobench.experts.travel import (
     DROP_DISTANCE,
     OPEN_WIDTH,
     distance_from_base,
+    hand_penetration,
     leaned_rotation,
     opening_direction,
     reach_lean,
@@ -46,6 +47,9 @@ WIDE_HANDLE_ROLL, WIDE_HANDLE_TILT = np.radians(30), np.radians(27)
 """Roll and downward tilt of the hand at a bar that is longer than the open fingers, rad. With more roll or less tilt
 the hand touches the table below the lowest drawer, stays above the bar and slips off; with more tilt it touches the
 handle above; with less roll the bar does not fit between the fingers."""
+HANDLE_APPROACH, HANDLE_MARGIN = (0.14, 0.07, 0.0), 0.03
+"""Distances of the open fingers from a handle on the way to it, and the margin between the hand, which turns on this
+way, and objects in front of the handle, m."""
 DOWNWARD_REACH = 0.72
 """Distance from the arm's base up to which a downward hand moves freely, m."""
 DOOR_THICKNESS = 0.02
@@ -59,6 +63,8 @@ FREE_SWING_END_LEAD = 0.015
 """Lead at the end of the swing of a door without friction, rad."""
 PUSH_GAP = 0.06
 """Distance of the closed fingers in front of a handle before pushing, m."""
+PUSH_SIDES = (0.0, 0.02, -0.02, 0.04, -0.04, 0.06, -0.06)
+"""Displacements along a handle at which a drawer is pushed, in the order of preference, m."""
 HANDLE_GRIP_DEPTH = 0.018
 """Depth of the grasp below a handle's upper end, m."""
 
@@ -107,12 +113,22 @@ def _handle_target(hand: Hand, articulation: Articulation, tilt: float, back: fl
     return target
 
 
-def _handle_grip(hand: Hand, articulation: Articulation, tilt: float) -> Array:
-    """Return the hand's rotation (3, 3) for a handle: closing along the front, or rolled for a long bar."""
+def _handle_grip(hand: Hand, articulation: Articulation, tilt: float, roll: float) -> Array:
+    """Return the hand's rotation (3, 3) for a handle: closing along the front, rolled by ``roll``, rad."""
     _, back, rotation = _handle_pose(hand, articulation, tilt)
-    if articulation.handle.length < OPEN_WIDTH:
-        return rotation
-    return Rotation.from_rotvec(WIDE_HANDLE_ROLL * back).as_matrix() @ rotation
+    return Rotation.from_rotvec(roll * back).as_matrix() @ rotation if roll else rotation
+
+
+def _handle_roll(hand: Hand, articulation: Articulation, tilt: float) -> float:
+    """Return the roll of the hand at a handle, rad: 0 for a short one, for a long bar the side with less collision."""
+
+    def collision(roll: float) -> float:
+        rotation = _handle_grip(hand, articulation, tilt, roll)
+        ways = (_handle_target(hand, articulation, tilt, gap)() for gap in HANDLE_APPROACH)
+        return max(hand_penetration(hand, "", way, rotation, HANDLE_MARGIN) for way in ways)
+
+    rolls = (0.0,) if articulation.handle.length < OPEN_WIDTH else (WIDE_HANDLE_ROLL, -WIDE_HANDLE_ROLL)
+    return min(rolls if hand.strict else rolls[:1], key=collision)
 
 
 def open_drawer(hand: Hand, region: str) -> Steps:
@@ -122,8 +138,9 @@ def open_drawer(hand: Hand, region: str) -> Steps:
     tilt = steep + float(hand.rng.uniform(-0.06, 0.06))
     for _ in range(MAX_ATTEMPTS):
         out = opening_direction(hand, articulation)
-        yield from _take_handle(hand, articulation, tilt)
-        rotation = _handle_grip(hand, articulation, tilt)
+        roll = _handle_roll(hand, articulation, tilt)
+        yield from _take_handle(hand, articulation, tilt, roll)
+        rotation = _handle_grip(hand, articulation, tilt, roll)
         yield from _pull_drawer(hand, region, rotation, out)
         yield from hand.open(6)
         back = _handle_target(hand, articulation, tilt, 0.09)
@@ -132,16 +149,16 @@ def open_drawer(hand: Hand, region: str) -> Steps:
             return
 
 
-def _take_handle(hand: Hand, articulation: Articulation, tilt: float) -> Steps:
-    at = partial(_handle_target, hand, articulation, tilt)
+def _take_handle(hand: Hand, articulation: Articulation, tilt: float, roll: float) -> Steps:
+    far, near, at = (_handle_target(hand, articulation, tilt, gap) for gap in HANDLE_APPROACH)
 
     def turned() -> Array:
-        return _handle_grip(hand, articulation, tilt)
+        return _handle_grip(hand, articulation, tilt, roll)
 
     yield from rise(hand, OPEN, 0.16)
-    yield from hand.move(at(0.14), turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
-    yield from hand.move(at(0.07), turned, OPEN, tolerance=0.012, turn_tolerance=0.06)
-    yield from hand.move(at(0.0), turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
+    yield from hand.move(far, turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
+    yield from hand.move(near, turned, OPEN, tolerance=0.012, turn_tolerance=0.06)
+    yield from hand.move(at, turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
     yield from hand.close()
 
 
@@ -164,27 +181,38 @@ def close_drawer(hand: Hand, region: str) -> Steps:
     for _ in range(MAX_ATTEMPTS):
         out = opening_direction(hand, articulation)
         rotation = _handle_pose(hand, articulation, tilt)[2]
-        yield from _approach_handle(hand, articulation, rotation, out)
-        yield from _push_drawer(hand, region, rotation, out)
+        aside = _free_side(hand, articulation, rotation, out)
+        yield from _approach_handle(hand, articulation, rotation, out, aside)
+        yield from _push_drawer(hand, region, rotation, out, aside)
         back = hand.position + 0.08 * out
         yield from hand.move(back, rotation, CLOSED, tolerance=0.02, turn_tolerance=1.0, timeout=50)
         if _joint_position(hand, region) > articulation.closed_above:
             return
 
 
-def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, out: Array) -> Steps:
+def _free_side(hand: Hand, articulation: Articulation, rotation: Array, out: Array) -> Array:
+    """Return the displacement (3,) along a handle at which the hand, 20 cm wide, pushes with the least collision, m."""
+    handle, _ = hand.sim.site_pose(articulation.handle_site)
+
+    def collision(aside: float) -> float:
+        return hand_penetration(hand, "", handle + PUSH_GAP * out + aside * rotation[:, 0], rotation, HANDLE_MARGIN)
+
+    return min(PUSH_SIDES if hand.strict else PUSH_SIDES[:1], key=collision) * rotation[:, 0]
+
+
+def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, out: Array, aside: Array) -> Steps:
     """Move the closed fingers in front of a handle, from above."""
 
     def before(gap: float) -> Array:
-        return hand.sim.site_pose(articulation.handle_site)[0] + gap * out
+        return hand.sim.site_pose(articulation.handle_site)[0] + gap * out + aside
 
     yield from rise(hand, CLOSED, 0.2)
     high = before(0.10) + 0.06 * UP
     yield from hand.move(high, rotation, CLOSED, tolerance=0.03, turn_tolerance=0.15)
-    yield from hand.move(lambda: before(0.06), rotation, CLOSED, tolerance=0.015, turn_tolerance=0.08)
+    yield from hand.move(lambda: before(PUSH_GAP), rotation, CLOSED, tolerance=0.015, turn_tolerance=0.08)
 
 
-def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
+def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array, aside: Array) -> Steps:
     """Push a drawer by its handle until it is closed or the fingers slip off sideways."""
     articulation, _ = hand.sim.world.articulation(region)
     spare = min(0.003, articulation.closed_q - articulation.closed_above)
@@ -192,7 +220,7 @@ def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
     for _ in range(110):
         if shut():
             break
-        handle, _ = hand.sim.site_pose(articulation.handle_site)
+        handle = hand.sim.site_pose(articulation.handle_site)[0] + aside
         gap = hand.position - handle
         if length(gap - (gap @ out) * out) > 0.04:
             break

@@ -33,6 +33,9 @@ from lerobot_memobench.experts.hand import (
 )
 from lerobot_memobench.experts.travel import (
     FINGER_REACH,
+    HAND_MARGIN,
+    MAX_LEAN,
+    MAX_LEAN_UNDER,
     OPEN_WIDTH,
     Held,
     clear_of_objects,
@@ -64,6 +67,10 @@ FALLEN_COSINE = 0.7
 """Cosine of the tilt below which an object lies on its side."""
 MAX_EXTRA_COST = 1.5
 """Largest cost above the best grasp's of a candidate."""
+SHIFTED_COST = 1.6
+"""Cost of a shifted grasp, m; above `MAX_EXTRA_COST`, so that it is chosen only where the others are blocked."""
+FINGER_HALF_WIDTH, MIN_SIDE_GAP = 0.0105, 0.006
+"""Half the width of a finger tip, and smallest gap between a box and the near finger at a shifted grasp, m."""
 FUNNEL_SLOPE, FUNNEL_RADIUS = 4.0, 0.006
 """Approach funnel: height per lateral distance beyond the radius, and the radius, m."""
 FUNNEL_CLEARANCE_SHARE = 0.6
@@ -94,8 +101,8 @@ FAR_SIDE_COST = 0.15
 them and move to the middle."""
 WIDE_GRASP = 0.068
 """Width from which a grasp is difficult, m."""
-TIGHT_GRASP, TIGHT_GRASP_SPEED = 0.074, 0.3
-"""Width from which a grasp leaves so little room that the hand descends slowly, m, and its speed there."""
+TIGHT_GRASP, TIGHT_GRASP_SPEED, TIGHT_COST = 0.074, 0.3, 1.5
+"""Width from which a grasp leaves little room and the hand descends slowly, m; its speed, and cost in strict tasks."""
 MAX_RIM_LEAN = np.radians(14)
 """Largest lean along a bowl's wall, rad."""
 MAX_RIGHTING_TILT = np.radians(35)
@@ -118,13 +125,14 @@ def grasp_pose(
     opening: float | None = None,
     place: Array | None = None,
     reaching: bool = False,
+    shifted: bool = False,
 ) -> tuple[Array, Array]:
     """Return position (3,) and rotation (3, 3) of the grip site for grasping ``name``.
 
     A rim is grasped with the inner finger close to the wall at every opening: the hand approaches from outside and
     follows the outer finger while closing, so the bowl's content is not touched. The hand leans away from obstacles,
     and towards the base if the object or its destination ``place`` is distant. Obstacle avoidance has priority unless
-    ``reaching``.
+    ``reaching``. At a ``shifted`` grasp it may lean further.
     """
     opening = hand.sim.gripper_opening() if opening is None else opening
     position, rotation = hand.sim.asset_pose(name)
@@ -144,7 +152,8 @@ def grasp_pose(
     target[2] = max(target[2], _support_height(hand, name) + FINGER_REACH)
     turn = downward(closing)
     away = _lean(hand, name, target, turn[:, 0], place, outward if rim else None)
-    return target, clear_of_objects(hand, name, target, turn[:, 0], away, reaching)
+    largest = MAX_LEAN_UNDER if shifted else MAX_LEAN
+    return target, clear_of_objects(hand, name, target, turn[:, 0], away, reaching, largest)
 
 
 def _support_height(hand: Hand, name: str) -> float:
@@ -198,9 +207,11 @@ class _Approach:
     spin: float
     place: Array | None
     reaching: bool
+    shifted: bool
+    """Whether the grasp is one of `_shifted_grasps`."""
 
     def pose(self, opening: float | None = None) -> tuple[Array, Array]:
-        return grasp_pose(self.hand, self.name, self.grasp, self.spin, opening, self.place, self.reaching)
+        return grasp_pose(self.hand, self.name, self.grasp, self.spin, opening, self.place, self.reaching, self.shifted)
 
     def above(self) -> Array:
         """Return the position above the grasp along the fingers, (3,), m."""
@@ -261,9 +272,10 @@ def _options(
 ) -> list[tuple[float, _Approach]]:
     """Return approaches to the grasps with their costs, sorted by cost."""
     options: list[tuple[float, _Approach]] = []
-    for grasp in grasps:
+    shifted = _shifted_grasps(hand.sim.assets[name]) if hand.strict else ()
+    for grasp in (*grasps, *shifted):
         for spin in np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]:
-            way = _Approach(hand, name, grasp, float(spin), place, reaching)
+            way = _Approach(hand, name, grasp, float(spin), place, reaching, grasp in shifted)
             options.append((_cost(way, avoid), way))
     return sorted(options, key=lambda option: option[0])
 
@@ -282,6 +294,25 @@ def _raised_grasps(asset: Asset) -> tuple[Grasp, ...]:
     )
 
 
+def _shifted_grasps(asset: Asset) -> tuple[Grasp, ...]:
+    """Return the grasps of a flat box off its middle: towards an end, towards one side, or both.
+
+    They leave room for the hand, or for a finger, between the box and an obstacle. A taller box would tip over.
+    """
+    found = []
+    for grasp in asset.grasps:
+        if grasp.symmetric or not asset.top - asset.bottom < grasp.width < WIDE_GRASP:
+            continue
+        across = np.array([np.cos(grasp.yaw), np.sin(grasp.yaw)])
+        along = np.array([-across[1], across[0]])
+        ends = max(0.0, float(np.abs(along) @ np.asarray(asset.half_extents)) - FINGER_HALF_WIDTH)
+        side = (OPEN_WIDTH - grasp.width) / 2 - MIN_SIDE_GAP
+        for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+            x, y = np.asarray(grasp.position[:2]) + a * ends * along + b * side * across
+            found.append(replace(grasp, position=(float(x), float(y), grasp.position[2])))
+    return tuple(found)
+
+
 def _cost(way: _Approach, avoid: Array | None) -> float:
     """Return the cost of a grasp: motion of wrist and arm, collisions, width and stretch."""
     hand, name = way.hand, way.name
@@ -293,8 +324,12 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
         cost += 2.0 * abs(float(turn[:, 0] @ avoid))
     cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
     blocked = hand_penetration(hand, name, target, turn)
-    cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
+    if way.shifted:  # without the margin: the hand pushes its neighbour by a few millimetres
+        cost += SHIFTED_COST + 100.0 * max(0.0, blocked - HAND_MARGIN)
+    else:
+        cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
     cost += 0.3 if way.grasp.width > WIDE_GRASP else 0.0
+    cost += TIGHT_COST if way.grasp.width >= TIGHT_GRASP and hand.strict else 0.0
     position, _ = hand.sim.asset_pose(name)
     if _is_rim(hand, name, way.grasp):
         cost += FAR_SIDE_COST * (1.0 + float(unit(target - position) @ hand.radial(position)))
@@ -334,7 +369,8 @@ def pick(
             timeout=60 if way.grasp.width < TIGHT_GRASP else 120,
             give_up=way.stall_check(),
         )
-        yield from hand.close(way.closing, hand.rotation)
+        # At a shifted grasp the first finger pushes the object to the other one, so the hand does not follow it.
+        yield from hand.close(None if way.shifted else way.closing, hand.rotation)
         # After a miss retry at once, first at the same place. Otherwise policies would learn to lift an empty hand, or
         # to change the grasp without a visible reason.
         failed += attempt > 0 or not hand.empty
@@ -347,8 +383,9 @@ def pick(
 
 
 def _lift(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, Held | None]:
-    """Lift the grasped object; return its pose in the hand, None if it was not lifted."""
+    """Lift the grasped object; return its pose in the hand, None if it was not lifted, or its support was too."""
     start, _ = hand.sim.asset_pose(name)
+    heights = {other: hand.sim.asset_pose(other)[0][2] for other in hand.sim.task.objects}
     # Retreat along the fingers: straight up for an upright hand, away from obstacles for a leaned one.
     lifted = hand.position - LIFT_HEIGHT * hand.rotation[:, 2]
     yield from hand.move(lifted, hand.rotation, CLOSED, tolerance=0.02, speed=0.7, timeout=60)
@@ -356,6 +393,9 @@ def _lift(hand: Hand, name: str) -> Generator[NDArray[np.float32], None, Held | 
     if hand.empty or now[2] - start[2] <= LIFT_HEIGHT * 0.5:
         return None
     position, rotation = hand.sim.eef_pose()
+    if any(z < start[2] and hand.sim.asset_pose(other)[0][2] - z > LIFT_HEIGHT / 2 for other, z in heights.items()):
+        yield from hand.move(position - LIFT_HEIGHT * UP, rotation, CLOSED, tolerance=0.02, timeout=40)
+        return None
     return Held(name, rotation.T @ (now - position), rotation.T @ turn)
 
 
@@ -442,10 +482,12 @@ def put_on(hand: Hand, held: Held, support: str) -> Steps:
         position, rotation = hand.sim.asset_pose(support)
         _, tilt = hand.sim.asset_pose(held.name)
         drop = -asset.bottom if tilt[2, 2] > 0.9 else asset.radius * 0.6
-        return position + rotation @ np.array([0.0, 0.0, height]) + (drop + 0.008) * UP
+        return position + rotation @ np.array([0.0, 0.0, height]) + (drop + gap) * UP
 
+    # An object that falls further is caught by a rising finger, such as LIBERO's milk carton by its eaves.
+    gap, tolerance = (0.0, 0.004) if hand.strict else (0.008, 0.006)
     clearance = max(0.08, below.top - height + 0.06)
-    yield from carry(hand, held, destination, turn, clearance, support=support)
+    yield from carry(hand, held, destination, turn, clearance, tolerance, support=support)
     yield from release_object(hand)
 
 

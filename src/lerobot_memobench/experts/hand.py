@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.sim.controller import POSITION_SCALE, ROTATION_SCALE
 from lerobot_memobench.sim.robot import ARM_JOINTS
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.task import STRICT
 
 Array = NDArray[np.float64]
 Steps = Generator[NDArray[np.float32], None, None]
@@ -103,6 +104,8 @@ class Hand:
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
         self.sim = sim
         self.rng = rng
+        self.strict = sim.task.suite == STRICT
+        """Whether the task is strict; published tasks keep the motions of their published demonstrations."""
         self.speed = float(rng.uniform(0.62, 0.82))
         """Largest linear action of this episode; 1 is about 0.25 m/s."""
         self.slew = float(rng.uniform(0.16, 0.22))

@@ -143,7 +143,7 @@ def _drawer_box(hand: Hand, region: str, handle_site: str) -> tuple[Array, Array
     return centre, turned, np.maximum(half + 0.012, reach)
 
 
-def hand_penetration(hand: Hand, name: str, target: Array, turn: Array) -> float:
+def hand_penetration(hand: Hand, name: str, target: Array, turn: Array, margin: float = HAND_MARGIN) -> float:
     """Return the largest penetration of palm and wrist into other objects for a grasp, m; 0 without collision."""
     points = target + HAND_POINTS @ turn.T
     deepest = 0.0
@@ -153,7 +153,7 @@ def hand_penetration(hand: Hand, name: str, target: Array, turn: Array) -> float
         position, rotation = hand.sim.asset_pose(other)
         low, high = np.asarray(asset.low), np.asarray(asset.high)
         local = (points - position) @ rotation - (low + high) / 2
-        depth = ((high - low) / 2 + HAND_MARGIN - np.abs(local)).min(axis=1)
+        depth = ((high - low) / 2 + margin - np.abs(local)).min(axis=1)
         deepest = max(deepest, float(depth.max()))
     return deepest
 
@@ -219,16 +219,17 @@ def leaned_rotation(closing: Array, away: Array) -> Array:
 
 
 def clear_of_objects(
-    hand: Hand, name: str, target: Array, closing: Array, away: Array, reaching: bool = False
+    hand: Hand, name: str, target: Array, closing: Array, away: Array, reaching: bool, largest: float
 ) -> Array:
     """Return the hand's rotation (3, 3), leaned by ``away`` plus the candidate with the least collision.
 
-    With ``reaching``, excess stretch of the arm counts like penetration of the same length.
+    With ``reaching``, excess stretch of the arm counts like penetration of the same length. Leans up to ``largest``
+    are tried, rad.
     """
     side = cross(UP, closing)
     best, least = leaned_rotation(closing, away), np.inf
-    for more in LEAN_CANDIDATES:
-        if abs(float(away @ side) + more) > MAX_LEAN and more != 0.0:
+    for more in (largest / MAX_LEAN * candidate for candidate in LEAN_CANDIDATES):
+        if abs(float(away @ side) + more) > largest and more != 0.0:
             continue
         turn = leaned_rotation(closing, away + more * side)
         bad = hand_penetration(hand, name, target, turn)
