@@ -39,7 +39,7 @@ FEWEST, MOST = 10, EVALUATION_EPISODES
 SEEDS = {SPLITS[name].start: name for name in (PAPER, SEALED)}
 """Seed of the first episode -> split of seeds that count."""
 MAY_DIFFER = {
-    *("suite", "world", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
+    *("suite", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
 }
 """Settings of the protocol that a submission may choose; all others have their defaults."""
 CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {EVIDENCE: {"evidence": True}, PAUSES: {"pause_steps": 100}}
@@ -424,7 +424,6 @@ def _check_scenes(runs: Sequence[Evaluation]) -> None:
         simulator = (
             run.card["runs"][-1]["versions"].get("mujoco"),
             run.protocol.get(HASH_VERSION, 1),
-            run.protocol["world"],
         )
         for record in run.records:
             kind = (*simulator, *record.get("stand_ins", ()), record["task"])

@@ -24,7 +24,6 @@ from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
-from lerobot_memobench.tasks.task import LIBERO
 
 DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"
 PLUGIN = "LeRobot plugin"
@@ -67,7 +66,7 @@ def examine() -> list[Finding]:
         plugin(),
         caches(),
         golden_frame(),
-        paper_world(),
+        libero_assets(),
         ffmpeg(),
         torchcodec(),
         device(),
@@ -226,15 +225,14 @@ def golden_frame() -> Finding:
     return Finding("golden frame", "ok", detail)
 
 
-def paper_world() -> Finding:
-    """Check the assets of ``world=libero``, which the package's own world does not need."""
-    what = f"world {LIBERO}"
+def libero_assets() -> Finding:
+    """Check LIBERO's assets."""
+    what = "LIBERO's assets"
     try:
-        folder = check_assets()
+        return Finding(what, "ok", str(check_assets()))
     except MemobenchError as error:
         detail, _, fix = str(error).partition("; ")
-        return Finding(what, "ok", f"not installed; only world={LIBERO} needs it: {detail}", fix)
-    return Finding(what, "ok", f"LIBERO's assets in {folder}")
+        return Finding(what, "failed", detail, fix)
 
 
 def ffmpeg() -> Finding:

