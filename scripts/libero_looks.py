@@ -35,7 +35,7 @@ VISIBLE_GROUP, HIDDEN_GROUP = 5, 4
 
 def tasks() -> list[Task]:
     """Return the tasks whose classes are all from LIBERO."""
-    return [task.in_world("libero") for name in task_names() if (task := get_task(name)).memory_type != "spatial"]
+    return [task for name in task_names() if (task := get_task(name)).memory_type != "spatial"]
 
 
 def scene(task: Task, seed: int) -> Simulation:

@@ -18,11 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.experts.demonstration_prompt import highlight_of
 from lerobot_memobench.experts.hand import downward
-from lerobot_memobench.sim.assets.asset import Asset, Grasp
-from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE, TABLE_TOP, Asset, Grasp
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.placement import DROP_HEIGHT, MAX_CONTACT_DEPTH
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE
 from lerobot_memobench.sim.simulation import Simulation
@@ -32,6 +30,8 @@ from lerobot_memobench.tasks.task import Task
 
 Array = NDArray[np.float64]
 
+DROP_HEIGHT, MAX_CONTACT_DEPTH = 0.0005, 0.0015
+"""Initial height of an object above its support, and largest contact depth of objects at rest, m."""
 DISTRACTOR = "more_"
 """Prefix of the names of distractors."""
 AREA = ((-0.30, 0.25), (-0.38, 0.38))

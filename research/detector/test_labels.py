@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_memobench.perception.geometry import projected, rays
 from lerobot_memobench.perception.visual_encoder import SIDE
-from lerobot_memobench.sim.assets.builder import VISUAL_GROUP
+from lerobot_memobench.sim.raster.drawlist import VISUAL_GROUP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector.labels import MASK, Labeller, kinds
 from tests.support.labelled_images import BOWLS, DRAWERS, simulation

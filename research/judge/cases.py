@@ -146,7 +146,8 @@ class _Cases:
         for i, move in enumerate(self.right):
             before, done = done, judge(self.task, whole[: 2 * (i + 1)]).checkpoints
             for k in range(before, done):
-                inside = isinstance(self.task.checkpoints[k].goal, Not)
+                goal = self.task.checkpoints[k].goal
+                inside = any(isinstance(part, Not) for part in (goal, *getattr(goal, "children", ())))
                 for kind, moves in self._out_of_place(move) if inside else self._nearly(move, self.right[i - 1]):
                     yield Case(kind, (*self.right[:i], *moves), checkpoint=k + 1)
 
@@ -183,7 +184,8 @@ class _Cases:
         else:
             yield "held 2 cm above the target", (replace(move, offset=(0.0, 0.0, 0.02)),)
         yield "touched, not moved", (replace(move, place=None),)
-        others = [name for name in self.task.objects if name not in (move.name, move.place)]
+        carriers = [atom.args[1] for atom in self.task.init if atom.args[0] == move.name]
+        others = [name for name in self.task.objects if name not in (move.name, move.place, *carriers)]
         yield from (("right place, wrong object", (replace(move, name=name),)) for name in others[:2])
         yield from (("right object, wrong place", (replace(move, place=place),)) for place in self._other_places(move))
 
