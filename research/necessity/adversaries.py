@@ -400,8 +400,7 @@ def look_inside(seat: Seat) -> Motion:
     name = _asked(seat)[0]
     for level in LOOKS:
         yield from _look(seat, level)
-        geoms, (model, *_) = seat.sim.geoms("wrist"), seat.sim._drawing()
-        shown = model.body_rootid[model.geom_bodyid[geoms[geoms >= 0]]] == model.body(name).rootid[0]
+        shown = seat.sim.visible_bodies("wrist") == seat.sim.model.body(name).id
         if shown.sum() >= SHOWN_PIXELS or seat.rows(_asked(seat)[1]):
             yield from seat.do(Atom("open", (f"wooden_cabinet_1_{level}_region",)))
             yield from _fetch(seat)

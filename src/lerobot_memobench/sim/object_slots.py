@@ -114,9 +114,9 @@ class ObjectSlots:
         self._group = np.zeros(6, np.uint8)
         self._group[COLLISION_GROUP] = 1
 
-    def owners(self, geoms: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the index in `things` of each geom's owner, for ids of any shape; -1 without owner and for id -1."""
-        return np.where(geoms >= 0, self._owner[self._sim.model.geom_bodyid[geoms]], -1)
+    def owners(self, bodies: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the index in `things` of each body's owner, for ids of any shape; -1 without owner and for id -1."""
+        return np.where(bodies >= 0, self._owner[bodies], -1)
 
     def observe(self) -> NDArray[np.float32]:
         """Return the observation (SIZE,) of the present state."""
@@ -163,7 +163,8 @@ class ObjectSlots:
                 model, data, origin, rays[inside].ravel(), self._group, True, -1, geoms, distances,
                 *_NORMALS_ARGUMENT, count, mujoco.mjMAXVAL,
             )  # fmt: skip
-            owners, mine = self.owners(geoms), tried[inside] // POINTS_PER_THING
+            owners = self.owners(np.where(geoms >= 0, model.geom_bodyid[geoms], -1))
+            mine = tried[inside] // POINTS_PER_THING
             hits += np.bincount(mine[owners == mine], minlength=len(hits))
         return hits >= MIN_VISIBLE_POINTS
 

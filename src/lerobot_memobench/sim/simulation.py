@@ -353,11 +353,12 @@ class Simulation:
         renderer = get_renderer(self._scene.key, model, self.render_settings, draw_list)
         return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
 
-    def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
-        """Return the id of the visible geom at each pixel of a camera's image, (height, width), -1 for none."""
+    def visible_bodies(self, camera: str = "agentview") -> NDArray[np.int64]:
+        """Return the id of the body at each pixel of a camera's image, (height, width), -1 for none."""
         model, data, draw_list = self._drawing()
         rasterizer = get_rasterizer(self._scene.key, model, self.render_settings, draw_list)
-        return rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
+        geoms = rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
+        return np.where(geoms >= 0, model.geom_bodyid[geoms], -1)
 
     def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData, DrawList]:
         """Return the scene's visual model in the present pose, its data, and its draw list."""
