@@ -177,6 +177,10 @@ class Placer:
         """
         name, where = atom.args
         if where in self._assets:
+            if where not in poses:
+                raise MemobenchError(
+                    f"task {self._task.name}: {where!r} has no place yet; put it before {name!r} in :init"
+                )
             return [CENTRE_ONLY], poses[where][:3] + np.array([0.0, 0.0, self._files[where].top + OBJECT_DROP_HEIGHT])
         region = self._task.regions[where]
         if region.target == TABLE:
