@@ -178,7 +178,7 @@ class _Cases:
         drawer = self.stage.is_drawer(move.place)
         yield "next to the target", (replace(move, offset=(0.0, self._outside(move.place), 0.0)),)
         if drawer:
-            depth = float(self.stage.sim.site_half_size(move.place)[2])
+            depth = float(self.stage.half(move.place)[2])
             yield "above the drawer", (replace(move, offset=(0.0, 0.0, depth + 0.01)),)
             yield "below the drawer", (replace(move, offset=(0.0, 0.0, -depth - 0.015)),)
         else:
@@ -196,7 +196,7 @@ class _Cases:
             return 0.04
         if region is not None and region.ranges:
             return float(max(box[3] for box in region.ranges) - (region.ranges[0][1] + region.ranges[0][3]) / 2) + 0.01
-        return float(np.max(self.stage.sim.site_half_size(place)[:2])) + 0.01
+        return float(np.max(self.stage.half(place)[:2])) + 0.01
 
     def _other_places(self, move: Move) -> list[str]:
         assert move.place is not None

@@ -124,6 +124,10 @@ class Stage:
         joint = self.sim.world.joints.get(place)
         return joint is not None and joint[0].kind == "drawer"
 
+    def half(self, place: str) -> Array:
+        """Return the half size (3,) of a region along the axes of the world, m."""
+        return np.abs(self.sim.site_pose(place)[1] @ self.sim.site_half_size(place))
+
     def way(self, name: str) -> float:
         """Return the way of a joint from its start to its bound of open or on, m or rad."""
         joint, address = self.sim.world.joints[name]
