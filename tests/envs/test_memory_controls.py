@@ -27,7 +27,7 @@ REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
 def played(task: str, **settings: Any) -> list[dict[str, Any]]:
     """Return the observations of an episode at rest, with its instruction and whether memory is corrupted."""
-    chosen = {"obs_type": OBJECTS, "seed_base": SEED, "render": "fast", "horizon": HORIZON, **settings}
+    chosen = {"obs_type": OBJECTS, "seed_base": SEED, "horizon": HORIZON, **settings}
     env = MemobenchEnv(task, **chosen)
     observation, info = env.reset(seed=SEED)
     found, ended = [], False

@@ -88,7 +88,7 @@ def test_harness_and_lerobot_run_the_same_episodes(tmp_path: Path, monkeypatch: 
     server = DigestServer(steps=3)
     with vla_eval.serve_background(server) as handle:
         with recorded(monkeypatch) as theirs:
-            params = {"tasks": [PROMPTED], "horizon": 5, "render": "fast", "history_every": 3}
+            params = {"tasks": [PROMPTED], "horizon": 5, "history_every": 3}
             result = by_harness(handle.url, episodes=2, **params, log_dir=str(tmp_path / "log"), label="digest")
         heard, server.heard = server.heard, []
         with recorded(monkeypatch) as ours:
@@ -117,7 +117,7 @@ def benchmarks() -> Iterator[Callable[..., MEMOBench]]:
     made = []
 
     def make(*tasks: Any, **params: Any) -> MEMOBench:
-        made.append(MEMOBench(*tasks, render="fast", **params))
+        made.append(MEMOBench(*tasks, **params))
         made[-1]._recorder = vla_eval.recording.NullEpisodeRecorder()
         return made[-1]
 

@@ -164,7 +164,9 @@ def test_suites_and_worlds_are_not_mixed(tmp_path: Path, key: str, value: str) -
     assert read_protocol(other)[key] == value
     assert key not in read_protocol(plain)
     (run,) = read_runs([other])
-    assert f"{value}{', 1 missing scan' if key == 'world' else ' suite'}" in headline([run])
+    assert ("1 missing scan" if key == "world" else "strict suite") in headline([run])
+    former = "scenes that version 0.2 modelled in code"
+    assert (former in headline([run]), former in headline(read_runs([plain]))) == (key != "world", True)
     assert any("cork__3" in note for note in run.notes)
     if key == "suite":
         with pytest.raises(MemobenchError, match="--with paper"):

@@ -15,7 +15,7 @@ from lerobot_memobench.tasks.difficulty import degree_of
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 from tests.experts.test_expert import play
-from tests.support.libero import needs_assets, simulate
+from tests.support.libero import simulate
 
 MICROWAVE = "open_and_close_the_microwave_a_given_number_of_times"
 BOWL = "check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer"
@@ -74,17 +74,15 @@ def test_solves_seeds_that_once_failed(name: str, seed: int) -> None:
     assert name != MILK or played.episode.exec_steps < 500, "it tried the unreachable low grasp repeatedly"
 
 
-@needs_assets
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seed"), [(DRAWERS, 20_003), (ARTICHOKE, 20_009), (BROCCOLI, 20_008), (TOMATO, 20_000), (WASTE, 20_002)]
 )
 def test_solves_seeds_in_liberos_scenes_that_once_failed(name: str, seed: int) -> None:
     """The hand slipped off the bottom drawer's bar; it carried the milk carton up after the release."""
-    assert not play(get_task(name).in_world("libero"), seed, prompt=True, referent="random").faults
+    assert not play(get_task(name), seed, prompt=True, referent="random").faults
 
 
-@needs_assets
 def test_opens_the_lowest_drawer_without_touching_the_table() -> None:
     """With more roll the hand rests on the table above the bar, slips off, and needs 500 steps."""
     sim = simulate(DRAWERS)

@@ -286,7 +286,7 @@ OF_THE_RUN = {
     "prompt_in": st.sampled_from(["auto", "steps", "reset"]),
     "horizon": COUNT,
     "obs_type": st.sampled_from(["pixels_agent_pos", "both"]),
-    "env.render": st.sampled_from(["fast", "high"]),
+    "env.render": st.sampled_from(["default", "high"]),
     "env.videos": COUNT,
     "env.oracle_memory": BOOLEAN,
     "pause_steps": COUNT,

@@ -10,7 +10,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.libero import files, mjcf
 from lerobot_memobench.sim.libero.scene import build_scene
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.libero import needs_assets
 
 PLATE = "stable_scanned_objects/plate/plate.xml"
 TOMATO = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
@@ -40,7 +39,6 @@ def test_missing_or_modified_assets_are_errors(
         files.asset(PLATE)
 
 
-@needs_assets
 def test_every_known_file_is_the_installed_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(files.ASSETS_VARIABLE, raising=False)
     assert all((files.check_assets() / name).is_file() for name in files.known_hashes())
@@ -65,9 +63,8 @@ def scan_folder(folder: Path, category: str, names: tuple[str, ...]) -> Path:
     return folder
 
 
-@needs_assets
 def test_user_scans(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    task = get_task(TOMATO).in_world("libero")
+    task = get_task(TOMATO)
     monkeypatch.delenv(files.SCANS_VARIABLE, raising=False)
     assert build_scene(task).stand_ins == ("beefsteak_tomato__1", "box_of_oatmeal__3")
     scan_folder(tmp_path, "beefsteak_tomato", ("aaa", "bbb"))

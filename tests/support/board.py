@@ -58,7 +58,7 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
             {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
             for c, step in zip(task.checkpoints, marks, strict=True)
         ],
-        **{"failure": None if success else "storage_failure", "suite": "strict", "lost": False},
+        **{"failure": None if success else "storage_failure", "suite": "strict", "lost": False, "world": "libero"},
         **{"scene_hash": scene_of(name, seed), "wall_s": 2.0, "policy": "act 0123", "run": "r", "inputs": "pixels"},
     }
 
