@@ -69,8 +69,9 @@ def _prompt_cues(episode: Episode) -> list[int]:
     goals = [atom.args[0] for atom in atoms(task.goal) if atom.predicate == "on"]
     asked = next((places[name] for name in goals if name in places), None)
     while episode.phase == PROMPT:
+        rests = episode.idling
         episode.step(np.zeros(7, np.float32))
-        if episode.phase != PROMPT:
+        if rests or episode.phase != PROMPT:
             continue
         last = episode.step_index
         if asked is not None:

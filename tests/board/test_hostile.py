@@ -34,7 +34,6 @@ from tests.support.board import (
 
 Json = dict[str, Any]
 Change = Callable[[Path], object]
-KEPT = Path(__file__).parents[2] / "results" / "board"
 
 
 @pytest.fixture(scope="module")
@@ -277,27 +276,41 @@ PUBLISHED: dict[str, tuple[Change, str]] = {
 }
 
 
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Valid rows of the published suite by their referents; do not change them."""
+    place, settings = tmp_path_factory.mktemp("published"), {"obs_type": "environment_state_agent_pos"}
+    return {
+        referent: write_submission(
+            place / "rows" / referent,
+            About(**ABOUT),
+            {"": evaluation(place / referent, speed=speed, suite="published", referent=referent, **settings)},
+        )
+        for referent, speed in (("random", 50), ("fixed", 70))
+    }
+
+
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_hostile_published_submission_is_refused(tmp_path: Path, name: str) -> None:
+def test_hostile_published_submission_is_refused(published: dict[str, Path], tmp_path: Path, name: str) -> None:
     change, reason = PUBLISHED[name]
-    folder = shutil.copytree(KEPT / "memobench_small", tmp_path / "one")
+    folder = shutil.copytree(published["random"], tmp_path / "one")
     check_submission(read_submission(folder))
     change(folder)
     with pytest.raises(MemobenchError, match=reason):
         check_submission(read_submission(folder))
 
 
-def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
+def test_scenes_agree_with_those_of_the_board(published: dict[str, Path], tmp_path: Path) -> None:
     """A row of fixed referents draws no variants: its seeds are known by their scenes."""
-    others = [read_submission(KEPT / "memobench_small")]
-    folder = shutil.copytree(KEPT / "memobench_blind", tmp_path / "one")
+    others = [read_submission(published["random"])]
+    folder = shutil.copytree(published["fixed"], tmp_path / "one")
     check_submission(read_submission(folder), others)
     both(relabelled, commit())(folder)
     check_submission(read_submission(folder))
     with pytest.raises(MemobenchError, match="equal for equal seeds only"):
         check_submission(read_submission(folder), others)
-    folder = shutil.copytree(KEPT / "memobench_blind", tmp_path / "two")
-    every(lambda record: record.update(scene_hash=scene_of(record["task"], record["seed"])))(folder)
+    folder = shutil.copytree(published["fixed"], tmp_path / "two")
+    every(lambda record: record.update(scene_hash=scene_of("another", record["seed"])))(folder)
     check_submission(read_submission(folder))
     with pytest.raises(MemobenchError, match="another rollout of the board"):
         check_submission(read_submission(folder), others)
