@@ -35,6 +35,7 @@ from tests.support.board import (
 Json = dict[str, Any]
 Change = Callable[[Path], object]
 KEPT = Path(__file__).parents[2] / "results" / "board"
+ROW = "memobench_expert_libero"
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +281,7 @@ PUBLISHED: dict[str, tuple[Change, str]] = {
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_hostile_published_submission_is_refused(tmp_path: Path, name: str) -> None:
     change, reason = PUBLISHED[name]
-    folder = shutil.copytree(KEPT / "memobench_small", tmp_path / "one")
+    folder = shutil.copytree(KEPT / ROW, tmp_path / "one")
     check_submission(read_submission(folder))
     change(folder)
     with pytest.raises(MemobenchError, match=reason):
@@ -289,14 +290,14 @@ def test_hostile_published_submission_is_refused(tmp_path: Path, name: str) -> N
 
 def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
     """A row of fixed referents draws no variants: its seeds are known by their scenes."""
-    others = [read_submission(KEPT / "memobench_small")]
-    folder = shutil.copytree(KEPT / "memobench_blind", tmp_path / "one")
+    others = [read_submission(KEPT / ROW)]
+    folder = shutil.copytree(KEPT / ROW, tmp_path / "one")
     check_submission(read_submission(folder), others)
     both(relabelled, commit())(folder)
     check_submission(read_submission(folder))
     with pytest.raises(MemobenchError, match="equal for equal seeds only"):
         check_submission(read_submission(folder), others)
-    folder = shutil.copytree(KEPT / "memobench_blind", tmp_path / "two")
+    folder = shutil.copytree(KEPT / ROW, tmp_path / "two")
     every(lambda record: record.update(scene_hash=scene_of(record["task"], record["seed"])))(folder)
     check_submission(read_submission(folder))
     with pytest.raises(MemobenchError, match="another rollout of the board"):
