@@ -48,6 +48,15 @@ def row(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_submission(place / "one", About(**ABOUT), folders)
 
 
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A valid row of published tasks; do not change it."""
+    place = tmp_path_factory.mktemp("published")
+    return write_submission(
+        place / "one", About(**ABOUT), {"": evaluation(place / "m", suite="published", referent="random")}
+    )
+
+
 def every(change: Callable[[Json], object]) -> Change:
     return in_log(lambda log: [change(record) for record in log], card=True)
 
@@ -271,46 +280,34 @@ PUBLISHED: dict[str, tuple[Change, str]] = {
         "without the checkpoint|the goal ends a rollout",
     ),
     "lost goals": (failures(lambda record: record.update(lost=True)), "has lost=True"),
-    "privileged state as pixels": (inputs("pixels", obs_type="pixels_agent_pos"), "inputs are 'pixels'"),
     "seeds named as sealed": (both(relabelled, commit()), "drew the variants"),
 }
 
 
-@pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Valid rows of the published suite by their referents; do not change them."""
-    place, settings = tmp_path_factory.mktemp("published"), {"obs_type": "environment_state_agent_pos"}
-    return {
-        referent: write_submission(
-            place / "rows" / referent,
-            About(**ABOUT),
-            {"": evaluation(place / referent, speed=speed, suite="published", referent=referent, **settings)},
-        )
-        for referent, speed in (("random", 50), ("fixed", 70))
-    }
-
-
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_hostile_published_submission_is_refused(published: dict[str, Path], tmp_path: Path, name: str) -> None:
+def test_hostile_published_submission_is_refused(published: Path, tmp_path: Path, name: str) -> None:
     change, reason = PUBLISHED[name]
-    folder = shutil.copytree(published["random"], tmp_path / "one")
+    folder = shutil.copytree(published, tmp_path / "one")
     check_submission(read_submission(folder))
     change(folder)
     with pytest.raises(MemobenchError, match=reason):
         check_submission(read_submission(folder))
 
 
-def test_scenes_agree_with_those_of_the_board(published: dict[str, Path], tmp_path: Path) -> None:
+def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
     """A row of fixed referents draws no variants: its seeds are known by their scenes."""
-    others = [read_submission(published["random"])]
-    folder = shutil.copytree(published["fixed"], tmp_path / "one")
+    for speed in (50, 90):
+        made = evaluation(tmp_path / f"m{speed}", speed=speed, suite="published", referent="fixed")
+        write_submission(tmp_path / "board" / f"row_{speed}", About(**ABOUT), {"": made})
+    others = [read_submission(tmp_path / "board" / "row_50")]
+    folder = shutil.copytree(tmp_path / "board" / "row_90", tmp_path / "one")
     check_submission(read_submission(folder), others)
     both(relabelled, commit())(folder)
     check_submission(read_submission(folder))
     with pytest.raises(MemobenchError, match="equal for equal seeds only"):
         check_submission(read_submission(folder), others)
-    folder = shutil.copytree(published["fixed"], tmp_path / "two")
-    every(lambda record: record.update(scene_hash=scene_of("another", record["seed"])))(folder)
+    folder = shutil.copytree(tmp_path / "board" / "row_90", tmp_path / "two")
+    every(lambda record: record.update(scene_hash=scene_of(record["task"], record["seed"] + 1)))(folder)
     check_submission(read_submission(folder))
     with pytest.raises(MemobenchError, match="another rollout of the board"):
         check_submission(read_submission(folder), others)

@@ -18,14 +18,13 @@ from lerobot_memobench.policies.lerobot_config import tree_hash
 from lerobot_memobench.run.card import new_card, with_episodes, write_card
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.evidence import chance, scene_and_variant
+from lerobot_memobench.tasks.task import STRICT
 
-TASKS = task_names(suite="strict")
+TASKS = task_names(suite=STRICT)
 ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
 VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
 FILES = {"config.json": "1" * 64, "model.safetensors": "2" * 64}
 PICTURES = {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}}
-OBJECTS = "privileged object state"
-STATE = {"observation.environment_state": {"type": "ENV", "shape": [208]}}
 Json = dict[str, Any]
 
 
@@ -37,11 +36,13 @@ def scene_of(name: str, seed: int) -> str:
 
 
 def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Json:
-    """A rollout: every third one fails at its first checkpoint."""
+    """A rollout of a task: every third one fails at its first checkpoint."""
     published = get_task(name)
-    strict, referent = published.suite == "strict", settings.get("referent", "fixed")
     scene, seed = episode, first + episode
-    task = referent_of(published, seed) if strict or referent == "random" else published
+    fixed = settings.get("referent") == "fixed"
+    task = published if fixed else referent_of(published, seed)
+    suite = {"suite": STRICT, "lost": False} if published.suite == STRICT else {}
+    prompt_steps = published.prompt_steps if suite else 200 * (task.prompt is not None)
     if settings.get("evidence"):
         scene, variant = scene_and_variant(published, episode)
         seed, task = first + scene, published.variant(variant)
@@ -53,39 +54,31 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
     choice |= {"variants": len(published.random_variants), "chance": chance(published)}
     return {
         **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed},
-        "referent": "drawn" if strict else referent,
+        **{"referent": "drawn" if suite else settings["referent"]},
         **{"variant": task.variant_index, "replan_steps": 5, "prompt_shown": None if task.prompt is None else True},
-        **{
-            "prompt_steps": published.prompt_steps if strict or task.prompt is None else 100,
-            "steps": steps,
-            "success": success,
-        },
+        **{"prompt_steps": prompt_steps, "steps": steps, "success": success},
         **(choice if settings.get("evidence") else {}),
         **({"paused_steps": 500} if settings.get("pause_steps") else {}),
         "checkpoints": [
             {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
             for c, step in zip(task.checkpoints, marks, strict=True)
         ],
-        **{"failure": None if success else "storage_failure"},
-        **({"suite": "strict", "lost": False} if strict else {}),
-        **{"world": "libero", "inputs": OBJECTS if settings.get("obs_type") else "pixels"},
-        **{"scene_hash": scene_of(name, seed), "wall_s": 2.0, "policy": "act 0123", "run": "r"},
+        **{"failure": None if success else "storage_failure", **suite, "world": "libero"},
+        **{"scene_hash": scene_of(name, seed), "wall_s": 2.0, "policy": "act 0123", "run": "r", "inputs": "pixels"},
     }
 
 
-def evaluation(folder: Path, first: int = 7, speed: int = 50, suite: str = "strict", **settings: Any) -> Path:
-    """Write the folder of an evaluation: 10 episodes of each task, with evidence 12 of those with variants."""
+def evaluation(folder: Path, first: int = 7, speed: int = 50, suite: str = STRICT, **settings: Any) -> Path:
+    """Write the folder of an evaluation: 10 episodes of each task, of those with variants 12 with ``evidence``."""
     names = [
         name for name in task_names(suite=suite) if not settings.get("evidence") or get_task(name).num_variants > 1
     ]
-    reads_objects = settings.get("obs_type") is not None
-    features = STATE if reads_objects else PICTURES
     count = 12 if settings.get("evidence") else 10
     records = [line(name, episode, first, speed, **settings) for name in names for episode in range(count)]
     block = EnvSettings(suite=suite, seed_base=first, replan_steps=5, **settings).protocol_block
     card = new_card(
-        protocol={"tasks": sorted(names), "episodes": count, **block, "inputs": OBJECTS if reads_objects else "pixels"},
-        policy={"type": "act", "seed": first, "settings": {"input_features": features}, "sha256": tree_hash(FILES)},
+        protocol={"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
+        policy={"type": "act", "seed": first, "settings": {"input_features": PICTURES}, "sha256": tree_hash(FILES)},
         checkpoint={"path": "user/one", "revision": "abc", "files": FILES},
         trained_on={"repo_id": "user/data", "revision": "def"},
         task_files={name: task_hash(get_task(name)) for name in names},

@@ -15,7 +15,7 @@ from lerobot_memobench.envs.settings import SCENE_HASHES, SETTINGS, steps_per_ac
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, seed_base
 from lerobot_memobench.io import count_of
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
+from lerobot_memobench.sim.scene_hash import WORLD
 from lerobot_memobench.tasks.catalogue import task_folder, task_names
 from lerobot_memobench.tasks.task import REFERENTS, STRICT
 
@@ -79,7 +79,6 @@ NOT_RUN = {"suite", WORLD, "difficulty"}
 REQUIRED: Mapping[str, tuple[str, Any]] = {
     **dict.fromkeys(("choice", "answered", "variants", "chance"), ("evidence", True)),
     **dict.fromkeys(("lost", "held_steps"), ("suite", STRICT)),
-    "stand_ins": (WORLD, LIBERO),
 }
 """Field that a line holds under one setting only -> that setting and its value."""
 
