@@ -55,8 +55,8 @@ def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
         use = max([before, *(step for step in range(before, reached) if homes[step])])
         if cue_in_prompt(episode.task, k):
             gaps.append(start + use - cues[k])
-        else:
-            gaps.append(_since_change(scenes[: use + 1]))
+        else:  # at first the instruction is enough, even where LIBERO's scene still moves by itself
+            gaps.append(_since_change(scenes[: use + 1]) if k else None)
         before = reached
     return episode.success, gaps
 
