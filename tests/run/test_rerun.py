@@ -225,7 +225,7 @@ def test_a_strict_card_of_an_earlier_version_is_refused(hold: int) -> None:
 @pytest.mark.parametrize("protocol", [ONE, {**ONE, "world": "memobench"}])
 def test_a_card_of_the_former_scenes_is_refused(protocol: dict[str, Any]) -> None:
     write_card(Path(), card({**RANDOM, "env": {"tasks": STOVE, "world": "memobench"}}, protocol=protocol))
-    with pytest.raises(MemobenchError, match="of the scenes that version 0.2 modelled in code"):
+    with pytest.raises(MemobenchError, match=r"scenes that version 0\.2 modelled in code"):
         rerun.repeat(Path(), None, None, lambda plan: pytest.fail("it was run"), print)
     assert allowed(env={"tasks": STOVE, "world": "libero"}).env == {"tasks": STOVE}
 
