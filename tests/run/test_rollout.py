@@ -277,7 +277,7 @@ def test_recorded_episodes_are_drawn_whole(drawn: list[int], tmp_path: Path) -> 
     from lerobot_memobench.envs.video import LAST_FRAMES
     from lerobot_memobench.evaluation.html.write import frame_count
 
-    words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "env.render=fast", "videos=1"]
+    words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "videos=1"]
     assert main(["eval", "env=memobench", *words, f"output_dir={tmp_path}"]) == 0
     (recorded,) = (tmp_path / "videos").rglob("*")
     assert recorded.name == f"{HIGHLIGHT}.0.mp4"

@@ -57,7 +57,7 @@ MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
 NAMED = {"success", "steps", "checkpoints"}
 """Fields that a card must name of an episode: a repetition compares them."""
 OF_EARLIER_VERSIONS = re.compile(
-    r"--(eval\.recording.*|job_name=.*|env\.render_every=1|env\.world=libero|env\.max_parallel_tasks=1)"
+    r"--(eval\.recording.*|job_name=.*|env\.render_every=1|env\.world=\w+|env\.max_parallel_tasks=1)"
 )
 """Flags on cards of earlier versions on which no outcome depends."""
 
@@ -103,8 +103,8 @@ def repeat(
         MemobenchError: the card cannot be repeated here.
     """
     card = repeatable_card(path, server)
-    check_policy(card)
     check_version(card)
+    check_policy(card)
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_card(card, out)
@@ -136,7 +136,6 @@ def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
     card = read_evaluation(path, whole=True)
     if not card["episodes"]:
         raise MemobenchError(f"{path} holds no episodes to compare with; expected the card of a finished evaluation")
-    check_world(card["protocol"].get(WORLD), f"the card {path}")
     return {**card, "asked": allowed_settings(settings_on(card), server)}
 
 
@@ -189,6 +188,7 @@ def check_version(card: Mapping[str, Any]) -> None:
         MemobenchError: it names that version.
     """
     run, protocol = card["runs"][-1], card["protocol"]
+    check_world(protocol.get(WORLD), "the card")
     version = f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
     problem = first_variant_mismatch(card["episodes"])
     for name, here in revision(protocol.get("suite", PUBLISHED), protocol.get("difficulty", STANDARD)).items():
