@@ -1,7 +1,7 @@
 """LIBERO's world equals stock LIBERO in models, scenes, predicates and rollouts, and MuJoCo's renderer in images.
 
 `scripts/libero_records.py` makes the records in an environment of its own with MuJoCo 3.3.7. In other versions objects
-settle some 10⁻⁵ m elsewhere, and touched objects then move differently; `docs/develop/paper_world.md` has the outcome
+settle some 10⁻⁵ m elsewhere, and touched objects then move differently; `results/scenes.md` has the outcome
 of 3.3.7.
 """
 
