@@ -287,7 +287,7 @@ def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80
     return place / "pretrained_model"
 
 
-NULL: dict[str, str | None] = dict.fromkeys(("memory_stride", "memory_fusion", "memory_phase"))
+NULL: dict[str, str | None] = dict.fromkeys(("memory_stride", "memory_fusion", "memory_phase", "memory_repeats"))
 SMALL = ["policy=memobench_small", "steps=1", "device=cpu"]
 DEFAULTS: list[tuple[list[str], dict[str, str | None]]] = [
     (
