@@ -246,11 +246,12 @@ def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
 
 
 def _strip(world: ET.Element, assets: ET.Element) -> None:
-    """Remove visual geoms, materials and lights."""
+    """Remove visual geoms, materials, lights and colours; MuJoCo's rays pass through transparent geoms."""
     _remove(world, lambda one: one.tag == "light")
     _remove(world, mjcf.is_visual)
     for geom in world.iter("geom"):
-        geom.attrib.pop("material", None)
+        for name in ("material", "rgba"):
+            geom.attrib.pop(name, None)
     used = {geom.get("mesh") for geom in world.iter("geom")}
     _remove(assets, lambda one: one.tag != "mesh" or one.get("name") not in used)
 
