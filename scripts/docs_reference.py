@@ -41,9 +41,9 @@ COPIES = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "develop/contributing.md",
     "research/README.md": "develop/lab.md",
-    "src/lerobot_memobench/policies/shipped/memobench_small/README.md": "results/cards/memobench_small.md",
-    "src/lerobot_memobench/policies/shipped/memobench_small_memoryless/README.md": (
-        "results/cards/memobench_small_memoryless.md"
+    "src/lerobot_memobench/policies/shipped/memobench_strict/README.md": "results/cards/memobench_strict.md",
+    "src/lerobot_memobench/policies/shipped/memobench_strict_memoryless/README.md": (
+        "results/cards/memobench_strict_memoryless.md"
     ),
     **{
         f"results/{page.name}": f"results/{page.name.replace('README', 'index')}"

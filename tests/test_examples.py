@@ -136,7 +136,7 @@ def test_recurrent_ppo_learns_and_resumes(tmp_path: Path) -> None:
 def test_openpi_server_returns_the_actions_of_the_policy() -> None:
     """A policy with a memory, requested at each eighth step; the client raises the server's error."""
     example = runpy.run_path(str(EXAMPLES / "openpi_server.py"))
-    served = example["ServedPolicy"]("memobench_small")
+    served = example["ServedPolicy"]("memobench_strict")
     server = example["make_server"](served, "127.0.0.1", 0)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     port = int(server.socket.getsockname()[1])

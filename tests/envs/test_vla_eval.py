@@ -212,8 +212,8 @@ def test_configuration_in_the_guide_is_valid(tmp_path: Path, monkeypatch: pytest
 def test_trained_memory_policy_by_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With and without a prompt: by ``vla-eval run``, by ``dialect=vla_eval``, and in this process."""
     tasks, port = [PROMPTED, UNPROMPTED], free_port()
-    script = [sys.executable, str(ROOT / "examples" / "vla_eval_server.py"), "memobench_small", "--detector", "package"]
-    server = subprocess.Popen([*script, "--port", str(port), "--device", "cpu"])
+    script = [sys.executable, str(ROOT / "examples" / "vla_eval_server.py"), "memobench_strict"]
+    server = subprocess.Popen([*script, "--detector", "package", "--port", str(port), "--device", "cpu"])
     try:
         words = (f"tasks={','.join(tasks)}", "batch_size=1")
         with recorded(monkeypatch) as asked:
@@ -230,7 +230,7 @@ def test_trained_memory_policy_by_three_ways(tmp_path: Path, monkeypatch: pytest
         server.kill()
         server.wait()
     with recorded(monkeypatch) as direct:
-        by_lerobot(tmp_path / "direct", "policy=memobench_small", "detector=package", *words)
+        by_lerobot(tmp_path / "direct", "policy=memobench_strict", "detector=package", *words)
     assert direct == asked
     logs = [log_of(tmp_path / name) for name in ("direct", "remote", "log")]
     for record in logs[0]:

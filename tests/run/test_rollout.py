@@ -305,7 +305,7 @@ def test_memory_reads_are_written_as_episodes_end(tmp_path: Path) -> None:
 
 def test_the_batch_size_of_an_object_policy_changes_no_episode(tmp_path: Path) -> None:
     """One process with a row per episode, by default; each row acts as it would alone."""
-    words = ["policy=memobench_small", f"tasks={STOVE}", "episodes=2", "horizon=60", "device=cpu"]
+    words = ["policy=memobench_strict", f"tasks={STOVE}", "episodes=2", "horizon=60", "device=cpu"]
     found = []
     for name, more, size in (("default", [], 2), ("alone", ["batch_size=1"], 1)):
         assert main(["eval", "env=memobench", *words, *more, f"output_dir={tmp_path / name}"]) == 0
