@@ -4,7 +4,7 @@
 
 FOLDER holds `lerobot_memobench` of the other commit (`git worktree add /tmp/before COMMIT`, then `/tmp/before/src`). An
 update is forward, backward, clipping, AdamW and the weight average on 12 episodes x 6 samples. A plan is one chunk of
-the shipped `memobench_small` with a full memory. Both sides run in processes of their own, on one thread. Prints a
+the shipped `memobench_strict` with a full memory. Both sides run in processes of their own, on one thread. Prints a
 Markdown table of median CPU milliseconds and the median ratio before / after. With --compile this commit's updates run
 under policy.compile_model=true; this takes a C++ compiler and minutes, and FOLDER may be this commit too.
 """
@@ -146,7 +146,7 @@ def planner(words: int) -> Callable[[], None]:
     """Return a function that makes one plan of the shipped policy, 300 steps into an episode."""
     import lerobot_memobench
 
-    shipped = Path(lerobot_memobench.__file__).parent / "policies/shipped/memobench_small"
+    shipped = Path(lerobot_memobench.__file__).parent / "policies/shipped/memobench_strict"
     policy = MemobenchMemPolicy.from_pretrained(shipped)
     batch = observation(policy.config, 1) | {OBS_ENV_STATE: random_slots(1), OBS_RAW_STATE: torch.randn(1, 8)}
     batch |= {OBS_PHASE: torch.ones(1, 1)} | instruction_mask(policy.config, 1, words)

@@ -2,9 +2,9 @@
 
     python examples/demo.py --out outputs/demo
 
-All runs are public commands. The second part is a task that begins with a demonstration prompt, under the expert and
-the two policies of the package. The three act in the same scenes, of the first evaluation seeds, on privileged object
-state. A policy without a memory guesses; twelve episodes show it. The same command resumes.
+All runs are public commands. The second part is a strict task, under the expert and the two policies of the package,
+which were trained alike except for the memory. The three act in the same scenes, of the first evaluation seeds, on
+privileged object state. A policy without a memory guesses; twelve episodes show it. The same command resumes.
 
 | output | |
 |---|---|
@@ -34,18 +34,19 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.jobs.processes import adding_resume_hint
 
-BOWL = "put_the_butter_into_the_bowl_from_the_prompt_video"
 TASKS = (
     "turn_on_the_stove_and_turn_it_off",
     "put_the_tomato_into_the_top_drawer_of_the_cabinet",
-    BOWL,
+    "put_the_butter_into_the_bowl_from_the_prompt_video",
     "execute_the_assembly_procedure_demonstrated_in_the_prompt_video",
 )
-"""One task of each memory type."""
+"""One task of each memory type, for the first part."""
+STRICT_TASK = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
+"""Task of the second part: the two policies differed in it on validation seeds."""
 POLICIES: dict[str, tuple[str, ...]] = {
     "expert": (),
-    "with memory": ("policy=memobench_small",),
-    "without memory": ("policy=memobench_small_memoryless",),
+    "with memory": ("policy=memobench_strict",),
+    "without memory": ("policy=memobench_strict_memoryless",),
 }
 """Name in the second part -> arguments of `lerobot eval` that choose who acts."""
 EPISODES, RECORDED, HORIZON = 12, 3, 400
@@ -88,7 +89,7 @@ def main() -> None:
     folders = {name: out / "memory" / name.replace(" ", "_") for name in POLICIES}
     for name, folder in folders.items():
         run(
-            *("lerobot", "eval", "env=memobench", *POLICIES[name], f"tasks={BOWL}", "referent=random"),
+            *("lerobot", "eval", "env=memobench", "suite=strict", *POLICIES[name], f"tasks={STRICT_TASK}"),
             *(f"horizon={HORIZON}", "obs_type=environment_state_agent_pos", f"episodes={EPISODES}"),
             *(f"videos={RECORDED}", f"output_dir={folder}", "resume=true"),
         )
@@ -119,20 +120,19 @@ def chosen_takes(folders: Mapping[str, Path], outcomes: Mapping[str, Episodes]) 
     alike = [len(set(each)) == 1 for each in zip(*ends, strict=True)]
     chosen = alike.index(False) if False in alike else 0
     return {
-        name: Take(folder / "videos" / f"{BOWL}.{chosen}.mp4", solved[chosen])
+        name: Take(folder / "videos" / f"{STRICT_TASK}.{chosen}.mp4", solved[chosen])
         for (name, folder), solved in zip(folders.items(), ends, strict=True)
     }
 
 
 def table(outcomes: Mapping[str, Episodes]) -> str:
-    """Return how many of the episodes each solved, and how many failed at a wrong bowl, as Markdown."""
-    head = "| butter into the bowl that the prompt showed, of three | solved | wrong bowl |"
+    """Return how many of the episodes each solved, as Markdown."""
     rows = [
-        f"| {name} | {sum(record['success'] for record in episodes)}/{len(episodes)} | "
-        f"{sum(record.get('failure') == 'reference_drift' for record in episodes)} |"
+        f"| {name} | {sum(record['success'] for record in episodes)}/{len(episodes)} |"
         for name, episodes in outcomes.items()
     ]
-    return "\n".join([head, "|---|---|---|", *rows, "", "Inputs: privileged object state and the prompt."]) + "\n"
+    head = [f"`{STRICT_TASK}`", "", "| policy | solved |", "|---|---|"]
+    return "\n".join([*head, *rows, "", "Inputs: privileged object state and the prompt."]) + "\n"
 
 
 # --- pictures ---

@@ -11,7 +11,7 @@ The policy serves one client at a time, since it has one memory. A connection be
 needs it, and must be asked at every step that it remembers: at every eighth, by default, so with replan=8, 4, 2 or 1.
 
 A policy of object state asks for `observation/environment_state`. Stock LIBERO observes none. A client in it sends its
-simulator state instead, from which ``world=libero`` computes what both cameras see:
+simulator state instead, from which the server computes what both cameras see:
 
 ``simulator/task``
     name of the task
@@ -107,7 +107,7 @@ def objects(task: str, state: NDArray[np.float64], fixtures: dict[str, NDArray[n
 @lru_cache(maxsize=1)
 def scene(task: str) -> tuple[Simulation, ObjectSlots]:
     """Return a task's scene in the paper's world; the last one stays."""
-    sim = Simulation(get_task(task).in_world("libero"))
+    sim = Simulation(get_task(task))
     return sim, ObjectSlots(sim)
 
 

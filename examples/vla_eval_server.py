@@ -1,6 +1,6 @@
 """Serve a LeRobot policy with a memory to vla-evaluation-harness, and to ``dialect=vla_eval``.
 
-    python examples/vla_eval_server.py memobench_small --detector package --port 8000
+    python examples/vla_eval_server.py memobench_strict --detector package --port 8000
 
 The harness's own LeRobot server knows no demonstration prompts. This one hands them to the policy frame by frame, as
 ``lerobot-eval`` does: `observation.phase` is 0 in the prompt and 1 in the execution, `observation.step` counts the

@@ -52,7 +52,7 @@ def render() -> None:
         simulation.step(NO_OP)
         for camera in MJCF_CAMERAS:
             simulation.render(camera)
-            simulation.geoms(camera)
+            simulation.visible_bodies(camera)
 
 
 if __name__ == "__main__":

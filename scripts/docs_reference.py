@@ -29,8 +29,8 @@ from lerobot_memobench.tasks.task import MEMORY_TYPES, SUITES  # noqa: E402
 
 SOURCE = ROOT / "src" / "lerobot_memobench"
 DOCS = ROOT / "docs"
-NECESSITY = ROOT / "results" / "necessity.parquet"
-"""Per task, the best rates that were found for a policy without a memory."""
+ROLLOUTS, ROUTINE = ROOT / "results" / "evaluations" / "rollouts.parquet", "memobench_blind"
+"""Table of rollouts, and its evaluation of a policy without a memory."""
 SHEET = DOCS / "figures" / "tasks.png"
 """Initial scenes of all published tasks, from `scripts/gallery.py`."""
 SHEET_SIDE = 256
@@ -41,9 +41,9 @@ COPIES = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "develop/contributing.md",
     "research/README.md": "develop/lab.md",
-    "src/lerobot_memobench/policies/shipped/memobench_small/README.md": "results/cards/memobench_small.md",
-    "src/lerobot_memobench/policies/shipped/memobench_small_memoryless/README.md": (
-        "results/cards/memobench_small_memoryless.md"
+    "src/lerobot_memobench/policies/shipped/memobench_strict/README.md": "results/cards/memobench_strict.md",
+    "src/lerobot_memobench/policies/shipped/memobench_strict_memoryless/README.md": (
+        "results/cards/memobench_strict_memoryless.md"
     ),
     **{
         f"results/{page.name}": f"results/{page.name.replace('README', 'index')}"
@@ -331,6 +331,7 @@ def typed_rows(kind: Any) -> list[list[str]]:
 
 
 PROTOCOL_ONLY = {
+    "world": "`libero`; absent for the scenes of version 0.2, a list for a log of both",
     "hold": "mean of the drawn holds of a strict task, control steps",
     "goals": "revision of the goals of strict tasks",
     "scene_hash_version": "version of `scene_hash`; hashes of different versions are not compared",
@@ -434,33 +435,40 @@ def python_page() -> str:
 
 
 @cache
-def needs(suite: str) -> dict[str, dict[str, tuple[str, str]]]:
-    """Return task -> referent -> (rate without a memory in %, verdict); the rate is a ceiling for strict tasks."""
+def solved_by_routine() -> dict[str, float]:
+    """Return task -> share of rollouts that a scripted routine without a memory solved."""
     import pyarrow.parquet as pq
 
-    from lerobot_memobench.tasks.catalogue import get_task
+    found: dict[str, list[bool]] = {}
+    for row in pq.read_table(ROLLOUTS, filters=[("evaluation", "==", ROUTINE)]).to_pylist():
+        found.setdefault(row["task"], []).append(row["success"])
+    return {name: sum(done) / len(done) for name, done in found.items()}
+
+
+def without_memory(task: Any) -> dict[str, str]:
+    """Return referent -> rate without a memory: routine or chance of a published task, ceiling of a strict one."""
+    from lerobot_memobench.tasks.evidence import chance
     from research.necessity.adversaries import ceiling
 
-    found: dict[str, dict[str, tuple[str, str]]] = {}
-    for row in pq.read_table(NECESSITY, filters=[("suite", "==", suite)]).to_pylist():
-        rates = [row[key] for key in ("fixed_map", "any_order", "any_order_probabilities") if row[key] is not None]
-        rate = 100 * ceiling(get_task(row["task"])) if suite == "strict" else max(rates)
-        found.setdefault(row["task"], {})[row["referent"]] = (f"{rate:.0f} %", row["memory_needed"])
-    return found
+    if task.suite == "strict":
+        return {"drawn": f"{100 * ceiling(task):.0f} %"}
+    guessed = chance(task)
+    fixed = {"fixed": f"{100 * solved_by_routine()[task.name]:.0f} %"}
+    return fixed if guessed is None else {**fixed, "random": f"≥ {100 * guessed:.0f} %"}
 
 
-VERDICTS = {
-    "no": "no: the current image determines each action",
-    "order": "no: the goal also accepts another order, in which the current image determines each action",
-    "yes": "yes: no policy that uses only the current images was found to succeed in every scene",
-}
 WITHOUT = {
-    "published": "*Without a memory* is the best rate that was found for a policy that decides from pictures alone "
-    "([how](../results/necessity.md)), with fixed and with random referents if they differ: a lower bound, because the "
-    "hand's pose and a clock can reveal more.",
+    "published": "*Without a memory* is the rate of [a scripted routine](results.md#scripted-policies) with fixed "
+    "referents, and with random ones that of a constant answer: a policy may do better.",
     "strict": "*Without a memory* is the [ceiling](suites.md#ceilings) of policies without a memory and a clock.",
 }
 """Suite -> how the rate without a memory was found."""
+NEEDS = {
+    "fixed": "no: a routine without a memory solves it",
+    "random": "yes, unless the goal accepts another order",
+    "drawn": "yes: no current observation determines the answer",
+}
+"""Referent -> whether a task needs a memory."""
 PROMPTS = {
     "routine": "shows the procedure",
     "pick": "picks up the referent",
@@ -475,11 +483,10 @@ def tasks_page(suite: str) -> str:
     from lerobot_memobench.tasks.catalogue import get_task, task_names
     from lerobot_memobench.tasks.gap import longest_gap
 
-    known = needs(suite)
     rows = []
     for number, name in enumerate(task_names(suite=suite), 1):
         task = get_task(name)
-        rates = " · ".join(rate for rate, _ in known.get(name, {}).values())
+        rates = " · ".join(without_memory(task).values())
         link = f"[{title_of(task)}]({card_page(task)}#{slug(name)})"
         rows.append([str(number), link, task.memory_type, task.operations, str(longest_gap(task) or "–"), rates])
     return f"""# {suite.capitalize()} tasks
@@ -495,7 +502,6 @@ def cards_page(suite: str, memory_type: str) -> str:
     """Return the cards of a suite's tasks of one memory type."""
     from lerobot_memobench.tasks.catalogue import get_task, task_names, task_number
 
-    known = needs(suite)
     parts = [
         f"# {suite.capitalize()} {memory_type} tasks",
         f"A card per task, made from its files. {WITHOUT[suite]}",
@@ -506,7 +512,7 @@ def cards_page(suite: str, memory_type: str) -> str:
             "home. [Limitations of this suite](suites.md#limits-of-the-strict-suite)."
         )
     for name in task_names(memory_type, suite):
-        parts += task_parts(task_number(name), get_task(name), known.get(name, {}))
+        parts += task_parts(task_number(name), get_task(name))
     return "\n\n".join(parts) + "\n"
 
 
@@ -521,7 +527,7 @@ def title_of(task: Any) -> str:
     return title.capitalize()
 
 
-def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Iterator[str]:
+def task_parts(number: int, task: Any) -> Iterator[str]:
     """Yield one task's card."""
     from lerobot_memobench.evaluation.tables import OPERATION_NAMES
     from lerobot_memobench.tasks.catalogue import get_task, task_number
@@ -545,12 +551,9 @@ def task_parts(number: int, task: Any, known: dict[str, tuple[str, str]]) -> Ite
     if task.derived_from:
         page = card_page(get_task(task.derived_from))
         rows.append(["scene of", f"[`{task.derived_from}`]({page}#{slug(task.derived_from)})"])
-    for referent, (rate, verdict) in known.items():
-        where = "" if referent in ("both", "drawn") else f", referent {referent}"
-        rows += [
-            [f"needs a memory{where}", VERDICTS.get(verdict, verdict)],
-            [f"without a memory{where}", rate],
-        ]
+    for referent, rate in without_memory(task).items():
+        where = "" if referent == "drawn" else f", referent {referent}"
+        rows += [[f"needs a memory{where}", NEEDS[referent]], [f"without a memory{where}", rate]]
     yield table(["", ""], rows)
     yield table(
         ["checkpoint", "operation", "text (intermediate)"],

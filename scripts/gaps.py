@@ -55,8 +55,8 @@ def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
         use = max([before, *(step for step in range(before, reached) if homes[step])])
         if cue_in_prompt(episode.task, k):
             gaps.append(start + use - cues[k])
-        else:
-            gaps.append(_since_change(scenes[: use + 1]))
+        else:  # at first the instruction is enough, even where LIBERO's scene still moves by itself
+            gaps.append(_since_change(scenes[: use + 1]) if k else None)
         before = reached
     return episode.success, gaps
 
@@ -69,8 +69,9 @@ def _prompt_cues(episode: Episode) -> list[int]:
     goals = [atom.args[0] for atom in atoms(task.goal) if atom.predicate == "on"]
     asked = next((places[name] for name in goals if name in places), None)
     while episode.phase == PROMPT:
+        rests = episode.idling
         episode.step(np.zeros(7, np.float32))
-        if episode.phase != PROMPT:
+        if rests or episode.phase != PROMPT:
             continue
         last = episode.step_index
         if asked is not None:

@@ -2,7 +2,7 @@
 
     python examples/openpi_server.py POLICY --port 8000 &
     PYTHONPATH=src:. LIBERO/bin/python scripts/libero_bridge.py stock FOLDER --replan 8
-    lerobot eval env=memobench world=libero protocol=upstream policy=POLICY replan=8 episodes=10 output_dir=HERE …
+    lerobot eval env=memobench protocol=upstream policy=POLICY replan=8 episodes=10 output_dir=HERE …
     python scripts/libero_bridge.py compare HERE FOLDER
 
 `stock` runs in the environment of `libero_records.py`, plus httpx, msgpack, pydantic and websockets. It follows the

@@ -1,9 +1,8 @@
-"""Compare images of world=libero with MuJoCo's renderer on LIBERO's complete files, or draw both worlds.
+"""Compare pictures with MuJoCo's renderer on LIBERO's complete files, one scene of each task without scans.
 
-    python scripts/libero_looks.py errors [--sheet FILE]     # one scene of each task without scans
-    python scripts/libero_looks.py worlds FILE               # both worlds, side by side
+    python scripts/libero_looks.py [--sheet FILE]
 
-Needs ``PYTHONPATH=src:.``; `errors` also needs MuJoCo's renderer (``MUJOCO_GL=egl``).
+Needs ``PYTHONPATH=src:.`` and MuJoCo's renderer (``MUJOCO_GL=egl``).
 """
 
 from __future__ import annotations
@@ -32,16 +31,11 @@ DIFFERENT_ABOVE = 16
 """Error of a channel (of 255) above which a pixel counts as different."""
 VISIBLE_GROUP, HIDDEN_GROUP = 5, 4
 """Groups of sites."""
-WORLDS_TASKS = (
-    "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it",
-    "check_the_middle_drawer_and_put_the_black_bowl_in_the_top_drawer_and_close_it",
-    "put_the_milk_picked_up_in_the_prompt_video_on_the_plate",
-)
 
 
 def tasks() -> list[Task]:
-    """Return the tasks whose classes are all from LIBERO, with world=libero."""
-    return [task.in_world("libero") for name in task_names() if (task := get_task(name)).memory_type != "spatial"]
+    """Return the tasks whose classes are all from LIBERO."""
+    return [task for name in task_names() if (task := get_task(name)).memory_type != "spatial"]
 
 
 def scene(task: Task, seed: int) -> Simulation:
@@ -122,32 +116,11 @@ def _line(name: str, seed: int | str, row: list[float]) -> str:
     return f"{name} | {seed} | {one_sample} | {row[2]:.1f} %, {row[3]:.1f} % | {four_samples}"
 
 
-def worlds(path: Path) -> None:
-    """Draw the same scenes in both worlds, one row per world, agentview and wrist camera; at most 150 kB."""
-    rows = []
-    for world in ("memobench", "libero"):
-        images = []
-        for name in WORLDS_TASKS:
-            sim = Simulation(get_task(name).in_world(world))
-            sim.reset(8)
-            images += [sim.render(camera) for camera in MJCF_CAMERAS]
-        rows.append(np.hstack([np.pad(image, ((0, 4), (0, 4), (0, 0)), constant_values=255) for image in images]))
-    picture = Image.fromarray(np.vstack(rows))
-    small = picture.resize((picture.width * 5 // 8, picture.height * 5 // 8), Image.Resampling.LANCZOS)
-    small.quantize(96, dither=Image.Dither.NONE).save(path, optimize=True)
-
-
 def main() -> None:
-    """Run a command."""
+    """Print the comparison."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("errors").add_argument("--sheet", type=Path)
-    commands.add_parser("worlds").add_argument("path", type=Path)
-    args = parser.parse_args()
-    if args.command == "errors":
-        errors(args.sheet)
-    else:
-        worlds(args.path)
+    parser.add_argument("--sheet", type=Path, help="file of all pictures")
+    errors(parser.parse_args().sheet)
 
 
 if __name__ == "__main__":

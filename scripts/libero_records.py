@@ -385,7 +385,7 @@ def actions() -> Arrays:
     records: Arrays = {}
     for name, seed in ROLLOUTS.items():
         task = get_task(name)
-        episode, theirs = Episode(task, demonstration_prompt=False), Simulation(task.in_world("libero"))
+        episode, theirs = Episode(task, demonstration_prompt=False), Simulation(task)
         episode.reset(seed)
         theirs.reset(seed)
         ours = episode.sim

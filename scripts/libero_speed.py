@@ -1,4 +1,4 @@
-"""Measure the speed of rollouts with world=libero, in this package or in stock LIBERO.
+"""Measure the speed of rollouts in this package or in stock LIBERO.
 
     PYTHONPATH=src:. python scripts/libero_speed.py
     PYTHONPATH=src:. LIBERO/bin/python scripts/libero_speed.py stock    # in the environment of `libero_records`
@@ -35,7 +35,7 @@ def our_operations(name: str) -> Operations:
     from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
     from lerobot_memobench.tasks.catalogue import get_task
 
-    sim = Simulation(get_task(name).in_world("libero"))
+    sim = Simulation(get_task(name))
 
     def reset(seed: int) -> None:
         sim.reset(seed)

@@ -23,7 +23,7 @@ from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task
 
-TASK, SEED = "find_the_artichoke_hidden_in_one_of_the_drawers", VALIDATION_SEED
+TASK, SEED = "find_the_artichoke_hidden_in_one_of_the_drawers", VALIDATION_SEED + 2
 VARIANTS = (0, 1)
 STRIDE, SPEED = 6, 3.0
 """Control steps per frame, and playback speed relative to real time."""

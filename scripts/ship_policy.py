@@ -1,11 +1,11 @@
 """Put a trained policy into the package: its weights in bfloat16, and a card with its training and its results.
 
-    python scripts/ship_policy.py outputs/joint/policies/memory-0 memobench_small --rollouts outputs/eval/small
+    python scripts/ship_policy.py outputs/joint/policies/memory-0 memobench_strict --rollouts outputs/eval/small
 
 The card's rollouts are of the shipped weights: run once without rollouts, evaluate the written folder
-(policy=memobench_small), and run again. Put later rollouts of the same weights into the card by
+(policy=memobench_strict), and run again. Put later rollouts of the same weights into the card by
 
-    python scripts/ship_policy.py memobench_small memobench_small --rollouts outputs/eval/later
+    python scripts/ship_policy.py memobench_strict memobench_strict --rollouts outputs/eval/later
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.datasets.lerobot_format.layout import read_manifest
 from lerobot_memobench.envs.episode_log import MERGED_FILE
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON
 from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder, shipped_policies
@@ -38,6 +39,8 @@ LARGEST = 4_000_000
 """Bytes that one policy may take."""
 OF_THE_DATA = ("input_features", "output_features", "action_feature_names", "object_classes")
 """Settings of a policy that its dataset decides."""
+OF_THE_MACHINE = ("policy", "output_dir", "resume", "videos", "batch_size", "device")
+"""Words of an evaluation's command that a card does not repeat."""
 HEAD = """---
 license: apache-2.0
 library_name: lerobot
@@ -256,8 +259,10 @@ def results(name: str, rollouts: Path) -> list[str]:
         for scope, row in rows.items()
     ]
     head = ["| | rollouts | SR | MSR | MUR | MCR |", "|---|---|---|---|---|---|"]
-    words = f"`lerobot eval env=memobench policy={name} referent=random`, evaluation seeds from 7 on, sha256 of its log"
-    return ["", f"{words} `{file_hash(rollouts / MERGED_FILE)}`:", "", *head, *body]
+    given = json.loads((rollouts / EVALUATION_FILE).read_text())["runs"][0]["command"][3:]
+    words = [f"policy={name}", *(word for word in given if word.partition("=")[0] not in OF_THE_MACHINE)]
+    command = shlex.join(["lerobot", "eval", "env=memobench", *words])
+    return ["", f"`{command}`, sha256 of its log `{file_hash(rollouts / MERGED_FILE)}`:", "", *head, *body]
 
 
 def retell(name: str, rollouts: Path) -> Path:

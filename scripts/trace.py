@@ -5,7 +5,7 @@
 A file counts when one of its functions runs; code run by an import and code compiled by numba do not count. Each
 operation runs in a process of its own, on the CPU, through public commands and LeRobot's interfaces:
 
-words to plan      `lerobot eval env=memobench policy=memobench_small …`, from the command line to the `EvaluationPlan`
+words to plan      `lerobot eval env=memobench policy=memobench_strict …`, from the command line to the `EvaluationPlan`
 control step       processors, `select_action` and `env.step`, at a step without planning
 planned step       processors and `select_action`, at a step that plans an action chunk
 training step      `lerobot train`: batch, processors and update, from the end of one update to the end of the next
@@ -34,7 +34,7 @@ if sys.path[0] == os.path.dirname(os.path.abspath(__file__)):
 
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "lerobot_memobench"
 TASK = "check_the_top_drawer_of_the_cabinet"
-POLICY = "memobench_small"
+POLICY = "memobench_strict"
 SEED = 20_000
 STEPS = 48
 """Traced control steps; with 6 actions per chunk and a memory stride of 8, they include every kind of step."""

@@ -23,12 +23,12 @@ import numpy as np
 from lerobot_memobench.protocol import PAPER, SPLITS
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import LIBERO, PUBLISHED, STRICT
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 
 
 def unsettled(name: str, seeds: range | list[int]) -> list[int]:
     """Return the seeds of a task whose scenes do not settle."""
-    sim = Simulation(get_task(name).in_world(LIBERO))
+    sim = Simulation(get_task(name))
     found = []
     for seed in seeds:
         sim.reset(seed)
@@ -41,7 +41,7 @@ def write_positions(file: str) -> None:
     """Write task -> positions of its objects after settling, (25, objects, 3), m."""
     found = {}
     for name in task_names(suite=PUBLISHED):
-        sim = Simulation(get_task(name).in_world(LIBERO))
+        sim = Simulation(get_task(name))
         found[name] = np.empty((25, len(sim.task.objects), 3))
         for k, seed in enumerate(SPLITS[PAPER][:25]):
             sim.reset(seed)

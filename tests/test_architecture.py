@@ -131,5 +131,5 @@ def test_developer_pages_name_existing_files() -> None:
     for page in pages:
         names = re.findall(r"`([\w/]+\.py)", page.read_text())
         assert [name for name in names if not any((base / name).is_file() for base in (page.parent, *folders))] == []
-        long = ("way_of_a_frame.md", "paper_world.md", "add_an_object_class.md")  # the last one has files in full
+        long = ("way_of_a_frame.md", "scenes.md", "add_an_object_class.md")  # the last one has files in full
         assert page.name in long or len(page.read_text().splitlines()) <= 40

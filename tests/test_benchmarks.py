@@ -17,10 +17,10 @@ SMALLEST = {
     "object_update": "src --rounds 1 --memory frames",
     "step_with_objects": "--steps 5 --repeats 1 --tasks 1",
 }
-"""Script -> arguments; `before_after` needs stock robosuite's renderer, `rollouts_total` is tested in `research`."""
+"""Script -> arguments."""
 
 
-@pytest.mark.parametrize("name", [*SMALLEST, "before_after", "rollouts_total"])
+@pytest.mark.parametrize("name", SMALLEST)
 def test_benchmark_imports(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(BENCHMARKS)
     for module in ("turns", "policies", "random_weights", "object_update", name):

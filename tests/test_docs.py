@@ -161,7 +161,7 @@ def test_site_is_built_strictly(tmp_path: Path) -> None:
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "The memory study" in (tmp_path / "results/study/index.html").read_text()
+    assert "stock LIBERO" in (tmp_path / "results/scenes/index.html").read_text()
 
 
 TEST = re.compile(r"`((?:tests|research)/[\w/]+\.py)::(\w+)`")
@@ -188,13 +188,14 @@ def test_claims_and_their_sources_stand_where_the_list_has_them() -> None:
 
 
 def test_kept_evaluations_are_named_in_pages() -> None:
-    """Those of a comparison with stock LIBERO on the page of the paper's world."""
+    """Those of a comparison with stock LIBERO on the page of the scenes."""
     there = set(pq.read_table(recompute.EVALUATIONS / "evaluations.parquet")["evaluation"].to_pylist())
-    results, world = (
-        set(re.findall(r"\[`(\w+)`\]\(\S+evaluations/rollouts.parquet\)", page.read_text()))
-        for page in (recompute.PAGES[1], DOCS / "develop" / "paper_world.md")
-    )
-    assert results | {name for name in world if name.startswith("bridge_")} == there
+    named = {
+        name
+        for page in (recompute.PAGES[1], recompute.RESULTS / "scenes.md")
+        for name in re.findall(r"\[`(\w+)`\]\(\S*evaluations/rollouts.parquet\)", page.read_text())
+    }
+    assert named == there
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.sim.object_layout import STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, fill_slots
 from tests.support import logs
-from tests.support.libero import needs_assets, simulate
+from tests.support.libero import simulate
 from tests.support.remote_case import batch
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -136,7 +136,7 @@ def test_recurrent_ppo_learns_and_resumes(tmp_path: Path) -> None:
 def test_openpi_server_returns_the_actions_of_the_policy() -> None:
     """A policy with a memory, requested at each eighth step; the client raises the server's error."""
     example = runpy.run_path(str(EXAMPLES / "openpi_server.py"))
-    served = example["ServedPolicy"]("memobench_small")
+    served = example["ServedPolicy"]("memobench_strict")
     server = example["make_server"](served, "127.0.0.1", 0)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     port = int(server.socket.getsockname()[1])
@@ -156,7 +156,6 @@ def test_openpi_server_returns_the_actions_of_the_policy() -> None:
         assert len({tuple(action.ravel().tolist()) for action in local}) == len(episode)
 
 
-@needs_assets
 def test_openpi_server_computes_object_state_from_libero_state() -> None:
     example = runpy.run_path(str(EXAMPLES / "openpi_server.py"))
     sim = simulate("turn_on_the_stove_and_turn_it_off_near_the_shelf")

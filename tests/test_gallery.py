@@ -59,10 +59,3 @@ def test_figures_are_reduced_to_the_maximum_size(tmp_path: Path, monkeypatch: py
     assert path.stat().st_size <= 8_000
     assert Image.open(path).width < 120
     assert Image.open(gallery.save(Image.new("RGB", (300, 300)), tmp_path / "plain.png")).size == (300, 300)
-
-
-def test_objects_and_fixtures() -> None:
-    assert gallery.draw_objects(["butter", "milk"], size=32).width == 2 * 4 * 32 + 18
-    fixtures = np.asarray(gallery.draw_fixtures(["microwave"], size=64)).astype(int)
-    closed, opened = fixtures[6:70, 6:70], fixtures[6:70, 140:204]
-    assert np.abs(closed - opened).mean() > 5

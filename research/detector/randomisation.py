@@ -18,11 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.experts.demonstration_prompt import highlight_of
 from lerobot_memobench.experts.hand import downward
-from lerobot_memobench.sim.assets.asset import Asset, Grasp
-from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE, TABLE_TOP, Asset, Grasp
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.placement import DROP_HEIGHT, MAX_CONTACT_DEPTH
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE
 from lerobot_memobench.sim.simulation import Simulation
@@ -32,6 +30,8 @@ from lerobot_memobench.tasks.task import Task
 
 Array = NDArray[np.float64]
 
+DROP_HEIGHT, MAX_CONTACT_DEPTH = 0.0005, 0.0015
+"""Initial height of an object above its support, and largest contact depth of objects at rest, m."""
 DISTRACTOR = "more_"
 """Prefix of the names of distractors."""
 AREA = ((-0.30, 0.25), (-0.38, 0.38))
@@ -142,16 +142,17 @@ class DomainRandomisation:
             x, y, z = sim.body_pose(other.name)[0] + [*(rng.normal(size=2) * other.clear_radius / 4), other.supports]
             return float(x), float(y), float(z)
         site = other.regions[str(rng.choice(list(other.regions)))]
-        (middle, rotation), half = sim.site_pose(site), sim.site_half_size(site)
+        middle, rotation = sim.site_pose(site)
+        half = np.abs(rotation @ sim.site_half_size(site))
         room = np.maximum(half[:2] - asset.radius, 0.0)
         flat = half[2] if site.endswith(("_side", "cook_region")) else -half[2]
-        x, y, z = middle + rotation @ np.array([*rng.uniform(-room, room), flat])
+        x, y, z = middle + np.array([*rng.uniform(-room, room), flat])
         return float(x), float(y), float(z)
 
     def _reach(self) -> bool:
         """Bend the arm to a pose above an object or a handle, the nearer the likelier."""
         rng, sim = self._rng, self._sim
-        goals = [(*sim.body_pose(name), asset.grasps[0]) for name, asset in self._objects.items() if asset.grasps]
+        goals = [(*sim.asset_pose(name), asset.grasps[0]) for name, asset in self._objects.items() if asset.grasps]
         places = [(place + turned @ np.array(grasp.position), grasp.yaw) for place, turned, grasp in goals]
         places = [(place, yaw) for place, yaw in places if place[0] < AWAY[0] / 2]
         places += [(sim.site_pose(part.handle_site)[0], 0.0) for part in self._parts]
@@ -184,8 +185,13 @@ class DomainRandomisation:
         """Put an object where no camera looks, each at a place of its own."""
         self._write(name, away(list(self._objects).index(name)))
 
-    def _write(self, name: str, pose: Array) -> None:
-        self._sim.data.joint(f"{name}_joint0").qpos[:] = pose
+    def _write(self, name: str, upright: Array) -> None:
+        """Set the pose (7,) of an object's `Asset` frame."""
+        frame = self._objects[name].upright
+        if frame is not None:
+            turn = Rotation.from_quat(upright[3:], scalar_first=True)
+            upright = pose(upright[:3], turn * Rotation.from_quat(frame, scalar_first=True).inv())
+        self._sim.data.joint(f"{name}_joint0").qpos[:] = upright
 
     def _overlapping(self, held: str | None = None) -> set[str]:
         """Return the names of bodies, at the roots of their trees, that penetrate one another; a held one may."""
@@ -227,10 +233,17 @@ def _task_with(task: Task, classes: list[str]) -> Task:
 
 def widened(state: Array, sim: Simulation, crowd: Simulation) -> Array:
     """Return a state of ``sim`` as one of its `with_distractors`: those are away, at rest."""
-    nq, before = sim.model.nq, sum(asset.kind == "object" for asset in sim.assets.values())
-    added = [away(before + index) for index in range((crowd.model.nq - nq) // 7)]
-    rest = np.zeros(crowd.model.nv - sim.model.nv)
-    return np.concatenate([state[: 1 + nq], *added, state[1 + nq :], rest])
+    made = np.concatenate([state[:1], crowd.model.qpos0, np.zeros(crowd.model.nv)])
+    for index in range(sim.model.njnt):
+        mine, theirs = sim.model.joint(index), crowd.model.joint(sim.model.joint(index).name)
+        count = len(mine.qpos0)
+        made[1 + theirs.qposadr[0] :][:count] = state[1 + mine.qposadr[0] :][:count]
+        count = 6 if count == 7 else 1
+        made[1 + crowd.model.nq + theirs.dofadr[0] :][:count] = state[1 + sim.model.nq + mine.dofadr[0] :][:count]
+    for index, name in enumerate(name for name in crowd.assets if name.startswith(DISTRACTOR)):
+        address = 1 + int(crowd.model.joint(f"{name}_joint0").qposadr[0])
+        made[address : address + 7] = away(index)
+    return made
 
 
 def pose(position: Array, turn: Rotation) -> Array:

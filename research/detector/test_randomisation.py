@@ -8,12 +8,12 @@ import pytest
 from lerobot_memobench.experts.hand import downward
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.placement import MAX_CONTACT_DEPTH
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector import randomisation
 from research.detector.labels import Labeller
 from research.detector.randomisation import (
     DISTRACTOR,
+    MAX_CONTACT_DEPTH,
     DomainRandomisation,
     held,
     object_classes,

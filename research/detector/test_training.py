@@ -15,7 +15,7 @@ from lerobot_memobench.perception.detector import Detector, detections
 from lerobot_memobench.perception.geometry import projected
 from lerobot_memobench.perception.visual_encoder import GRID, SIDE
 from lerobot_memobench.perception.weights import load_detector, save_detector
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE_TOP
 from research.detector import training
 from research.detector.data import Pictures
 from research.detector.labels import Rows, images_of

@@ -35,7 +35,7 @@ from lerobot_memobench.perception.detector import (
 from lerobot_memobench.perception.geometry import projected
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.training.loop import keep_freed_memory
 from research.detector.data import Pictures
 from research.detector.labels import MASK, Rows, images_of

@@ -146,7 +146,8 @@ class _Cases:
         for i, move in enumerate(self.right):
             before, done = done, judge(self.task, whole[: 2 * (i + 1)]).checkpoints
             for k in range(before, done):
-                inside = isinstance(self.task.checkpoints[k].goal, Not)
+                goal = self.task.checkpoints[k].goal
+                inside = any(isinstance(part, Not) for part in (goal, *getattr(goal, "children", ())))
                 for kind, moves in self._out_of_place(move) if inside else self._nearly(move, self.right[i - 1]):
                     yield Case(kind, (*self.right[:i], *moves), checkpoint=k + 1)
 
@@ -177,13 +178,14 @@ class _Cases:
         drawer = self.stage.is_drawer(move.place)
         yield "next to the target", (replace(move, offset=(0.0, self._outside(move.place), 0.0)),)
         if drawer:
-            depth = float(self.stage.sim.site_half_size(move.place)[2])
+            depth = float(self.stage.half(move.place)[2])
             yield "above the drawer", (replace(move, offset=(0.0, 0.0, depth + 0.01)),)
             yield "below the drawer", (replace(move, offset=(0.0, 0.0, -depth - 0.015)),)
         else:
             yield "held 2 cm above the target", (replace(move, offset=(0.0, 0.0, 0.02)),)
         yield "touched, not moved", (replace(move, place=None),)
-        others = [name for name in self.task.objects if name not in (move.name, move.place)]
+        carriers = [atom.args[1] for atom in self.task.init if atom.args[0] == move.name]
+        others = [name for name in self.task.objects if name not in (move.name, move.place, *carriers)]
         yield from (("right place, wrong object", (replace(move, name=name),)) for name in others[:2])
         yield from (("right object, wrong place", (replace(move, place=place),)) for place in self._other_places(move))
 
@@ -194,7 +196,7 @@ class _Cases:
             return 0.04
         if region is not None and region.ranges:
             return float(max(box[3] for box in region.ranges) - (region.ranges[0][1] + region.ranges[0][3]) / 2) + 0.01
-        return float(np.max(self.stage.sim.site_half_size(place)[:2])) + 0.01
+        return float(np.max(self.stage.half(place)[:2])) + 0.01
 
     def _other_places(self, move: Move) -> list[str]:
         assert move.place is not None

@@ -59,7 +59,6 @@ NOT_SHOWN = {
     "Progress.step: self.first_step[k] is None": "verdicts do not hold the first step",
     "Progress.step: now and self.first_step[k] is None": "verdicts do not hold the first step",
     "World.touching: False -> True": "a scene without any contact does not occur",
-    "World._on_site: any((x1": "no case puts an object into the second rectangle of a region only",
     "IN_SLACK × 0.5": "no case puts an object 5 to 10 mm below a drawer's floor; tests/sim/test_world.py does",
     "ON_SITE_BELOW ×": "contact with the target decides first",
     "ON_SITE_ABOVE × 2.0": "contact with the target decides first",

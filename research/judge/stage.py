@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.assets.kitchen import TABLE
+from lerobot_memobench.sim.asset import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.evidence import Choice, handled_atoms
 from lerobot_memobench.tasks.formula import LATCHES, Atom, atoms
@@ -124,18 +124,23 @@ class Stage:
         joint = self.sim.world.joints.get(place)
         return joint is not None and joint[0].kind == "drawer"
 
+    def half(self, place: str) -> Array:
+        """Return the half size (3,) of a region along the axes of the world, m."""
+        return np.abs(self.sim.site_pose(place)[1] @ self.sim.site_half_size(place))
+
     def way(self, name: str) -> float:
         """Return the way of a joint from its start to its bound of open or on, m or rad."""
         joint, address = self.sim.world.joints[name]
         return (joint.on_at_least if joint.kind == "knob" else joint.open_below) - float(self.start[1 + address])
 
     def _turn(self, name: str, share: float) -> None:
-        """Turn a joint, with all objects in it."""
-        _, address = self.sim.world.joints[name]
+        """Turn a joint, with all objects in it; a published scene begins with joints between open and closed."""
+        joint, address = self.sim.world.joints[name]
         drawer = self.is_drawer(name)
         carried = [one for one in self.task.objects if drawer and self.sim.holds(Atom("in", (one, name)))]
         before = self.sim.site_pose(name)[0] if drawer else np.zeros(3)
-        self.sim.data.qpos[address] = self.start[1 + address] + share * self.way(name)
+        shut = self.start[1 + address] if share or self.task.suite == STRICT else joint.closed_q
+        self.sim.data.qpos[address] = shut + share * self.way(name)
         mujoco.mj_step1(self.sim.model, self.sim.data)
         for one in carried:
             self._set_position(one, self.sim.body_pose(one)[0] + self.sim.site_pose(name)[0] - before)
@@ -160,6 +165,10 @@ class Stage:
 
     def _lower(self, name: str, target: str) -> None:
         """Lower an object from above until it touches the target."""
+        if target == TABLE:
+            place = self.sim.body_pose(name)[0]
+            self._set_position(name, np.array([*place[:2], TABLE_TOP - self.sim.assets[name].bottom]))
+            return
         height = CLEAR
         for step in (COARSE, FINE):
             self._set_position(name, self.sim.body_pose(name)[0] + (0.0, 0.0, height))
@@ -174,7 +183,7 @@ class Stage:
             return self.sim.body_pose(place)[0]
         if region is not None and region.target == TABLE:
             x1, y1, x2, y2 = region.ranges[0]
-            return np.array([(x1 + x2) / 2, (y1 + y2) / 2, self.sim.body_pose(TABLE)[0][2]])
+            return np.array([(x1 + x2) / 2, (y1 + y2) / 2, TABLE_TOP])
         return self.sim.site_pose(place)[0]
 
     def _owner(self, place: str) -> str:

@@ -23,6 +23,7 @@ KNOWN = {
     ("published", "order exchanged"),
     ("published", "moved without the hand"),
     ("strict", "moved without the hand"),
+    ("strict", "held 2 cm above the target"),
 }
 """Suite and kind of near misses that the definitions of goals accept, as the page states."""
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"

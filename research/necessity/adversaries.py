@@ -20,7 +20,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -33,7 +33,7 @@ from lerobot_memobench.experts.expert import Expert, plan_of
 from lerobot_memobench.experts.hand import OPEN, UP
 from lerobot_memobench.experts.travel import opening_direction, release_fixture, rise
 from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, VALIDATION_SEED
-from lerobot_memobench.sim.assets.registry import split_class
+from lerobot_memobench.sim.asset import split_class
 from lerobot_memobench.sim.detents import DEAD_CENTRE
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import classes
@@ -41,7 +41,7 @@ from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.formula import Atom, atoms
-from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, Task, World
+from lerobot_memobench.tasks.task import STRICT, Task
 from research.command import run
 from research.necessity.clock import WAIT, best_plan, bin_of
 from research.necessity.notes import Motion, leave_ajar, loose_object, opened_to, pull, shift
@@ -400,8 +400,7 @@ def look_inside(seat: Seat) -> Motion:
     name = _asked(seat)[0]
     for level in LOOKS:
         yield from _look(seat, level)
-        geoms, (model, *_) = seat.sim.geoms("wrist"), seat.sim._drawing()
-        shown = model.body_rootid[model.geom_bodyid[geoms[geoms >= 0]]] == model.body(name).rootid[0]
+        shown = seat.sim.visible_bodies("wrist") == seat.sim.model.body(name).id
         if shown.sum() >= SHOWN_PIXELS or seat.rows(_asked(seat)[1]):
             yield from seat.do(Atom("open", (f"wooden_cabinet_1_{level}_region",)))
             yield from _fetch(seat)
@@ -534,15 +533,14 @@ NOTHING = np.zeros(ACTION_DIM, np.float32)
 
 
 @cache
-def _episode(name: str, strategy: str, world: World) -> Episode:
+def _episode(name: str, strategy: str) -> Episode:
     """Return the episodes of a task, with a scene that is compiled once; of prompts only the final scene is visible."""
-    task = get_task(name).in_world(world)
-    return Episode(task, EnvSettings(suite=STRICT, demonstration_prompt=False, **DECLARED.get(strategy, {})))
+    return Episode(get_task(name), EnvSettings(suite=STRICT, demonstration_prompt=False, **DECLARED.get(strategy, {})))
 
 
-def rollout(name: str, strategy: str, seed: int, world: World = MEMOBENCH) -> dict[str, object]:
+def rollout(name: str, strategy: str, seed: int) -> dict[str, object]:
     """Return one rollout of a strategy: success, whether the goal was lost, control steps, and those in holds."""
-    episode = _episode(name, strategy if strategy in DECLARED else "", world)
+    episode = _episode(name, strategy if strategy in DECLARED else "")
     episode.reset(seed, keep_prompt=True)
     while episode.phase != EXECUTION:
         episode.step(NOTHING)
@@ -559,7 +557,7 @@ def rollout(name: str, strategy: str, seed: int, world: World = MEMOBENCH) -> di
         episode.step(action)
     found = {"success": episode.success, "lost": episode.lost, "steps": episode.exec_steps}
     found["held"] = episode.pacing.held_steps
-    return {"task": name, "world": world, "strategy": strategy, "seed": seed, **found}
+    return {"task": name, "strategy": strategy, "seed": seed, **found}
 
 
 def table(rollouts: list[dict[str, object]]) -> str:
@@ -599,32 +597,29 @@ def adversaries(
     seed: Annotated[int, typer.Option(help="Seed of the first scene.")] = VALIDATION_SEED,
     tasks: Annotated[list[str] | None, typer.Option(help="Names or memory types; all strict tasks if omitted.")] = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    world: Annotated[str, typer.Option(help="memobench or libero.")] = MEMOBENCH,
     strategies: Annotated[list[str] | None, typer.Option(help="Names of strategies; all if omitted.")] = None,
 ) -> None:
     """Roll out every strategy on every strict task; print the table."""
     out.mkdir(parents=True, exist_ok=True)
     log = out / "rollouts.jsonl"
     found = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
-    done = {(r["task"], r["strategy"], r["seed"], r["world"]) for r in found}
+    done = {(r["task"], r["strategy"], r["seed"]) for r in found}
     chosen = [
         name for name in task_names(suite="strict") if not tasks or name in tasks or get_task(name).memory_type in tasks
     ]
     wanted = [
-        (name, strategy, seed + scene, cast("World", world))
+        (name, strategy, seed + scene)
         for scene in range(scenes)
         for name in chosen
         for strategy in STRATEGIES[str(get_task(name).family)]
-        if (name, strategy, seed + scene, world) not in done and strategy in (strategies or [strategy])
+        if (name, strategy, seed + scene) not in done and strategy in (strategies or [strategy])
     ]
     with ProcessPoolExecutor(workers) as pool, log.open("a") as file:
         for future in as_completed([pool.submit(rollout, *one) for one in wanted]):
             found.append(future.result())
             file.write(json.dumps(found[-1]) + "\n")
             file.flush()
-    asked = [
-        one for one in found if one["task"] in chosen and one["world"] == world and seed <= one["seed"] < seed + scenes
-    ]
+    asked = [one for one in found if one["task"] in chosen and seed <= one["seed"] < seed + scenes]
     print(f"{table(asked)}\n\n{summary(asked)}")
     print(f"\nceiling of these tasks, their mean: {100 * np.mean([ceiling(get_task(name)) for name in chosen]):.1f} %")
 

@@ -53,8 +53,14 @@ def check_choice(name: str, value: object, known: Sequence[str]) -> None:
         raise MemobenchError(f"{name} is {value!r}; {nearest(str(value), known)}")
 
 
+REMOVED = {"world": "it was removed: LIBERO's scenes are the only ones"}
+"""Setting of earlier versions -> the reason of its absence."""
+
+
 def nearest(given: str, known: Iterable[str], count: int = 3) -> str:
     """Return a hint that names the known words nearest to ``given``, or all of them if there are few."""
+    if given.rpartition(".")[2] in REMOVED:
+        return REMOVED[given.rpartition(".")[2]]
     words = sorted(known)
     if not words:
         return "there is none"

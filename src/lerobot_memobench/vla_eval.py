@@ -26,6 +26,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
 from lerobot_memobench.sim.convention import CONVENTIONS
+from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 
 try:
     from vla_eval.benchmarks.base import StepBenchmark, StepResult
@@ -249,9 +250,9 @@ class MEMOBench(StepBenchmark):
         return dict.fromkeys((SUCCESS, *PROCESS_METRICS), "mean")
 
     def get_metadata(self) -> dict[str, Any]:
-        """Return the maximum number of steps (horizon and pauses), suite, world and protocol."""
+        """Return the maximum number of steps (horizon and pauses), suite, source of the scenes, and protocol."""
         own = self._settings
-        return {"max_steps": longest(own), "suite": own.suite, "world": own.world, "protocol": own.protocol}
+        return {"max_steps": longest(own), "suite": own.suite, WORLD: LIBERO, "protocol": own.protocol}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """Return the conventions of an action."""

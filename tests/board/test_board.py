@@ -81,7 +81,7 @@ def test_valid_submission_is_accepted(board: Path) -> None:
 def test_board_of_the_repository_is_valid() -> None:
     rows = board_rows(ROOT / "results" / "board")
     assert {row.name: row.rerun for row in rows} == dict.fromkeys((row.name for row in rows), True)
-    assert {row.name: f"{row.rates['SR'].value:.4f}" for row in rows}["memobench_small"] == "0.9775"
+    assert {row.name: f"{row.rates['SR'].value:.4f}" for row in rows}["memobench_expert_libero"] == "0.9960"
 
 
 # --- doctored submissions ---
@@ -154,7 +154,8 @@ DOCTORED: dict[str, tuple[Callable[[Path], object], str]] = {
         in_card(lambda card: card["runs"].append({**card["runs"][0], "versions": {**VERSIONS, "mujoco": "4.0.0"}})),
         "its parts ran under mujoco",
     ),
-    "mixed world": (in_log(lambda log: log[0].update(world="libero"), card=True), "world=libero"),
+    "former scenes": (in_card(lambda card: card["protocol"].update(world="memobench")), "world: memobench and libero"),
+    "mixed scenes": (in_log(lambda log: log[0].pop("world")), "world=memobench"),
     "mixed policy": (in_log(lambda log: log[9].update(policy="act 4567")), "of the policy 'act 4567'"),
     "hidden inputs": (in_log(lambda log: log[9].update(inputs="privileged object state")), "inputs=privileged"),
     "sealed without commitment": (sealed, "commitment of the sealed test"),

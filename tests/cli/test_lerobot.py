@@ -287,8 +287,8 @@ def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80
     return place / "pretrained_model"
 
 
-NULL: dict[str, str | None] = dict.fromkeys(("memory_stride", "memory_fusion", "memory_phase"))
-SMALL = ["policy=memobench_small", "steps=1", "device=cpu"]
+NULL: dict[str, str | None] = dict.fromkeys(("memory_stride", "memory_fusion", "memory_phase", "memory_repeats"))
+SMALL = ["policy=memobench_strict", "steps=1", "device=cpu"]
 DEFAULTS: list[tuple[list[str], dict[str, str | None]]] = [
     (
         ["policy=memobench_mem", "align=contrastive"],
@@ -309,7 +309,10 @@ DEFAULTS: list[tuple[list[str], dict[str, str | None]]] = [
         [*SMALL, "policy.memory=motion", "policy.memory_stride=2"],
         {"policy.memory_stride": "2", "policy.memory_fusion": "null"},
     ),
-    ([*SMALL, "align=none", "policy.memory=none"], {"policy.memory_phase": "false"}),
+    (
+        [*SMALL, "align=none", "policy.memory=none"],
+        {"policy.memory_phase": "false", "policy.memory_repeats": "true"},
+    ),
 ]
 
 

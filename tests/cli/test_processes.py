@@ -312,7 +312,7 @@ def test_a_training_is_ended_and_resumed(tmp_path: Path) -> None:
 # --- evaluations killed twenty times at random moments ---
 
 KILLS = 20
-COMMON = ["env=memobench", "env.render=fast", "env.videos=-1", "batch_size=2"]
+COMMON = ["env=memobench", "env.videos=-1", "batch_size=2"]
 COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would start for longer than an episode lasts
 TWO = f"tasks={STOVE},{DRAWER}"
 EVALUATIONS = {

@@ -186,10 +186,10 @@ ACT = (
     ("words", "wrong"),
     [
         (ACT, ["remembers"]),
-        (("policy=memobench_small",), []),
-        (("policy=memobench_small_memoryless",), ["remembers"]),
+        (("policy=memobench_strict",), []),
+        (("policy=memobench_strict_memoryless",), ["remembers"]),
     ],
-    ids=["act", "memobench_small", "memobench_small_memoryless"],
+    ids=["act", "memobench_strict", "memobench_strict_memoryless"],
 )
 def test_known_policies_fail_known_checks(words: tuple[str, ...], wrong: list[str], pictures: Path) -> None:
     results = run_checks(load_subject([*words, f"dataset={pictures}"], pictures.parent))

@@ -174,7 +174,7 @@ def test_a_dataset_is_no_log(synthetic, copy):
 @pytest.mark.parametrize("name", ["episodes.jsonl", "episodes.jsonl.gz", "weights"])
 def test_pointers_to_logs_and_weights_are_named(tmp_path, name):
     if name == "weights":
-        checkpoint = Path(shutil.copytree(checkpoint_folder("memobench_small"), tmp_path / "policy"))
+        checkpoint = Path(shutil.copytree(checkpoint_folder("memobench_strict"), tmp_path / "policy"))
         path = next(checkpoint.glob("*.safetensors"))
     else:
         path = tmp_path / name

@@ -14,15 +14,15 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble, numeric_stats, write_dataset
-from lerobot_memobench.datasets.lerobot_format.card import terms
+from lerobot_memobench.datasets.lerobot_format.card import _world, terms
 from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK
+from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.task import LIBERO
 from tests.support.kills import hashes
 
 SIZE = 64
@@ -139,27 +139,27 @@ def test_equal_episodes_give_equal_files(synthetic, demos, tmp_path):
     assert hashes(synthetic) == hashes(write_dataset(iter(demos), tmp_path / "again", repo_id=REPO))
     manifest = json.loads((synthetic / "manifest.json").read_text())
     assert [row["digest"] for row in manifest["episodes"]] == [digest(demo) for demo in demos]
-    assert "world" not in manifest["episodes"][0]
+    assert manifest["episodes"][0]["world"] == LIBERO
     names = list(json.loads((synthetic / "meta" / "stats.json").read_text()))
     assert names[-2:] == ["observation.images.image", "observation.images.wrist_image"], "not in the order of a set"
 
 
 def test_card(synthetic):
     card = DatasetCard.load(synthetic / "README.md")
-    assert (card.data.license, "LeRobot" in card.data.tags) == ("apache-2.0", True)
+    assert (card.data.license, "LeRobot" in card.data.tags) == ("other", True)
     for column in dataset_features((SIZE, SIZE)):
         assert f"`{column}`" in card.text
     assert "| object | here | 1 | 2 | 60 | 30.00 | 30.00 | 30.00 | 30 |" in card.text
 
 
-def test_terms_of_the_papers_world(demos, make_task, tmp_path):
+def test_terms_depend_on_scans_and_source(demos, make_task, tmp_path):
     name = "put_the_artichoke_into_the_top_drawer_of_the_cabinet"
-    spatial = replace(demos[0], task=make_task("SU", name=name, memory_type="spatial").in_world(LIBERO))
+    spatial = replace(demos[0], task=make_task("SU", name=name, memory_type="spatial"))
     classes = sorted({*get_task(name).objects.values()})
     for folder, demo, licence in (
         ("boxes", replace(spatial, stand_ins=tuple(classes)), "other"),
         ("scans", replace(spatial, stand_ins=tuple(classes[1:])), "cc-by-nc-4.0"),
-        ("converted", replace(demos[0], task=demos[0].task.in_world(LIBERO), seed=-1), "cc-by-nc-4.0"),
+        ("converted", replace(demos[0], seed=-1), "cc-by-nc-4.0"),
     ):
         root = write_dataset([demo], tmp_path / folder)
         assert read_episode(root, 0).world == LIBERO
@@ -168,7 +168,9 @@ def test_terms_of_the_papers_world(demos, make_task, tmp_path):
         card = DatasetCard.load(root / "README.md")
         assert card.data.license == licence
         assert ("replace missing scans" in card.text) == bool(demo.stand_ins)
-    assert terms([{"task_name": name, "memory_type": "spatial", "seed": -1}])[0] == "cc-by-nc-4.0"
+    former = {"task_name": name, "memory_type": "spatial", "seed": 7}
+    assert [terms([{**former, "seed": seed}])[0] for seed in (7, -1)] == ["apache-2.0", "cc-by-nc-4.0"]
+    assert "version 0.2 modelled in code" in _world([former])[0]
 
 
 def test_refused_destinations_and_episodes(synthetic, demos, make_demo, tmp_path):

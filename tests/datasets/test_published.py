@@ -16,13 +16,10 @@ from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.restore import joints_of, restore, task_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.object_slots import ObjectSlots
+from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.task import LIBERO
 from tests.support import libero_layout
-from tests.support.libero import needs_assets
 from tests.support.short_demonstrations import drawn_steps, with_pictures
-
-pytestmark = needs_assets
 
 DRAWER = "check_the_middle_drawer_of_the_cabinet"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -33,7 +30,7 @@ OPENED, SHUT = 8, 15
 @pytest.fixture(scope="module")
 def drawer() -> Demonstration:
     """The middle drawer is opened and closed by its joint; the arm moves at random."""
-    demo = drawn_steps(DRAWER, 10_000, 20, world=LIBERO)
+    demo = drawn_steps(DRAWER, 10_000, 20)
     sim = Simulation(demo.task)
     states = demo.states.copy()
     joint = joints_of(sim.model)["wooden_cabinet_1_middle_level"]
@@ -107,7 +104,7 @@ def test_variations_of_files(drawer, tmp_path):
 
 
 def test_other_scenes_are_refused(drawer, tmp_path):
-    demo = grey(drawn_steps(MILK, 10_000, 6, 2, LIBERO))
+    demo = grey(drawn_steps(MILK, 10_000, 6, 2))
     file, found = first(libero_layout.write(tmp_path / "milk.hdf5", demo, timestep_exec_start_idx=2, key_frame=[4]))
     task = task_of(file, found)
     np.testing.assert_array_equal(restore(task, found).states, demo.states)

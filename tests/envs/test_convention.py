@@ -29,7 +29,7 @@ NAMES = ("image", "image2")
 
 
 def opened(task: str = STOVE, **settings: Any) -> Any:
-    return gym.make(f"memobench/{task}-v0", seed_base=20_000, render="fast", **settings)
+    return gym.make(f"memobench/{task}-v0", seed_base=20_000, **settings)
 
 
 def test_libero_mirrors_and_names_what_the_policy_gets() -> None:
@@ -78,7 +78,7 @@ def test_refused_settings(settings: dict[str, Any], named: str) -> None:
 
 def test_log_file_and_headline_name_the_convention(tmp_path: Path) -> None:
     for convention in ("upright", "libero"):
-        env = MemobenchEnv(STOVE, log_dir=str(tmp_path / convention), convention=convention, horizon=1, render="fast")
+        env = MemobenchEnv(STOVE, log_dir=str(tmp_path / convention), convention=convention, horizon=1)
         env.reset(seed=7)
         env.step(REST)
         env.close()

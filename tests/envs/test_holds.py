@@ -62,7 +62,7 @@ def test_holds_are_heavy_tailed_and_do_not_depend_on_the_variant() -> None:
 
 
 def test_holds_at_the_start_and_after_each_return_are_not_observable() -> None:
-    env = MemobenchEnv(COUNTING, obs_type=BOTH, render="fast", replan_steps=5)
+    env = MemobenchEnv(COUNTING, obs_type=BOTH, replan_steps=5)
     first, _ = env.reset(seed=20_001)
     episode = env.episode
     assert not episode.action_has_effect

@@ -39,9 +39,9 @@ from lerobot_memobench.protocol import ENDED, EXECUTION, NO_CLOCK, PROMPT, PROMP
 from lerobot_memobench.run.card import first_variant_mismatch
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
+from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import NOTHING_YET, with_memory
-from tests.support.libero import needs_assets
 from tests.support.short_demonstrations import record_demonstration
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -54,11 +54,11 @@ NEW_ROLLOUT = {"lerobot_new_rollout": True}
 
 
 def make(name: str = STOVE, **settings: Any) -> MemobenchEnv:
-    return MemobenchEnv(name, **{"obs_type": OBJECTS, "seed_base": 20_000, "render": "fast", **settings})
+    return MemobenchEnv(name, **{"obs_type": OBJECTS, "seed_base": 20_000, **settings})
 
 
 def vector(log: Path, rows: int = 3, use_async: bool = False, **settings: Any) -> gym.vector.VectorEnv:
-    chosen = {"tasks": STOVE, "obs_type": OBJECTS, "seed_base": 20_000, "render": "fast", "horizon": 3, **settings}
+    chosen = {"tasks": STOVE, "obs_type": OBJECTS, "seed_base": 20_000, "horizon": 3, **settings}
     if "task_dir" in settings:
         del chosen["tasks"]
     config = MemobenchEnvConfig(log_dir=str(log), **chosen)
@@ -105,19 +105,18 @@ def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- the contract ---
 
 CONTRACT = {
-    "published-pixels": (STOVE, "memobench", PIXELS),
-    "published-both": (STOVE, "memobench", BOTH),
-    "prompted-objects": (HIGHLIGHT, "memobench", OBJECTS),
-    "strict-both": (STRICT_HIGHLIGHT, "memobench", BOTH),
-    "libero-both": pytest.param(STOVE, "libero", BOTH, marks=needs_assets),
+    "published-pixels": (STOVE, PIXELS),
+    "published-both": (STOVE, BOTH),
+    "prompted-objects": (HIGHLIGHT, OBJECTS),
+    "strict-both": (STRICT_HIGHLIGHT, BOTH),
 }
 
 
 @pytest.mark.usefixtures("short_holds")
-@pytest.mark.parametrize(("name", "world", "obs_type"), CONTRACT.values(), ids=CONTRACT)
-def test_contract_of_reset_step_log_and_resume(tmp_path: Path, name: str, world: str, obs_type: str) -> None:
+@pytest.mark.parametrize(("name", "obs_type"), CONTRACT.values(), ids=CONTRACT)
+def test_contract_of_reset_step_log_and_resume(tmp_path: Path, name: str, obs_type: str) -> None:
     task = get_task(name)
-    settings = {"obs_type": obs_type, "world": world, "render": "fast", "seed_base": 20_000, "horizon": 3}
+    settings = {"obs_type": obs_type, "seed_base": 20_000, "horizon": 3}
     strict = task.suite == "strict"
     if strict:
         settings["prompt_in"] = RESET
@@ -151,10 +150,10 @@ def test_contract_of_reset_step_log_and_resume(tmp_path: Path, name: str, world:
     assert lines[0].items() >= {"task": name, "memory_type": task.memory_type, "seed": 20_001, "steps": 3}.items()
     assert (lines[0]["success"], lines[0]["failure"], lines[0]["replan_steps"]) == (False, "cut_off", 20)
     assert [each["first_step"] for each in lines[0]["checkpoints"]] == [None] * len(task.checkpoints)
-    assert lines[0].get("world", "memobench") == world
+    assert lines[0]["world"] == LIBERO
     assert lines[0].get("suite", "published") == task.suite
     block = protocol_of(tmp_path)
-    assert (block["obs_type"], block["world"], block["suite"]) == (obs_type, world, task.suite)
+    assert (block["obs_type"], block["world"], block["suite"]) == (obs_type, LIBERO, task.suite)
 
     config = {**settings, "suite": task.suite, "replan_steps": 20, "prompt_in": env.settings.prompt_in}
     resumed = vector(tmp_path, 2, tasks=name, resume=True, **config)

@@ -27,7 +27,7 @@ REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
 def played(task: str, **settings: Any) -> list[dict[str, Any]]:
     """Return the observations of an episode at rest, with its instruction and whether memory is corrupted."""
-    chosen = {"obs_type": OBJECTS, "seed_base": SEED, "render": "fast", "horizon": HORIZON, **settings}
+    chosen = {"obs_type": OBJECTS, "seed_base": SEED, "horizon": HORIZON, **settings}
     env = MemobenchEnv(task, **chosen)
     observation, info = env.reset(seed=SEED)
     found, ended = [], False
@@ -73,7 +73,7 @@ def assert_clock_never_goes_back(frames: list[dict[str, Any]]) -> None:
 def test_the_shipped_policy_is_corrupted(words: tuple[str, ...], tmp_path: Path) -> None:
     how, *more = words
     settings = [f"tasks={HIGHLIGHT}", "referent=random", "episodes=2", "batch_size=2", "horizon=8", "device=cpu"]
-    line = ["eval", "env=memobench", "policy=memobench_small", *settings, f"output_dir={tmp_path}"]
+    line = ["eval", "env=memobench", "policy=memobench_strict", *settings, f"output_dir={tmp_path}"]
     assert main([*line, f"corrupt={how}", *more]) == 0
     assert [(line["corrupt"], line["corrupted"], line["steps"]) for line in read_episodes(tmp_path)] == [
         (how, True, 8)

@@ -47,7 +47,7 @@ MORE_EVENTS = [(name, 2) for name in EVENTS if name != DRAWER]
     ("name", "rounds"), [*FEW_EVENTS, *(pytest.param(*case, marks=pytest.mark.slow) for case in MORE_EVENTS)]
 )
 def test_observation_at_home_is_the_same_after_an_event(name: str, rounds: int) -> None:
-    env = MemobenchEnv(name, obs_type=BOTH, prompt_in=RESET, render="fast")
+    env = MemobenchEnv(name, obs_type=BOTH, prompt_in=RESET)
     first, _ = env.reset(seed=20_000)
     expert = Expert(env.episode.task, env.episode.sim, np.random.default_rng(20_000))
     begin, end, thing = EVENTS[name]
@@ -123,7 +123,7 @@ def first_frames(
     name: str, variants: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[MemobenchEnv, dict[str, NDArray[np.generic]]]]:
     """Yield the environment at the first execution frame of each variant, and all that a policy could observe."""
-    env = MemobenchEnv(name, obs_type=BOTH, referent="random", prompt_in=RESET, render="fast")
+    env = MemobenchEnv(name, obs_type=BOTH, referent="random", prompt_in=RESET)
     for variant in variants:
 
         def chosen(published: Task, seed: int, salt: str | None, *, variant: int = variant) -> Task:

@@ -74,7 +74,7 @@ def rollout(
     name: str, seed: int, log: Path, prompt_in: str, obs_type: str
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the facts of each frame of a short episode, and its log line."""
-    settings: dict[str, Any] = {"referent": "random", "render": "fast", "obs_type": obs_type, "seed_base": 7}
+    settings: dict[str, Any] = {"referent": "random", "obs_type": obs_type, "seed_base": 7}
     env = MemobenchEnv(name, log_dir=str(log), prompt_in=prompt_in, horizon=HORIZON, **settings)
     observation, info = env.reset(seed=seed)
     frames, over = [facts(env, observation, (info,))], False

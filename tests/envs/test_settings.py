@@ -29,6 +29,7 @@ from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EVALUATION_SEED, HOLD_MEAN, HORIZON, UPSTREAM_HORIZON
+from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import STRICT
 
@@ -76,7 +77,7 @@ def test_bad_values_and_unknown_names_are_refused_everywhere(taker: str) -> None
 def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
     fields = {each.name: each for each in dataclasses.fields(EnvSettings)}
     assert all(each.metadata["meaning"] for each in fields.values())
-    assert set(SETTINGS) == set(fields) - set(NOT_COMPARED)
+    assert set(SETTINGS) == {WORLD, *fields} - set(NOT_COMPARED)
     config = MemobenchEnvConfig(horizon=5, pause_steps=3, videos=2)
     assert config.gym_kwargs == dataclasses.asdict(config.settings)
     assert (config.horizon, config.pause_steps, config.videos) == (5, 3, 2)
@@ -93,13 +94,16 @@ def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
         ({"suite": STRICT, "referent": "fixed"}, {"referent": "drawn", HOLD: HOLD_MEAN, GOALS: 3}),
         ({"protocol": "upstream"}, {"demonstration_prompt": False, "horizon": UPSTREAM_HORIZON}),
         ({"protocol": "upstream", "horizon": 5}, {"horizon": 5}),
-        ({}, {"horizon": HORIZON, "seed_base": EVALUATION_SEED, "world": "memobench"}),
+        ({}, {"horizon": HORIZON, "seed_base": EVALUATION_SEED, WORLD: LIBERO}),
     ],
 )
 def test_suite_and_protocol_determine_other_settings(asked: dict[str, Any], found: dict[str, Any]) -> None:
     block = EnvSettings(**asked).protocol_block
     assert {name: block[name] for name in found} == found
-    assert vars(MemobenchEnvConfig(**asked)).items() >= {k: v for k, v in found.items() if k in SETTINGS}.items()
+    assert (
+        vars(MemobenchEnvConfig(**asked)).items()
+        >= {k: v for k, v in found.items() if k in SETTINGS and k != WORLD}.items()
+    )
 
 
 def test_upstream_protocol_has_no_controls() -> None:
@@ -173,10 +177,12 @@ def test_files_of_earlier_versions_are_merged(tmp_path: Path) -> None:
     found = read_evaluation(tmp_path)
     assert found["policy"] == {"type": "act"}
     assert found["protocol"] == {**card["protocol"], "render_every": 1, "prompt_in": "steps"}
-    earlier = EnvSettings(horizon=5, prompt_in="steps").protocol_block | {SCENE_HASHES: 1}
+    earlier = EnvSettings(horizon=5, prompt_in="steps").protocol_block | {SCENE_HASHES: 1, WORLD: FORMER}
     assert check_protocol(tmp_path, earlier)
     (tmp_path / EARLIER_PROTOCOL).write_text(json.dumps({"horizon": 5, "render_every": 8}))
     with pytest.raises(MemobenchError, match="render_every: 8 and 1"):
+        check_protocol(tmp_path, earlier)
+    with pytest.raises(MemobenchError, match="world: memobench and libero"):
         check_protocol(tmp_path, EnvSettings(horizon=5).protocol_block)
     card_file = tmp_path / EARLIER_CARD
     card_file.with_name(f"{EARLIER_CARD}.gz").write_bytes(gzip.compress(card_file.read_bytes()))

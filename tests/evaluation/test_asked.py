@@ -35,7 +35,15 @@ def line(name: str, episode: int, **changes: Any) -> Line:
     marks = [{"operation": c.operation, "first_step": 9, "ordered_step": 9} for c in task.checkpoints]
     return {
         **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": 7 + episode, "referent": "fixed"},
-        **{"variant": 0, "replan_steps": 6, "prompt_steps": 0, "prompt_shown": None, "steps": 9, "success": True},
+        **{
+            "variant": 0,
+            "replan_steps": 6,
+            "prompt_steps": 0,
+            "prompt_shown": None,
+            "steps": 9,
+            "success": True,
+            "world": "libero",
+        },
         **{"checkpoints": marks, "failure": None, "scene_hash": f"{name[:20]}-{episode}", "wall_s": 1.0},
         **{"policy": "act 0123", "run": "r", "inputs": "pixels", **changes},
     }
@@ -123,13 +131,24 @@ def test_a_complete_run_has_an_overall_score(tmp_path: Path) -> None:
 # --- settings ---
 
 RESULTS = {
-    *("prompt_steps", "prompt_shown", "success", "checkpoints", "failure", "fault", "scene_hash", "settled", "wall_s"),
+    *(
+        "prompt_steps",
+        "prompt_shown",
+        "success",
+        "checkpoints",
+        "failure",
+        "fault",
+        "scene_hash",
+        "settled",
+        "stand_ins",
+        "wall_s",
+    ),
     *("not_run", "run", "written_at"),
 }
 """Fields of a line that state no setting."""
 DOCTORED: dict[str, Any] = {
     **{"task": "turn_on_the_stove_and_turn_it_off", "memory_type": "spatial", "episode": 1, "seed": 1007, "variant": 1},
-    **{"steps": 1201, "checkpoints": [], "stand_ins": [], "difficulty": "hard", "policy": "diffusion 0123"},
+    **{"steps": 1201, "checkpoints": [], "difficulty": "hard", "policy": "diffusion 0123"},
 }
 """Other values than `other_value` finds."""
 
@@ -164,7 +183,7 @@ def test_lines_of_other_settings_are_refused(small: Path, tmp_path: Path, name: 
         assert status == 2 or "missing: " in written or "log and card" in written, (command, name)
 
 
-@pytest.mark.parametrize("name", sorted({*STATED, "seed"} - {"referent", "replan_steps", "inputs"}))
+@pytest.mark.parametrize("name", sorted({*STATED, "seed"} - {"referent", "replan_steps", "inputs", "world"}))
 def test_a_line_is_refused_that_omits_another_setting_of_the_file(small: Path, tmp_path: Path, name: str) -> None:
     """Lines omit usual values; those of earlier versions omitted others too."""
     folder = shutil.copytree(small, tmp_path / "b")

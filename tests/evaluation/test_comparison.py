@@ -140,7 +140,7 @@ def test_differences_of_logs_are_refused_by_name_and_may_be_allowed(
     ("setting", "value"),
     [
         ("horizon", 600),
-        ("render", "fast"),
+        ("render", "high"),
         ("seed_base", 1007),
         ("demonstration_prompt", False),
         ("prompt_in", "reset"),
@@ -200,7 +200,7 @@ def test_all_that_must_be_allowed_is_named_at_once(tmp_path: Path) -> None:
     a = logs.evaluation(tmp_path / "a")
     b = logs.evaluation(tmp_path / "b", scene_hash="another", referent="random", replan_steps=20)
     (a / "protocol.json").write_text(json.dumps(settings))
-    (b / "protocol.json").write_text(json.dumps({**settings, "horizon": 600, "render": "fast", "referent": "random"}))
+    (b / "protocol.json").write_text(json.dumps({**settings, "horizon": 600, "referent": "random"}))
     with pytest.raises(MemobenchError) as caught:
         compared(a, b, allow=["render"])
     names = str(caught.value).replace("--allow ", "").rsplit(": ", 1)[1].split()

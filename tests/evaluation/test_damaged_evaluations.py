@@ -26,7 +26,6 @@ SETTINGS: dict[str, Any] = {
     "demonstration_prompt": True,
     "horizon": 1200,
     "replan_steps": 5,
-    "render": "fast",
     "render_every": 1,
     "oracle_memory": False,
 }

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import EpisodeLog, differences, write_episodes
+from lerobot_memobench.envs.episode_log import EpisodeLog, differences, with_omitted, write_episodes
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_protocol
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare
@@ -39,7 +39,7 @@ def test_protocol_is_written_with_the_first_episode(tmp_path: Path) -> None:
     log.append(record())
     log.append(record("b", 3))
     EpisodeLog(tmp_path, partial(write_protocol, tmp_path, SETTINGS)).append(record(episode=1))  # another worker
-    protocol = {**SETTINGS, "tasks": ["a_task", "b"], "episodes": 4, "policy": {}}
+    protocol = {**SETTINGS, "world": "libero", "tasks": ["a_task", "b"], "episodes": 4, "policy": {}}
     assert read_protocol(tmp_path) == protocol
     before = sorted((tmp_path / "episodes").iterdir()), (tmp_path / EVALUATION_FILE).read_bytes()
     with pytest.raises(MemobenchError, match="horizon: 1200 and 600"):
@@ -52,8 +52,8 @@ def test_protocol_is_written_with_the_first_episode(tmp_path: Path) -> None:
 
 def test_protocol_of_a_log_alone(tmp_path: Path) -> None:
     write_episodes(tmp_path, [record(), record(episode=1)])
-    known = {"tasks": ["a_task"], "episodes": 2, "seed_base": 7, "referent": "fixed", "replan_steps": 20, "policy": {}}
-    assert read_protocol(tmp_path) == known
+    known = {"tasks": ["a_task"], "episodes": 2, "seed_base": 7, "referent": "fixed", "replan_steps": 20}
+    assert read_protocol(tmp_path) == {**known, "world": "libero", "policy": {}}
     write_episodes(tmp_path, [record(), record(episode=1, referent="random", replan_steps=None)])
     mixed = read_protocol(tmp_path)
     assert mixed["referent"] == ["fixed", "random"]
@@ -147,7 +147,7 @@ def test_other_settings_are_noted_in_every_format(tmp_path: Path) -> None:
     assert '"notices":[]' in (write_html([found[0], found[2]], tmp_path / "page").page).read_text()
 
 
-@pytest.mark.parametrize(("key", "value"), [("suite", "strict"), ("world", "libero")])
+@pytest.mark.parametrize(("key", "value"), [("suite", "strict"), ("world", "memobench")])
 def test_suites_and_worlds_are_not_mixed(tmp_path: Path, key: str, value: str) -> None:
     plain = evaluation(tmp_path / "plain")
     other = evaluation(tmp_path / "other", **{key: value}, stand_ins=["cork__3"])
@@ -161,10 +161,11 @@ def test_suites_and_worlds_are_not_mixed(tmp_path: Path, key: str, value: str) -
         compare(*read_runs([plain]), *read_runs([other]), allow=[key])
     with pytest.raises(MemobenchError, match=rf"\({key}: "):
         merge(tmp_path / "joined", [plain, other])
-    assert read_protocol(other)[key] == value
-    assert key not in read_protocol(plain)
+    usual = {"suite": "published", "world": "libero"}[key]
+    assert [with_omitted(read_protocol(folder))[key] for folder in (other, plain)] == [value, usual]
     (run,) = read_runs([other])
-    assert f"{value}{', 1 missing scan' if key == 'world' else ' suite'}" in headline([run])
+    named = {"suite": "strict suite", "world": "scenes that version 0.2 modelled in code"}[key]
+    assert [named in headline(read_runs([folder])) for folder in (other, plain)] == [True, False]
     assert any("cork__3" in note for note in run.notes)
     if key == "suite":
         with pytest.raises(MemobenchError, match="--with paper"):

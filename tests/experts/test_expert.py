@@ -21,12 +21,12 @@ from lerobot_memobench.experts.hand import (
 )
 from lerobot_memobench.experts.travel import PRESS_STEPS
 from lerobot_memobench.protocol import EXECUTION, HORIZON
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, parse_formula
 from lerobot_memobench.tasks.task import Task
-from tests.support.libero import needs_assets, simulate
+from tests.support.libero import simulate
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
@@ -263,15 +263,13 @@ UPRIGHT = 0.999
 """Cosine of a thing's tilt."""
 
 
-@needs_assets
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == SHORT else pytest.mark.slow) for name in task_names()]
 )
 def test_solves_the_task_in_the_papers_world(name: str) -> None:
-    assert not play(get_task(name).in_world("libero"), SEED).faults
+    assert not play(get_task(name), SEED).faults
 
 
-@needs_assets
 @pytest.mark.parametrize(
     "name",
     [

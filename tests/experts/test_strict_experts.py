@@ -20,7 +20,7 @@ from lerobot_memobench.tasks.difficulty import degree_of
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 from tests.experts.test_expert import play
-from tests.support.libero import needs_assets, simulate
+from tests.support.libero import simulate
 
 MICROWAVE = "open_and_close_the_microwave_a_given_number_of_times"
 BOWL = "check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer"
@@ -90,7 +90,6 @@ def test_solves_seeds_that_once_failed(name: str, seed: int) -> None:
     assert name != MILK or played.episode.exec_steps < 500, "it tried the unreachable low grasp repeatedly"
 
 
-@needs_assets
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seed"),
@@ -109,10 +108,9 @@ def test_solves_seeds_that_once_failed(name: str, seed: int) -> None:
 )
 def test_solves_seeds_in_liberos_scenes_that_once_failed(name: str, seed: int) -> None:
     """The hand slipped off a bar, met what stands in front of a drawer, or carried the milk carton up."""
-    assert not play(get_task(name).in_world("libero"), seed, prompt=True, referent="random").faults
+    assert not play(get_task(name), seed, prompt=True, referent="random").faults
 
 
-@needs_assets
 def test_opens_the_lowest_drawer_without_touching_the_table() -> None:
     """With more roll the hand rests on the table above the bar, slips off, and needs 500 steps."""
     sim = simulate(DRAWERS)
@@ -123,7 +121,6 @@ def test_opens_the_lowest_drawer_without_touching_the_table() -> None:
     assert steps < 200
 
 
-@needs_assets
 def test_grasps_a_flat_box_beside_a_tall_one() -> None:
     """In the middle of the butter the palm meets the carton: two attempts of 230 steps, and the carton falls."""
     sim = simulate(WASTE)
@@ -135,7 +132,6 @@ def test_grasps_a_flat_box_beside_a_tall_one() -> None:
     assert np.linalg.norm(sim.asset_pose("milk_1")[0] - carton) < 0.005
 
 
-@needs_assets
 def test_opens_a_drawer_behind_a_bottle() -> None:
     """Rolled the other way, the hand meets the bottle and never reaches the handle."""
     sim = simulate(ARTICHOKE)
@@ -145,7 +141,6 @@ def test_opens_a_drawer_behind_a_bottle() -> None:
     assert sim.holds(Atom("open", (region,)))
 
 
-@needs_assets
 def test_closes_a_drawer_beside_a_bottle() -> None:
     """In front of the handle's middle the palm meets the bottle, which a motion has moved there."""
     sim = simulate(SPROUTS)

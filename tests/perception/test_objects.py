@@ -12,8 +12,7 @@ from lerobot_memobench.perception.detector import DETECTION, MIN_SCORE, Detector
 from lerobot_memobench.perception.geometry import projected, view_of, views_of
 from lerobot_memobench.perception.objects import APART, MIN_SCORE_ALONE, ONE, PARTS, ROUND, SAME, ObjectLocalizer
 from lerobot_memobench.perception.weights import PACKAGE, load_detector
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
-from lerobot_memobench.sim.assets.registry import split_class
+from lerobot_memobench.sim.asset import TABLE_TOP, split_class
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation

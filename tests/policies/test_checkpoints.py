@@ -108,7 +108,7 @@ def copied(act: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def memory_policy(tmp_path: Path) -> Path:
-    return Path(shutil.copytree(shipped_policies()["memobench_small"], tmp_path / "memory_policy"))
+    return Path(shutil.copytree(shipped_policies()["memobench_strict"], tmp_path / "memory_policy"))
 
 
 def refused(checkpoint: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
@@ -272,12 +272,12 @@ def test_checkpoints_of_earlier_lerobots_are_refused(copied: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "fixed"),
     [
-        *(("memory_stride", 4, True), ("chunk_size", 2, True), ("align", "contrastive", True)),
+        *(("memory_stride", 4, True), ("chunk_size", 2, True), ("align", "semantic", True)),
         *(("optimizer_lr", 1.0, True), ("n_action_steps", 2, False), ("device", "cpu", False)),
     ],
 )
 def test_settings_of_training_cannot_change_at_evaluation(name: str, value: object, fixed: bool) -> None:
-    checkpoint = shipped_policies()["memobench_small"]
+    checkpoint = shipped_policies()["memobench_strict"]
     policy = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=["--device=cpu"])
     setattr(policy, name, value)
     with pytest.raises(MemobenchError, match=rf"policy\.{name}=") if fixed else nullcontext():
@@ -287,7 +287,7 @@ def test_settings_of_training_cannot_change_at_evaluation(name: str, value: obje
 
 
 def test_evaluation_refuses_other_settings(memory_policy: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for word in ("memory_stride=4", "align=contrastive"):
+    for word in ("memory_stride=4", "align=semantic"):
         assert f"--policy.{word}" in refused(memory_policy, capsys, "obs_type=both", f"--policy.{word}")
 
 
@@ -351,7 +351,7 @@ def test_damaged_files_end_in_a_result_or_an_error(tmp_path: Path, kind: str, co
 def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A package with one trained policy, and a folder that is none."""
     monkeypatch.setattr(checkpoint, "SHIPPED", tmp_path / "shipped")
-    for name, config in (("memobench_small", {"type": "memobench_mem"}), ("notes", None)):
+    for name, config in (("memobench_strict", {"type": "memobench_mem"}), ("notes", None)):
         (tmp_path / "shipped" / name).mkdir(parents=True)
         if config is not None:
             (tmp_path / "shipped" / name / "config.json").write_text(json.dumps(config))
@@ -359,20 +359,20 @@ def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_policy_is_found_by_its_name(shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = shipped / "memobench_small"
-    assert checkpoint.shipped_policies() == {"memobench_small": folder}
-    assert checkpoint_of("memobench_small", {"act"}) == str(folder)
+    folder = shipped / "memobench_strict"
+    assert checkpoint.shipped_policies() == {"memobench_strict": folder}
+    assert checkpoint_of("memobench_strict", {"act"}) == str(folder)
     assert checkpoint.checkpoint_type(str(folder)) == "memobench_mem"
     assert checkpoint_of("notes", {"act"}) is None
-    assert checkpoint.portable_path(str(folder)) == "memobench_small"
+    assert checkpoint.portable_path(str(folder)) == "memobench_strict"
     assert checkpoint.portable_path("outputs/train/me") == "outputs/train/me"
-    mine = tmp_path / "here" / "memobench_small"
+    mine = tmp_path / "here" / "memobench_strict"
     mine.mkdir(parents=True)
     (mine / "config.json").write_text("{}")
     monkeypatch.chdir(tmp_path / "here")
-    assert checkpoint_of("memobench_small", {"act"}) == str(folder), "a known name, wherever the command is run"
-    assert checkpoint_of("./memobench_small", {"act"}) == "memobench_small", "a folder is named by a path"
-    assert checkpoint.local_folder("memobench_small") == folder
+    assert checkpoint_of("memobench_strict", {"act"}) == str(folder), "a known name, wherever the command is run"
+    assert checkpoint_of("./memobench_strict", {"act"}) == "memobench_strict", "a folder is named by a path"
+    assert checkpoint.local_folder("memobench_strict") == folder
 
 
 # -- the script that ships them ------------------------------------------------------------------------------------

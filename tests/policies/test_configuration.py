@@ -132,7 +132,7 @@ def test_bad_values_are_refused(fields: dict[str, Any], named: str) -> None:
     [(name, OBJECTS) for name in ("visual_encoder", "image_resolution", "empty_cameras")]
     + [(name, {"size": "tiny"}) for name in ("max_state_dim", *READERS["perception=objects"][1].split())]
     + [("image_resolution", {"size": "small"})]
-    + [(name, {"memory": "none"}) for name in (*READERS["a memory"][1].split(), "memory_phase")]
+    + [(name, {"memory": "none"}) for name in (*READERS["a memory"][1].split(), "memory_phase", "memory_repeats")]
     + [(name, OBJECTS) for name in READERS["objective=flow_matching"][1].split()]
     + [(name, {}) for name in ("text_encoder", "subgoal_level", "subgoals", "scheduler_decay_lr", "n_obs_steps")],
 )

@@ -53,7 +53,7 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def evaluated(policy: Path, out: Path, *more: str) -> int:
-    words = [f"tasks={TASK}", "horizon=3", "env.render=fast", "videos=0", "batch_size=1"]
+    words = [f"tasks={TASK}", "horizon=3", "videos=0", "batch_size=1"]
     return main(["eval", "env=memobench", f"policy={policy}", *words, f"output_dir={out}", *more])
 
 

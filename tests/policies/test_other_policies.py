@@ -50,7 +50,7 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
     assert set(config["input_features"]) == inputs
     assert set(config["output_features"]) == {"action"}
     assert normalised(checkpoint, inputs) <= {*inputs, "action"} | KEPT
-    words = (f"tasks={TASK}", "episodes=1", "horizon=3", "env.render=fast", f"output_dir={out / 'eval'}")
+    words = (f"tasks={TASK}", "episodes=1", "horizon=3", f"output_dir={out / 'eval'}")
     assert main(["eval", "env=memobench", f"policy={run}", *words]) == 0
     (record,) = read_episodes(out / "eval")
     assert record["steps"] == 3
@@ -210,7 +210,7 @@ def observed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
         monkeypatch.setattr(policy, "select_action", selected)
         line = [
-            *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}", "--env.render=fast"),
+            *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}"),
             *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
             *("--policy.device=cpu", f"--output_dir={tmp_path}", f"--env.log_dir={tmp_path}"),
         ]

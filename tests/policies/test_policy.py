@@ -31,6 +31,8 @@ from lerobot_memobench.policies.update_checkpoint import update_checkpoint
 from lerobot_memobench.protocol import CONTROL_HZ, ENDED, EXECUTION, NO_CLOCK, PROMPT
 from lerobot_memobench.training.average import begin_average
 from lerobot_memobench.training.data import Training
+from tests.support.held_dataset import LENGTHS as HELD_LENGTHS
+from tests.support.held_dataset import make_held_dataset
 from tests.support.memory import remembered, trained_on
 from tests.support.object_dataset import LENGTHS
 from tests.support.small_policy import (
@@ -135,16 +137,21 @@ def test_bfloat16_trains_in_float32(root: Path) -> None:
 # -- rollouts ------------------------------------------------------------------------------------------------------
 
 
-def test_a_stalled_hand_executes_the_whole_chunk(root: Path) -> None:
+def test_a_stalled_hand_goes_on_in_its_chunk(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is held for two plans, stalls for three, and moves; all plans have three actions."""
     policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    chunk = torch.arange(16.0)[None, :, None].expand(1, 16, 7)
+    monkeypatch.setattr(policy, "plan", lambda *_: chunk)
     policy.reset()
-    left = []
-    for step in range(12):
+    done = []
+    for step in range(21):
         frame = observed(dataset, 30, **{"observation.step": torch.tensor([[float(step)]])})
-        frame["observation.state"] = frame["observation.state"] + 0.02 * (step >= 9)
-        policy.select_action(before(frame))
-        left.append(len(policy.rollout.rows[0].queue))
-    assert left == [2, 1, 0, 5, 4, 3, 2, 1, 0, 2, 1, 0]
+        moved = [0, 0, 0.001, 0.002, 0.003, 0.02, 0.02][step // 3]
+        frame["observation.state"] = frame["observation.state"] + moved
+        done.append(int(policy.select_action(before(frame))[0, 0]))
+    assert [done[at : at + 3] for at in range(0, 21, 3)] == [
+        [first, first + 1, first + 2] for first in (0, 0, 3, 6, 9, 0, 0)
+    ]
 
 
 STATE = torch.tensor([0.1, 0.2, 1.0, 3.13, 0.1, 0.0, 0.04, -0.04])
@@ -156,21 +163,25 @@ def moved(index: int, by: float) -> Tensor:
 
 
 @pytest.mark.parametrize(
-    ("state", "queued"),
-    [(state, 16) for state in (STATE, moved(2, 0.005), moved(6, 0.005), moved(4, 0.05), STATE - 2.007 * STATE * AXIS)]
-    + [(state, 6) for state in (moved(2, 0.01), moved(7, 0.01), moved(4, 0.2), None)],
+    ("state", "first"),
+    [(state, 6) for state in (moved(2, 0.005), moved(6, 0.005), moved(4, 0.05), STATE - 2.007 * STATE * AXIS)]
+    + [(state, 0) for state in (STATE, moved(2, 0.01), moved(7, 0.01), moved(4, 0.2), None)],
 )
-def test_stalled_hands_are_recognised(state: Tensor | None, queued: int) -> None:
-    """One state has nearly the same rotation with the opposite axis."""
-    row = Row()
-    row.begin_chunk(torch.zeros(16, 7), 6, STATE)
-    assert len(row.queue) == 6
-    row.queue.clear()
-    row.begin_chunk(torch.zeros(16, 7), 6, state)
-    assert len(row.queue) == queued
+def test_stalled_hands_are_recognised(state: Tensor | None, first: int) -> None:
+    """One state has nearly the same rotation with the opposite axis; an equal one is of a held hand."""
+    row, chunk = Row(), torch.arange(16.0)[:, None]
+
+    def begins(state: Tensor | None) -> int:
+        row.queue.clear()
+        row.begin_chunk(chunk, 6, state)
+        assert len(row.queue) == 6, "as declared to the environment"
+        return int(row.queue[0])
+
+    assert begins(STATE) == 0
+    assert begins(state) == first
     row.drop_chunk()
-    row.begin_chunk(torch.zeros(16, 7), 6, STATE)
-    assert len(row.queue) == 6
+    assert begins(STATE) == 0
+    assert [begins(moved(2, 0.001 * step)) for step in range(1, 5)] == [6, 10, 10, 10], "to the chunk's end"
 
 
 def test_one_thread_runs_a_rollout(trained: Any) -> None:
@@ -241,6 +252,22 @@ def test_unobserved_frames_are_noticed() -> None:
     assert (rollout.missed([0]), rollout.missed([1]), rollout.missed([0, 1])) == (12, 4, 4)
     rollout.observe([(1, 14), (1, 0)], written.append)
     assert (rollout.missed([0]), rollout.missed([1])) == (12, None)
+
+
+def test_repeated_frames_are_left_out_as_in_training(tmp_path: Path) -> None:
+    """Holds at frames 4, 14 and 22 repeat the frame at which they begin."""
+    root = make_held_dataset(tmp_path / "data")
+    fields = OBJECTS | {"memory_settings": {"frames": 4}, "memory_repeats": False}
+    policy, before, _, dataset = made_for_training(root, **fields)
+    last = HELD_LENGTHS[0] - 1
+    policy.reset()
+    for step in range(last + 1):
+        policy.observe(before(observed(dataset, step)))
+    stored = [frame.step for frame in policy.rollout.rows[0].memory[0]]
+    assert stored == [0, 2, 4, 10, 12, 14, 18, 20, 22]
+    (rolled,), (trained,) = remembered(policy, [0]), trained_on(before(batch_of(dataset, [last])))
+    assert rolled[1] == trained[1] == [0, 4, 14, 22]
+    assert torch.equal(rolled[0], trained[0])
 
 
 # -- chunks for LeRobot --------------------------------------------------------------------------------------------

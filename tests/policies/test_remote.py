@@ -363,7 +363,7 @@ def test_images_are_resized_as_by_openpis_client(height: int, width: int, digest
 
 def evaluate(port: int, out: Path, *words: str) -> int:
     policy = ("policy=memobench_remote", "host=127.0.0.1", f"port={port}", "replan=10")
-    usual = (f"tasks={TASK}", "horizon=20", "env.render=fast", "eval.use_async_envs=false", f"output_dir={out}")
+    usual = (f"tasks={TASK}", "horizon=20", "eval.use_async_envs=false", f"output_dir={out}")
     return main(["eval", "env=memobench", *policy, *usual, *words])
 
 

@@ -95,7 +95,7 @@ def test_other_commands_get_their_arguments_as_typed() -> None:
         ("eval", ["env=memobensh"], "'memobench'"),
         ("eval", ["env="], "env= is empty"),
         ("eval", ["env=memobench", "policy=memobench_men"], "'memobench_mem'"),
-        ("eval", ["env=memobench", "policy=memobench_smal"], "'memobench_small'"),
+        ("eval", ["env=memobench", "policy=memobench_stric"], "'memobench_strict'"),
         ("eval", ["env=memobench", "episode=3"], "'episodes'"),
         ("eval", ["env=memobench", "env.horizn=3"], "'env.horizon'"),
         ("eval", ["env=memobench", "policy=act", "policy.chunksize=3"], "'policy.chunk_size'"),
@@ -174,7 +174,7 @@ def test_names_reach_lerobot_as_they_are_typed() -> None:
     """LeRobot's commands parse them by YAML, and the settings of a checkpoint's policy by JSON."""
     for name in NAMES:
         Path(name).mkdir()
-        line = ["policy=memobench_small", f"dataset={name}", f"output_dir={name}", f"policy.repo_id=user/{name}"]
+        line = ["policy=memobench_strict", f"dataset={name}", f"output_dir={name}", f"policy.repo_id=user/{name}"]
         arguments = read_arguments("train", split_arguments(line))
         flags = [flag for flag in arguments.for_parser if "policy" not in flag]
         trained = draccus.parse(TrainPipelineConfig, args=flags)

@@ -114,9 +114,9 @@ def evidence(folder: Path) -> MemobenchEnv:
 
 def test_memory_reads_need_a_policy_with_a_memory() -> None:
     line = ["env=memobench", f"tasks={TASK}", "episodes=2", "batch_size=1", "memory_reads=true"]
-    assert plan_line([*line, "policy=memobench_small"]).options.memory_reads
+    assert plan_line([*line, "policy=memobench_strict"]).options.memory_reads
     with pytest.raises(MemobenchError, match="memory=none"):
-        plan_line([*line, "policy=memobench_small_memoryless"])
+        plan_line([*line, "policy=memobench_strict_memoryless"])
 
 
 # --- files on the report's timeline ---

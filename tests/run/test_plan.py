@@ -65,7 +65,7 @@ def facts(plan: EvaluationPlan) -> dict[str, Any]:
     return {**plan.environment.gym_kwargs, **run, **policy, **use, "path": plan.policy_path}
 
 
-SMALL = ["policy=memobench_small", "device=cpu"]
+SMALL = ["policy=memobench_strict", "device=cpu"]
 RENAMED = '{"observation.images.image": "observation.images.top"}'
 PLANNED: list[tuple[list[str], dict[str, Any]]] = [
     (
@@ -139,15 +139,15 @@ BAD: list[tuple[list[str], str]] = [
     (["policy=memobench_random", "memory_reads=true"], "memory_reads"),
     (["policy=act", "prompt_in=steps", "corrupt=delete", "tasks=object"], "corrupt_memory(how, rows)"),
     (["policy=memobench_random", "interference=1", "tasks=object"], "reads prompts"),
-    (["policy=memobench_small_memoryless", "corrupt=noise", "tasks=object"], "memobench_mem has none"),
-    (["policy=memobench_small", "corrupt=swap", "tasks=object", "episodes=11"], "batch of one episode"),
-    (["policy=memobench_small", "corrupt=delete", "tasks=temporal"], "set corrupt_step="),
+    (["policy=memobench_strict_memoryless", "corrupt=noise", "tasks=object"], "memobench_mem has none"),
+    (["policy=memobench_strict", "corrupt=swap", "tasks=object", "episodes=11"], "batch of one episode"),
+    (["policy=memobench_strict", "corrupt=delete", "tasks=temporal"], "set corrupt_step="),
     (["policy=diffusion", "policy.down_dims=[1"], "a value of policy. cannot be read"),
-    (["policy=memobench_small", "obs_type=pixels_agent_pos"], "lacks inputs of the policy"),
+    (["policy=memobench_strict", "obs_type=pixels_agent_pos"], "lacks inputs of the policy"),
     (["policy.discover_packages_path=not_here"], "not_here"),
     (["shard=0/4"], "shard=0/4"),
-    (["policy=memobench_small", "device=cuda:99"], "cuda:99"),
-    (["policy=memobench_small", "device=gpu"], "gpu"),
+    (["policy=memobench_strict", "device=cuda:99"], "cuda:99"),
+    (["policy=memobench_strict", "device=gpu"], "gpu"),
     (["--policy.path=outputs/none"], "outputs/none does not exist"),
     (["shard=5/4"], "shard=5/4"),
     (["shard=2"], "shard=2"),
@@ -196,8 +196,8 @@ def test_a_checkpoint_gets_the_inputs_it_was_trained_on(seen: tuple[str, ...], s
     other = OBJECTS if shown != OBJECTS else "pixels_agent_pos"
     with pytest.raises(MemobenchError, match="lacks inputs of the policy"):
         plan_line([*BARE, "policy=./act", f"obs_type={other}"])
-    shipped = shipped_policies()["memobench_small"]
-    assert plan_line([*BARE, f"policy={shipped}"]).settings.portable["policy"]["path"] == "memobench_small"
+    shipped = shipped_policies()["memobench_strict"]
+    assert plan_line([*BARE, f"policy={shipped}"]).settings.portable["policy"]["path"] == "memobench_strict"
 
 
 @pytest.mark.parametrize("name", ["evaluation.json", "card.json"])
@@ -254,7 +254,7 @@ def test_the_command_that_resumes(words: list[str], found: list[str]) -> None:
 
 
 def test_a_configuration_file_is_overridden_by_the_line() -> None:
-    path = shipped_policies()["memobench_small"]
+    path = shipped_policies()["memobench_strict"]
     for text, words, found in (
         ("policy: memobench_blind", [LINE[0]], {"policy": "memobench_blind", "blind_action": True}),
         ("policy: {type: memobench_blind}", [LINE[0], "policy=memobench_random"], {"policy": "memobench_random"}),

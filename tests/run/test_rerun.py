@@ -34,6 +34,7 @@ from lerobot_memobench.run.settings import EvaluationSettings
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, make_checkpoint
 
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
+ONE = {"tasks": [STOVE], "episodes": 1}
 RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "success": True, "checkpoints": []}
 
 
@@ -48,7 +49,7 @@ def in_folder(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def card(settings: Any, **changes: Any) -> dict[str, Any]:
-    parts: dict[str, Any] = {"protocol": {"tasks": [STOVE], "episodes": 1}, "policy": {}, "checkpoint": None}
+    parts: dict[str, Any] = {"protocol": {**ONE, "world": "libero"}, "policy": {}, "checkpoint": None}
     parts |= {"trained_on": None, "task_files": {}, "settings": settings, "runs": [run_facts(["lerobot", "eval"], 1)]}
     return with_episodes(new_card(**parts), [RECORD]) | changes
 
@@ -217,10 +218,24 @@ def test_a_strict_card_may_be_held_as_long_as_the_protocol_says(difficulty: str)
 
 @pytest.mark.parametrize("hold", [0, 1200])
 def test_a_strict_card_of_an_earlier_version_is_refused(hold: int) -> None:
-    asked = {"tasks": [COUNTING], "episodes": 1, "suite": "strict", **({"hold": hold} if hold else {})}
+    asked = {
+        "tasks": [COUNTING],
+        "episodes": 1,
+        "suite": "strict",
+        "world": "libero",
+        **({"hold": hold} if hold else {}),
+    }
     write_card(Path(), card({**RANDOM, "env": {"suite": "strict"}}, protocol=asked))
     with pytest.raises(MemobenchError, match=f"hold={hold} on the card"):
         rerun.repeat(Path(), None, None, lambda plan: pytest.fail("it was run"), print)
+
+
+@pytest.mark.parametrize("protocol", [ONE, {**ONE, "world": "memobench"}])
+def test_a_card_of_the_former_scenes_is_refused(protocol: dict[str, Any]) -> None:
+    write_card(Path(), card({**RANDOM, "env": {"tasks": STOVE, "world": "memobench"}}, protocol=protocol))
+    with pytest.raises(MemobenchError, match=r"scenes that version 0\.2 modelled in code"):
+        rerun.repeat(Path(), None, None, lambda plan: pytest.fail("it was run"), print)
+    assert allowed(env={"tasks": STOVE, "world": "libero"}).env == {"tasks": STOVE}
 
 
 def test_other_versions_and_renderers_are_noted() -> None:
@@ -294,7 +309,7 @@ OF_THE_RUN = {
     "prompt_in": st.sampled_from(["auto", "steps", "reset"]),
     "horizon": COUNT,
     "obs_type": st.sampled_from(["pixels_agent_pos", "both"]),
-    "env.render": st.sampled_from(["fast", "high"]),
+    "env.render": st.sampled_from(["default", "high"]),
     "env.videos": COUNT,
     "env.oracle_memory": BOOLEAN,
     "pause_steps": COUNT,

@@ -102,7 +102,6 @@ def rolled(
     config = MemobenchEnvConfig(
         tasks=HIGHLIGHT,
         horizon=HORIZON,
-        render="fast",
         expert_action=name == "memobench_expert",
         log_dir=str(log),
         videos=videos,
@@ -178,7 +177,7 @@ class Watched:
     [({}, PROMPT), ({"reshow": True}, PROMPT), ({"corrupt_step": 3}, PROMPT + 3)],
 )
 def test_memory_is_corrupted_before_the_frame_is_observed(settings: dict[str, Any], at: int, tmp_path: Path) -> None:
-    asked = {"corrupt": "swap", "tasks": HIGHLIGHT, "horizon": HORIZON, "render": "fast", "obs_type": OBJECTS}
+    asked = {"corrupt": "swap", "tasks": HIGHLIGHT, "horizon": HORIZON, "obs_type": OBJECTS}
     config = MemobenchEnvConfig(**asked, **settings)
     env = config.opener(None, UNKNOWN_POLICY, tmp_path)(task_folder(HIGHLIGHT), 2, False)
     policy = Watched()
@@ -256,7 +255,7 @@ def test_a_memory_of_pictures_refuses_objects_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("use_async", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_unneeded_pictures_are_not_drawn(use_async: bool, tmp_path: Path) -> None:
     """A call of the vector environment, in this process or in workers, lasts until the next reset."""
-    config = MemobenchEnvConfig(tasks=HIGHLIGHT, demonstration_prompt=False, render="fast", log_dir=str(tmp_path))
+    config = MemobenchEnvConfig(tasks=HIGHLIGHT, demonstration_prompt=False, log_dir=str(tmp_path))
     ((env,),) = (suite.values() for suite in config.create_envs(2, use_async).values())
     move = np.full((2, 7), 0.7, np.float32)
     try:
@@ -278,7 +277,7 @@ def test_recorded_episodes_are_drawn_whole(drawn: list[int], tmp_path: Path) -> 
     from lerobot_memobench.envs.video import LAST_FRAMES
     from lerobot_memobench.evaluation.html.write import frame_count
 
-    words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "env.render=fast", "videos=1"]
+    words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "videos=1"]
     assert main(["eval", "env=memobench", *words, f"output_dir={tmp_path}"]) == 0
     (recorded,) = (tmp_path / "videos").rglob("*")
     assert recorded.name == f"{HIGHLIGHT}.0.mp4"
@@ -306,7 +305,7 @@ def test_memory_reads_are_written_as_episodes_end(tmp_path: Path) -> None:
 
 def test_the_batch_size_of_an_object_policy_changes_no_episode(tmp_path: Path) -> None:
     """One process with a row per episode, by default; each row acts as it would alone."""
-    words = ["policy=memobench_small", f"tasks={STOVE}", "episodes=2", "horizon=60", "device=cpu"]
+    words = ["policy=memobench_strict", f"tasks={STOVE}", "episodes=2", "horizon=60", "device=cpu"]
     found = []
     for name, more, size in (("default", [], 2), ("alone", ["batch_size=1"], 1)):
         assert main(["eval", "env=memobench", *words, *more, f"output_dir={tmp_path / name}"]) == 0

@@ -15,7 +15,6 @@ from lerobot_memobench.envs.episode_log import with_omitted
 from lerobot_memobench.envs.settings import SCENE_HASHES
 from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from tests.support.fake_loop import STOVE, FakeLoop
-from tests.support.libero import needs_assets
 
 BOARD = Path(__file__).parents[2] / "results" / "board"
 ROWS = sorted(file.parent.name for file in BOARD.glob("*/evaluation.json"))
@@ -36,7 +35,7 @@ def first_rollout(card: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", [pytest.param(row, marks=needs_assets if "libero" in row else ()) for row in ROWS])
+@pytest.mark.parametrize("row", ROWS)
 def test_a_kept_rollout_of_each_row_is_repeated(row: str, tmp_path: Path) -> None:
     card = first_rollout(json.loads((BOARD / row / "evaluation.json").read_text()))
     if (version := with_omitted(card["protocol"])[SCENE_HASHES]) != SCENE_HASH_VERSION:

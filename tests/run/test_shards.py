@@ -201,7 +201,7 @@ def test_parts_repeat_the_command_and_decide_the_device_where_they_run(
     monkeypatch.setattr("torch.cuda.is_available", lambda: gpu)
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
     Path("eval.yaml").write_text("env: {horizon: 30}")
-    words = ["memory_reads=true", "config_path=eval.yaml", "policy=memobench_small", "workers=1"]
+    words = ["memory_reads=true", "config_path=eval.yaml", "policy=memobench_strict", "workers=1"]
     whole = plan_line([*LINE, *words, "shards=2", "slurm=--partition=a"])
     jobs = plan_shards(whole, ("program",), print)
     parts = [plan_line(job.arguments[1:]) for job in jobs]
@@ -236,7 +236,7 @@ def test_slurm_needs_follow_the_policy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("lerobot_memobench.run.shards.parameters_of", lambda path: parameters)
-    slurm = slurm_of(plan_line([*LINE, "policy=memobench_small", *words, "shards=2", "slurm=--partition=a"]))
+    slurm = slurm_of(plan_line([*LINE, "policy=memobench_strict", *words, "shards=2", "slurm=--partition=a"]))
     assert slurm is not None
     assert (slurm.needs.cores, slurm.needs.memory_gb, slurm.needs.gpus) == needs
 

@@ -10,8 +10,6 @@ import mujoco
 import pytest
 
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.assets.kitchen import build_kitchen
-from lerobot_memobench.sim.scene import PHYSICS_STEP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -21,13 +19,17 @@ BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
 ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
 
 
+def arm_spec() -> mujoco.MjSpec:
+    """Return the arm alone as a specification."""
+    spec = mujoco.MjSpec.from_string(robot.robot_xml())
+    robot.hide_helpers(spec)
+    return spec
+
+
 @pytest.fixture(scope="session")
 def arm_model() -> mujoco.MjModel:
-    """The arm over an empty table."""
-    spec = robot.robot_spec()
-    spec.option.timestep = PHYSICS_STEP
-    build_kitchen(spec)
-    return spec.compile()
+    """The arm alone."""
+    return arm_spec().compile()
 
 
 @pytest.fixture

@@ -238,7 +238,7 @@ def test_the_first_step_decides(fault: str, monkeypatch: pytest.MonkeyPatch, cap
 
 def arm_with(memory: int) -> tuple[mujoco.MjData, CompiledController]:
     """Return an arm with limited simulation memory, bytes."""
-    spec = robot.robot_spec()
+    spec = mujoco.MjSpec.from_string(robot.robot_xml())
     spec.nconmax, spec.njmax, spec.memory = -1, -1, memory
     model = spec.compile()
     data, controller = mujoco.MjData(model), CompiledController(model)
@@ -272,15 +272,17 @@ def test_another_robosuite_names_the_install_command(monkeypatch: pytest.MonkeyP
             raise metadata.PackageNotFoundError(name)
         return found
 
-    robot._arrays.cache_clear()
+    robot.robot_xml.cache_clear()
     monkeypatch.setattr(metadata, "version", version)
     with pytest.raises(MemobenchError, match=r"run: pip install --no-deps robosuite==1\.4\.1$"):
-        robot.robot_spec()
+        robot.robot_xml()
 
 
-def test_a_modified_arm_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_modified_arm_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     xml = robot._robosuite_xml()
+    robot.robot_xml.cache_clear()
+    monkeypatch.setattr(robot, "cache_folder", lambda: tmp_path)
     assert robot.arm_hash(xml) == robot.ARM_SHA256
     monkeypatch.setattr(robot, "_robosuite_xml", lambda: xml.replace('mass="', 'mass="1', 1))
     with pytest.raises(MemobenchError, match="not those of robosuite"):
-        robot._build()
+        robot.robot_xml()

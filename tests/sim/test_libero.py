@@ -1,7 +1,7 @@
 """LIBERO's world equals stock LIBERO in models, scenes, predicates and rollouts, and MuJoCo's renderer in images.
 
 `scripts/libero_records.py` makes the records in an environment of its own with MuJoCo 3.3.7. In other versions objects
-settle some 10⁻⁵ m elsewhere, and touched objects then move differently; `docs/develop/paper_world.md` has the outcome
+settle some 10⁻⁵ m elsewhere, and touched objects then move differently; `results/scenes.md` has the outcome
 of 3.3.7.
 """
 
@@ -16,11 +16,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from lerobot_memobench.sim.libero.scene import get_scene
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
-from lerobot_memobench.sim.worlds import get_scene
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
-from tests.support.libero import RECORDS, needs_assets, record, simulate, some_of_all
+from tests.support.libero import RECORDS, record, simulate, some_of_all
 from tests.support.scripts import load_script
 
 SCRIPT = load_script("libero_records")
@@ -49,13 +49,12 @@ DIMENSIONS = {
 # --- models ---
 
 
-@needs_assets
 @pytest.mark.parametrize("name", some_of_all(task_names()))
 def test_the_model_is_stock_liberos(name: str) -> None:
     script, kept = SCRIPT, record("models")
     assert list(kept["tasks"]) == sorted(task_names(), key=lambda one: str(script.task_files()[one]))
     wanted = dict(zip(kept["fields"], kept["fingerprints"][list(kept["tasks"]).index(name)], strict=True))
-    model = get_scene(get_task(name).in_world("libero")).model
+    model = get_scene(get_task(name)).model
     differ = {
         field: (found.tolist(), wanted[field].tolist())
         for field, values in script.fields(model).items()
@@ -83,13 +82,11 @@ def apart(sim: Simulation, seeds: range) -> float:
     return worst
 
 
-@needs_assets
 @pytest.mark.parametrize("name", some_of_all(task_names()))
 def test_scenes_of_evaluation_seeds(name: str) -> None:
     assert apart(simulate(name), range(7, 57)) <= EQUAL
 
 
-@needs_assets
 @pytest.mark.parametrize("name", some_of_all(task_names()))
 def test_a_reset_settles_as_stock_libero(name: str) -> None:
     sim = simulate(name)
@@ -102,7 +99,6 @@ def test_a_reset_settles_as_stock_libero(name: str) -> None:
 # --- predicates and rollouts ---
 
 
-@needs_assets
 @pytest.mark.parametrize("name", SCRIPT.PREDICATES)
 def test_predicates_are_stock_liberos(name: str) -> None:
     sim, kept = simulate(name), record("predicates")
@@ -123,7 +119,6 @@ QUICK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_p
 TASKS = [QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SCRIPT.ROLLOUTS if name != QUICK)]
 
 
-@needs_assets
 @pytest.mark.parametrize("name", TASKS)
 def test_rollout_outcomes_equal_stock_libero(name: str) -> None:
     sim, kept = simulate(name), {key.partition(":")[2]: record("rollouts")[key] for key in keys_of(name)}
@@ -154,7 +149,6 @@ def keys_of(name: str) -> list[str]:
 # --- images ---
 
 
-@needs_assets
 @pytest.mark.parametrize(
     "name",
     [
@@ -205,7 +199,7 @@ from lerobot_memobench.tasks.catalogue import task_names
 
 names = task_names()[:14]
 for k in range(300):
-    env = MemobenchEnv(names[k % len(names)], world="libero", obs_type="both", demonstration_prompt=False)
+    env = MemobenchEnv(names[k % len(names)], obs_type="both", demonstration_prompt=False)
     env.reset(seed=20_000 + k)
     env.step(np.zeros(7, np.float32))
     env.close()
@@ -214,7 +208,6 @@ for k in range(300):
 """
 
 
-@needs_assets
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read in /proc")
 def test_memory_levels_off_over_resets_of_many_scenes() -> None:

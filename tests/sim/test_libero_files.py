@@ -10,12 +10,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.libero import files, mjcf
 from lerobot_memobench.sim.libero.scene import build_scene
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.libero import needs_assets
 
 TOMATO = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 
 
-@needs_assets
 def test_required_packages_have_all_files(monkeypatch: pytest.MonkeyPatch) -> None:
     places = dict(files._candidates())
     folder = places[f"the packages {files.DISTRIBUTIONS}"]
@@ -41,9 +39,8 @@ def scan_folder(folder: Path, category: str, names: tuple[str, ...]) -> Path:
     return folder
 
 
-@needs_assets
 def test_user_scans(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    task = get_task(TOMATO).in_world("libero")
+    task = get_task(TOMATO)
     monkeypatch.delenv(files.SCANS_VARIABLE, raising=False)
     assert build_scene(task).stand_ins == ("beefsteak_tomato__1", "box_of_oatmeal__3")
     scan_folder(tmp_path, "beefsteak_tomato", ("aaa", "bbb"))

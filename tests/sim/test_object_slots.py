@@ -90,9 +90,9 @@ def seen_pixels(sim: Simulation, name: str) -> int:
 
 @pytest.mark.parametrize("name", [pytest.param(NINE, marks=pytest.mark.slow), DRAWERS])
 def test_visibility_agrees_with_pixels(name: str) -> None:
-    episode = Episode(get_task(name), demonstration_prompt=False, render=RenderSettings(256, 256, "fast"))
+    episode = Episode(get_task(name), demonstration_prompt=False, render=RenderSettings(256, 256))
     episode.reset(20_001)
-    sim, other = episode.sim, Simulation(get_task(name), RenderSettings(256, 256, "fast"))
+    sim, other = episode.sim, Simulation(get_task(name), RenderSettings(256, 256))
     slots = ObjectSlots(sim)
     for step in range(320):
         episode.step(episode.expert_action())

@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -24,11 +23,6 @@ Simulate = Callable[..., Simulation]
 STOVE = "turn_on_the_stove_and_turn_it_off"
 TOMATO = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
-
-
-def difference(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the mean absolute difference of two frames, grey levels."""
-    return float(np.abs(a.astype(int) - b.astype(int)).mean())
 
 
 def test_object_pixels_are_at_the_projected_position(simulate: Simulate) -> None:
@@ -97,27 +91,6 @@ def test_highlights_are_drawn_and_go_away(simulate: Simulate) -> None:
     sim.highlights = (Highlight((0, 0, 0.9), 0.1),) * (HIGHLIGHTS + 1)
     with pytest.raises(MemobenchError, match=f"at most {HIGHLIGHTS}"):
         sim.render()
-
-
-def visual_groups() -> mujoco.MjvOption:
-    """Return options of MuJoCo's renderer without collision geoms and sites."""
-    option = mujoco.MjvOption()
-    option.geomgroup[:] = 0
-    option.geomgroup[1] = 1
-    option.sitegroup[:] = 0
-    return option
-
-
-def test_looks_like_mujocos_own_renderer(mujoco_renderer: type[mujoco.Renderer], simulate: Simulate) -> None:
-    """Same camera, light and textures: only the edges of shadows differ."""
-    sim = simulate()
-    ours = sim.render()
-    model = sim.model
-    with mujoco_renderer(model, 256, 256) as renderer:
-        renderer.update_scene(sim.data, "agentview", visual_groups())
-        theirs = renderer.render()
-    assert difference(ours, theirs) < 4
-    assert (np.abs(ours.astype(int) - theirs).max(axis=2) > 40).mean() < 0.04
 
 
 def test_invalid_settings_are_errors(simulate: Simulate) -> None:

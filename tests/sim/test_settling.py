@@ -45,7 +45,7 @@ def test_all_listed_scenes(name: str) -> None:
 
 
 def test_report_counts_them() -> None:
-    episode = Episode(get_task(SWAP).in_world("libero"), demonstration_prompt=False)
+    episode = Episode(get_task(SWAP), demonstration_prompt=False)
     lines = []
     for number, seed in enumerate((22, 7)):
         episode.reset(seed)

@@ -18,9 +18,8 @@ from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.libero import files, mjcf
 from lerobot_memobench.sim.libero.looks import drawing_model
-from lerobot_memobench.sim.worlds import get_scene
+from lerobot_memobench.sim.libero.scene import get_scene
 from lerobot_memobench.tasks.catalogue import load_task
-from tests.support.libero import needs_assets
 
 PAGE = Path(__file__).parents[2] / "docs/develop/add_an_object_class.md"
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"\n]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
@@ -47,13 +46,12 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@needs_assets
 def test_the_guides_example(place: Path) -> None:
     exec(scripts()[1], {})
     picture = np.asarray(Image.open(place / "sponge.png")).astype(int)
     green = (picture[..., 1] > picture[..., 0] + 20) & (picture[..., 1] > picture[..., 2] + 20)
     assert 50 < green.sum() < 20_000  # the texture's stripe
-    env = MemobenchEnv(TASK, world="libero")
+    env = MemobenchEnv(TASK)
     env.reset(seed=7)
     for _ in range(5):
         observation, *_ = env.step(np.zeros(7, np.float32))
@@ -63,9 +61,8 @@ def test_the_guides_example(place: Path) -> None:
     assert env.episode.stand_ins == ()
 
 
-@needs_assets
 def test_the_expert_solves_the_guides_task(place: Path) -> None:
-    episode = Episode(load_task(TASK).in_world("libero"), demonstration_prompt=False)
+    episode = Episode(load_task(TASK), demonstration_prompt=False)
     episode.reset(7)
     while not episode.done and not episode.success:
         episode.step(episode.expert_action())
@@ -151,9 +148,8 @@ def test_names_of_built_in_classes_are_refused(place: Path, name: str) -> None:
         mjcf.class_file("sponge", "published")
 
 
-@needs_assets
 def test_another_folder_is_another_scene(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    task = load_task(TASK).in_world("libero")
+    task = load_task(TASK)
     width = get_scene(task).assets["sponge_1"].grasps[0].width
     (place / "my_objects").rename(place / "others")
     path = place / "others/sponge/sponge.xml"

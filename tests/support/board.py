@@ -19,8 +19,9 @@ from lerobot_memobench.protocol import EVIDENCE_EPISODES
 from lerobot_memobench.run.card import new_card, with_episodes, write_card
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.evidence import chance, scene_and_variant
+from lerobot_memobench.tasks.task import STRICT
 
-TASKS = task_names(suite="strict")
+TASKS = task_names(suite=STRICT)
 ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
 VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
 FILES = {"config.json": "1" * 64, "model.safetensors": "2" * 64}
@@ -37,10 +38,13 @@ def scene_of(name: str, seed: int) -> str:
 
 
 def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Json:
-    """A rollout of a strict task: every third one fails at its first checkpoint."""
+    """A rollout of a task: every third one fails at its first checkpoint."""
     published = get_task(name)
     scene, seed = episode, first + episode
-    task = referent_of(published, seed)
+    fixed = settings.get("referent") == "fixed"
+    task = published if fixed else referent_of(published, seed)
+    suite = {"suite": STRICT, "lost": False} if published.suite == STRICT else {}
+    prompt_steps = published.prompt_steps if suite else 200 * (task.prompt is not None)
     if settings.get("evidence"):
         scene, variant = scene_and_variant(published, episode)
         seed, task = first + scene, published.variant(variant)
@@ -51,31 +55,33 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
     choice = {"choice": task.variant_index if success else None, "answered": success}
     choice |= {"variants": len(published.random_variants), "chance": chance(published)}
     return {
-        **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed, "referent": "drawn"},
+        **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed},
+        **{"referent": "drawn" if suite else settings["referent"]},
         **{"variant": task.variant_index, "replan_steps": 5, "prompt_shown": None if task.prompt is None else True},
-        **{"prompt_steps": published.prompt_steps, "steps": steps, "success": success},
+        **{"prompt_steps": prompt_steps, "steps": steps, "success": success},
         **(choice if settings.get("evidence") else {}),
         **({"paused_steps": steps // 50 * 100} if settings.get("pause_steps") else {}),
         "checkpoints": [
             {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
             for c, step in zip(task.checkpoints, marks, strict=True)
         ],
-        **{"failure": None if success else "storage_failure", "suite": "strict", "lost": False},
+        **{"failure": None if success else "storage_failure", **suite, "world": "libero"},
         **{"scene_hash": scene_of(name, seed), "wall_s": 2.0, "policy": "act 0123", "run": "r", "inputs": "pixels"},
     }
 
 
-def evaluation(folder: Path, first: int = 7, speed: int = 50, **settings: Any) -> Path:
-    """Write the folder of an evaluation of the strict suite: 10 episodes of each task, 36 with evidence."""
+def evaluation(folder: Path, first: int = 7, speed: int = 50, suite: str = STRICT, **settings: Any) -> Path:
+    """Write the folder of an evaluation of a suite: 10 episodes of each task, 36 with evidence."""
+    names = task_names(suite=suite)
     count = EVIDENCE_EPISODES if settings.get("evidence") else 10
-    records = [line(name, episode, first, speed, **settings) for name in TASKS for episode in range(count)]
-    block = EnvSettings(suite="strict", seed_base=first, replan_steps=5, **settings).protocol_block
+    records = [line(name, episode, first, speed, **settings) for name in names for episode in range(count)]
+    block = EnvSettings(suite=suite, seed_base=first, replan_steps=5, **settings).protocol_block
     card = new_card(
-        protocol={"tasks": sorted(TASKS), "episodes": count, **block, "inputs": "pixels"},
+        protocol={"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
         policy={"type": "act", "seed": first, "settings": {"input_features": PICTURES}, "sha256": tree_hash(FILES)},
         checkpoint={"path": "user/one", "revision": "abc", "files": FILES},
         trained_on={"repo_id": "user/data", "revision": "def"},
-        task_files={name: task_hash(get_task(name)) for name in TASKS},
+        task_files={name: task_hash(get_task(name)) for name in names},
         settings={},
         runs=[{"command": ["lerobot"], "batch_size": 1, "versions": VERSIONS, "git_commit": None, "machine": {}}],
     )

@@ -83,6 +83,7 @@ class FakeLoop:
             "failure": None if seed % 2 else "storage_failure",
             "scene_hash": f"{task.name[:4]}{seed:012d}",
             "wall_s": 1.0,
+            "world": "libero",
             **self.changed,
         }
 

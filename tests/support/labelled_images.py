@@ -12,7 +12,7 @@ from torch import Tensor
 from lerobot_memobench.perception.detector import GEOMETRY, CellQuery, DetectorOutput
 from lerobot_memobench.perception.geometry import rays
 from lerobot_memobench.perception.visual_encoder import SIDE, VisualEncoder
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from research.detector.labels import MASK, PICTURE, Rows

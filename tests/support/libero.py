@@ -1,4 +1,4 @@
-"""What tests of LIBERO's world share: records of stock LIBERO, and a skip where its assets are not installed."""
+"""Records of stock LIBERO, and simulations, for tests of scenes."""
 
 from __future__ import annotations
 
@@ -10,25 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
 RECORDS = Path(__file__).parents[1] / "sim/libero"
-
-
-@cache
-def installed() -> bool:
-    """Return whether LIBERO's assets are here."""
-    try:
-        check_assets()
-    except MemobenchError:
-        return False
-    return True
-
-
-needs_assets = pytest.mark.skipif(not installed(), reason="LIBERO's assets are not on this machine")
 
 
 @cache
@@ -55,5 +40,5 @@ def some_of_all(names: list[str]) -> list[Any]:
 
 
 def simulate(name: str) -> Simulation:
-    """Return a simulation of a task in LIBERO's world."""
-    return Simulation(get_task(name).in_world("libero"))
+    """Return a simulation of a task."""
+    return Simulation(get_task(name))

@@ -40,6 +40,7 @@ def record(
             for operation, first, ordered in marks
         ],
         "failure": None,
+        "world": "libero",
         **changes,
     }
 

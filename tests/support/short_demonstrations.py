@@ -15,7 +15,7 @@ from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.task import MEMOBENCH, Task
+from lerobot_memobench.tasks.task import Task
 
 
 def record_demonstration(task: Task, seed: int, *, variant: int = 0, **settings: Any) -> Demonstration:
@@ -33,7 +33,6 @@ def drawn_steps(
     seed: int,
     frames: int,
     exec_start: int = 0,
-    world: str = MEMOBENCH,
     holds: Sequence[tuple[int, int]] = (),
 ) -> Demonstration:
     """Return as many steps of drawn actions; ``exec_start`` of them are of the prompt.
@@ -46,7 +45,7 @@ def drawn_steps(
     for start, end in holds:
         held[start:end] = True
     actions[held] = 0
-    return resimulate(get_task(task_name).in_world(world), seed, actions, exec_start, held=held)
+    return resimulate(get_task(task_name), seed, actions, exec_start, held=held)
 
 
 def beginning(demo: Demonstration, frames: int) -> Demonstration:

@@ -48,7 +48,7 @@ FEWEST, MOST = 10, EVALUATION_EPISODES
 SEEDS = {SPLITS[name].start: name for name in (PAPER, SEALED)}
 """Seed of the first episode -> split of seeds that count."""
 MAY_DIFFER = {
-    *("suite", "world", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
+    *("suite", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
     *("evidence", "salt"),
 }
 """Settings of the protocol that a submission may choose; all others have their defaults."""
@@ -435,7 +435,7 @@ def _check_scenes(runs: Sequence[Evaluation]) -> None:
             raise MemobenchError(
                 f"{run.place}: {SCENE_HASHES} is {version}; expected at most {SCENE_HASH_VERSION}, that of this version"
             )
-        simulator = run.card["runs"][-1]["versions"].get("mujoco"), version, run.protocol["world"]
+        simulator = run.card["runs"][-1]["versions"].get("mujoco"), version
         for record in run.records:
             kind = (*simulator, *record.get("stand_ins", ()), record["task"])
             scene, seed = str(record.get("scene_hash")), record["seed"]

@@ -15,7 +15,6 @@ from lerobot_memobench.evaluation.metrics import Rate, Row, stand_ins_of
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure, with_interval
 from lerobot_memobench.io import checked, parsed
 from lerobot_memobench.protocol import PAPER
-from lerobot_memobench.tasks.task import LIBERO
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ def board_row(
         ranked=ranked(evaluation),
         rerun=(reruns or {}).get(submission.name) == submission.digest,
         suite=" ".join([protocol["suite"], *(["random referents"] if protocol["referent"] == "random" else [])]),
-        assets=_assets(protocol["world"], bool(stand_ins_of(run.records))),
+        assets=f"LIBERO{', own objects for missing scans' if stand_ins_of(run.records) else ''}",
         inputs=protocol[INPUTS],
         seeds=split if split == PAPER else f"{split}, run {evaluation.card['sealed']['run']}",
         episodes=protocol["episodes"],
@@ -88,10 +87,6 @@ def board_row(
         pauses=next((each for each in changes if each.kind == "average" and each.metric == "SR"), None),
         without_memory=None if partner is None else partner.evaluation.run.summary.average["SR"],
     )
-
-
-def _assets(world: str, stand_ins: bool) -> str:
-    return f"LIBERO{', own objects for missing scans' if stand_ins else ''}" if world == LIBERO else "package"
 
 
 # --- text ---

@@ -22,7 +22,7 @@ from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
 from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal
 from lerobot_memobench.jobs.start import prepare_process, reader_has_left
-from lerobot_memobench.tasks.task import LIBERO, MEMOBENCH, PUBLISHED, STRICT
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 
 USAGE_ERROR = 2
 
@@ -43,23 +43,12 @@ class Suite(StrEnum):
     STRICT = STRICT
 
 
-class World(StrEnum):
-    """The world: one set of scenes."""
-
-    MEMOBENCH = MEMOBENCH
-    LIBERO = LIBERO
-
-
 WhichSuite = Annotated[
     Suite,
     typer.Option(
         help="published: the thirty tasks as published; strict: their memory-necessary variants, whose answer no "
         "picture shows."
     ),
-]
-WhichWorld = Annotated[
-    World,
-    typer.Option(help="memobench: the package's own scenes; libero: the paper's, of LIBERO's assets (extra libero)."),
 ]
 OfSuite = Annotated[
     Suite | None, typer.Option(help="Refuse a dataset that holds tasks of another suite; any when left out.")

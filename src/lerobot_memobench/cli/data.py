@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, WhichWorld, World, console, counting, say
+from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting, say
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
@@ -39,7 +39,6 @@ def generate(
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
     suite: WhichSuite = Suite.PUBLISHED,
-    world: WhichWorld = World.MEMOBENCH,
     episodes: Annotated[int, typer.Option(min=1, help="Demonstrations per task.")] = 50,
     prompted_episodes: Annotated[
         int | None, typer.Option(min=1, help="Demonstrations per task that begins with a prompt, if not --episodes.")
@@ -68,7 +67,7 @@ def generate(
     """Make a LeRobotDataset of expert demonstrations. The same command continues a killed run."""
     options = None if slurm is None else read_options(slurm)
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
-    chosen = [get_task(name).in_world(world.value) for name in resolve_tasks(tasks, suite)]
+    chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
     from lerobot_memobench.datasets.generation import episodes_of, slurm_of
     from lerobot_memobench.datasets.generation import generate as run
 

@@ -43,7 +43,6 @@ from lerobot_memobench.datasets.restore import (
     restore,
     task_of,
     unlike_the_catalogue,
-    world_of,
 )
 from lerobot_memobench.datasets.staging import (
     EpisodeStage,
@@ -72,8 +71,7 @@ from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
-from lerobot_memobench.sim.worlds import WORLDS
-from lerobot_memobench.tasks.task import World
+from lerobot_memobench.sim.libero.files import check_assets
 
 SUFFIXES = (".hdf5", ".h5")
 MACOS_FOLDER = "__MACOSX"
@@ -130,9 +128,10 @@ def convert(
 
     Raises:
         MemobenchError: there is no file to convert, ``out`` holds something else, its disk has no room (finished
-            episodes stay), or LIBERO's assets, which files of its scenes need, are not installed.
+            episodes stay), or LIBERO's assets are not installed.
     """
     check_choice("convention", convention, [*CONVENTIONS])
+    check_assets()
     source, out = Path(source).absolute(), Path(out)
     staging = out / STAGING
     files, refused = find_files(source, staging.absolute() / "unpacked")
@@ -286,22 +285,17 @@ class Sound(BaseModel):
 
 
 class Findings(BaseModel):
-    """Demonstrations, problems and notes of a file, the world of its scenes, and how its images are stored."""
+    """Demonstrations, problems and notes of a file, and how its images are stored."""
 
     demonstrations: list[Sound] = []
     problems: list[Problem] = []
     notes: list[Problem] = []
-    world: World | None = None
     orientation: str | None = None
 
 
-def inspect(file: SourceFile, world: World | None) -> Findings:
-    """Return the findings of a file; ``world`` is that of the files before it.
-
-    Raises:
-        MemobenchError: the assets of its world are not installed.
-    """
-    found = Findings(world=world)
+def inspect(file: SourceFile) -> Findings:
+    """Return the findings of a file."""
+    found = Findings()
 
     def leave_out(group: str, reason: object) -> None:
         found.problems.append(Problem(file=file.name, group=group, reason=str(reason)))
@@ -316,7 +310,6 @@ def inspect(file: SourceFile, world: World | None) -> Findings:
             for group in groups:
                 try:
                     demo = opened.read(group)
-                    found.world = _checked_world(demo, found.world)
                     found.orientation = found.orientation or orientation_of(opened, demo)
                 except Unusable as error:
                     leave_out(f"data/{group}", error)
@@ -332,14 +325,6 @@ def inspect(file: SourceFile, world: World | None) -> Findings:
         turned = f"its images are {found.orientation}: they are turned"
         found.notes.append(Problem(file=file.name, group="", reason=turned if found.orientation else unclear))
     return found
-
-
-def _checked_world(demo: PublishedDemo, others: World | None) -> World:
-    world = world_of(demo)
-    if world != (others or world):
-        raise Unusable(f"its scenes are of world={world}, those before of {others}; convert each world separately")
-    WORLDS[world].check()
-    return world
 
 
 def _notes(file: PublishedFile, demo: PublishedDemo) -> list[str]:
@@ -381,7 +366,6 @@ class _Conversion:
         self._source, self._staging, self._folder, self._convention = source, staging, folder, convention
         self._workers, self._progress, self._files = workers, progress, files
         self._resumed = 0
-        self._world: World | None = None
         shutil.rmtree(staging / "unpacked", ignore_errors=True)  # a killed run may have left a part
         (staging / "files").mkdir(exist_ok=True)
 
@@ -393,9 +377,8 @@ class _Conversion:
             notify(f"file {number} of {len(self._files)}: {file.name}, {in_words(file.size)}")
             findings = self._unpack(file, findings)
         if findings is None:
-            findings = inspect(file, self._world)
+            findings = inspect(file)
         write_file(record, findings.model_dump_json(), durable=True)
-        self._world = findings.world
         jobs = self._jobs_of(file, findings)
         run_jobs(jobs, workers=self._workers, progress=self._progress and self._counting(number, len(jobs)))
         self.jobs += jobs
@@ -421,7 +404,7 @@ class _Conversion:
             if findings is not None:  # an earlier run found its demonstrations
                 raise MemobenchError(f"{self._source}, {file.name}: {error}") from None
             problem = Problem(file=file.name, group="", reason=str(error))
-            return Findings(problems=[problem], world=self._world)
+            return Findings(problems=[problem])
         return findings
 
     def _jobs_of(self, file: SourceFile, findings: Findings) -> list[ConversionJob]:

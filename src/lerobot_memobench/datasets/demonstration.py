@@ -26,8 +26,9 @@ from lerobot_memobench.protocol import (
     PROMPT,
     PROPRIO_DIM,
 )
+from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
-from lerobot_memobench.tasks.task import LEVELS, MEMOBENCH, OPERATIONS, STRICT, Task
+from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, STRICT, Task
 
 MAX_CHECKPOINTS = 6
 """Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
@@ -332,7 +333,7 @@ def digest(demo: Demonstration) -> str:
         "variant": demo.variant,
         "exec_start": demo.exec_start,
         "success": bool(demo.success),
-        **({} if demo.task.world == MEMOBENCH else {"world": demo.task.world}),
+        WORLD: LIBERO,
     }
     columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
     if demo.executed is not None:

@@ -249,6 +249,7 @@ class FrameLookup:
         self.columns: Columns = columns or {}
         self.encoded: Mapping[str, Encoded] = encoded or {}
         self._remember = remember
+        self._changes: dict[int, np.ndarray] = {}
 
     @property
     def num_frames(self) -> int:
@@ -280,6 +281,15 @@ class FrameLookup:
         if self._remember is None:
             raise LookupError("this lookup has no remembered features")
         return self._remember(episode, slots)
+
+    def changes(self, episode: int) -> np.ndarray:
+        """Return the slots of an episode whose remembered features differ from those of the slot before."""
+        if episode not in self._changes:
+            slots = range(0, int(self.episodes[episode + 1] - self.episodes[episode]), self.stride)
+            frames = self.tokens(episode, range(len(slots))).flatten(1)
+            differs = (frames[1:] != frames[:-1]).any(dim=1).numpy()
+            self._changes[episode] = np.flatnonzero(np.append(True, differs))
+        return self._changes[episode]
 
     def memory_texts(self, indices: Sequence[int]) -> list[str]:
         """Return the oracle memory texts of frames by their global indices.

@@ -30,8 +30,9 @@ from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
-from lerobot_memobench.sim.worlds import WORLDS
-from lerobot_memobench.tasks.task import MEMOBENCH, Task, referent_text
+from lerobot_memobench.sim.libero.files import check_assets
+from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
+from lerobot_memobench.tasks.task import Task, referent_text
 
 NEEDS = Needs(cores=1, memory_gb=4)
 """Resources of one job on Slurm, which makes one episode after another."""
@@ -110,7 +111,7 @@ def generate(
     if finish:
         return _finish_early(plan, Path(out))
     if slurm is None:  # on Slurm, each job checks its own machine
-        WORLDS[plan.world].check()
+        check_assets()
     return _run(plan, Path(out), workers, slurm=slurm, progress=progress, notify=notify)
 
 
@@ -135,13 +136,6 @@ class _Plan:
         names = [task.name for task in self.tasks]
         if len(set(names)) < len(names):
             raise MemobenchError(f"a task was named twice among {', '.join(names)}; name each once")
-        if len({task.world for task in self.tasks}) > 1:
-            raise MemobenchError("tasks of two worlds were asked for; make a dataset of each world")
-
-    @property
-    def world(self) -> str:
-        """World of all scenes."""
-        return self.tasks[0].world
 
     @property
     def request(self) -> dict[str, Any]:
@@ -151,7 +145,7 @@ class _Plan:
             "episodes": self.episodes,
             "prompted_episodes": self.prompted_episodes,
             "seed_base": self.seed_base,
-            **({} if self.world == MEMOBENCH else {"world": self.world}),
+            WORLD: LIBERO,
             "hold_frames": HOLD_FRAMES,
             **asdict(self.settings),
             "task_files": [task_hash(task) for task in self.tasks],
@@ -164,7 +158,6 @@ class _Plan:
         prompts = "" if self.settings.demonstration_prompt else ", demonstration prompts left out"
         more = "" if self.prompted_episodes is None else f" ({self.prompted_episodes} of those with a prompt)"
         seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
-        seeds += "" if self.world == MEMOBENCH else f", world {self.world}"
         moved = ", the arm disturbed at random in two thirds of them" if self.settings.perturb else ""
         return f"`memobench generate`, {seeds}, referent {self.settings.referent}{prompts}{moved}. {SCRIPTED}"
 

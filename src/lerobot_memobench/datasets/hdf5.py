@@ -11,9 +11,6 @@
 ``meta_data`` is the task's metadata as JSON, with ``key_frame`` (for each checkpoint the frame at which it was
 completed in order) and ``timestep_exec_start_idx`` (the frame at which execution starts) filled in. Frame t shows
 the observation before ``actions[t]``.
-
-Files of earlier versions of this package have further attributes: of ``data`` ``task_metadata``; of a demonstration
-those of `Extras`.
 """
 
 from __future__ import annotations
@@ -23,29 +20,23 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from annotated_types import Len
 from numpy.typing import NDArray
-from pydantic import BaseModel, Json
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
-    Count,
     Malformed,
-    Number,
-    Whole,
     check_fetched,
     check_regular,
-    checked,
     parsed,
     refusing,
 )
 from lerobot_memobench.protocol import ACTION_DIM
+from lerobot_memobench.sim.scene_hash import FORMER, check_world
 
 if TYPE_CHECKING:
     import h5py
@@ -56,30 +47,11 @@ LIBERO_NAMES = {"image": "agentview_rgb", "wrist_image": "eye_in_hand_rgb"}
 """Camera of this package -> array of LIBERO's own files, whose names are also accepted."""
 FILE_OBJECT = re.compile(r"<(_io\.\w+|open file) .*>")
 NO_SEED = -1
-"""Seed of a demonstration without a recorded seed."""
+"""Seed of a demonstration, which the layout does not hold."""
 SUFFIX = "_demo.hdf5"
 FRAMES_PER_READ = 32
 LARGEST = 1e10
 """MuJoCo treats a state with a larger number as unstable and replaces it by the initial state."""
-
-
-class Extras(BaseModel):
-    """Attributes that earlier versions of this package added to a demonstration; the defaults apply to other files.
-
-    Attributes:
-        success: None in files of other programs.
-        fixture_poses: JSON, fixture to pose (7,).
-        satisfied_intervals: JSON, checkpoint to [start, stop) pairs.
-    """
-
-    seed: Whole = NO_SEED
-    referent: str = "fixed"
-    variant: Count = 0
-    success: bool | None = None
-    fixture_poses: Json[dict[str, Annotated[list[Number], Len(7, 7)]]] | None = None
-    scene_hash: str = ""
-    satisfied_intervals: Json[list[list[Annotated[list[Count], Len(2, 2)]]]] | None = None
-    digest: str | None = None
 
 
 class Unusable(MemobenchError):
@@ -100,7 +72,6 @@ class PublishedDemo:
         actions: (T, 7) float32.
         metadata: ``meta_data``.
         model_file: MJCF, or "" where it is missing.
-        extras: attributes of earlier versions of this package.
         image_size: (height, width).
     """
 
@@ -109,7 +80,6 @@ class PublishedDemo:
     actions: NDArray[np.float32]
     metadata: dict[str, Any]
     model_file: str
-    extras: Extras
     image_size: tuple[int, int]
 
 
@@ -154,12 +124,6 @@ class PublishedFile:
     ) -> None:
         self._file.close()
 
-    @cached_property
-    def task_metadata(self) -> dict[str, Any] | None:
-        """The task's metadata as earlier versions of this package store it; None in other files."""
-        stored = text_attribute(self._data, "task_metadata")
-        return None if stored is None else json_object(stored, "task_metadata")
-
     @property
     def lacks_its_text(self) -> bool:
         """Whether the task's text is replaced by the name of an open file."""
@@ -199,6 +163,8 @@ class PublishedFile:
             raise Unusable(f"the group {name!r} is missing")
         if demo_number(name) is None or not isinstance(group, h5py.Group):
             raise Unusable("it is no group demo_<number>")
+        if "success" in group.attrs:
+            check_world(FORMER, "it was written by an earlier version of this package and", Unusable)
         states = array(group, "states", (None, None), np.float64)
         actions = array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
         if not isinstance(group.get("obs"), h5py.Group):
@@ -217,7 +183,6 @@ class PublishedFile:
             actions=finite("actions", actions[:]).astype(np.float32),
             metadata=json_object(text_attribute(group, "meta_data", required=True), "meta_data"),
             model_file=text_attribute(group, "model_file") or "",
-            extras=read_extras(group),
             image_size=sizes.pop(),
         )
 
@@ -377,20 +342,6 @@ def finite(name: str, values: NDArray) -> NDArray:
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or its name."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
-def read_extras(group: h5py.Group) -> Extras:
-    """Return the `Extras` of a group.
-
-    Raises:
-        Unusable: an attribute is of another type, or no JSON.
-    """
-    found = {key: _plain(group.attrs[key]) for key in Extras.model_fields if key in group.attrs}
-    try:
-        extras: Extras = checked(found, Extras)
-    except Malformed as error:
-        raise Unusable(f"its attributes: {error}") from None
-    return extras
 
 
 def _plain(value: Any) -> Any:

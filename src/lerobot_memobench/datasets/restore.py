@@ -1,9 +1,9 @@
 """Restore a demonstration from a group of the published layout: its task, its execution, its checkpoints.
 
 The layout holds states, but neither proprioception nor the truth of predicates. Proprioception and visible objects are
-computed in the simulator from the states, in the world in which they were recorded. Highlights of demonstration prompts
-of other programs are unknown. Checkpoint columns come from the key frames; where one is missing (-1) its predicate is
-evaluated on the states, with the latches and orders of a rollout.
+computed in the simulator from the states. Highlights of demonstration prompts are unknown. Checkpoint columns come from
+the key frames; where one is missing (-1) its predicate is evaluated on the states, with the latches and orders of a
+rollout.
 
 The order of the joints in a state is that of the attribute ``model_file``, an MJCF text of another program. Only its
 bodies and joints are compiled, so it cannot reference files or plugins.
@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -25,19 +24,18 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest
-from lerobot_memobench.datasets.hdf5 import SUFFIX, PublishedDemo, PublishedFile, Unusable, first_line
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.hdf5 import NO_SEED, SUFFIX, PublishedDemo, PublishedFile, Unusable, first_line
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_name
 from lerobot_memobench.protocol import CAMERAS, UPSTREAM_EVALUATIONS
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, load_task, task_names
 from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
-from lerobot_memobench.tasks.task import BDDL_FILE, LIBERO, MEMOBENCH, MEMORY_TYPES, METADATA_FILE, Task, World
+from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, REFERENTS, Task
 
 States = NDArray[np.float64]
 Pose = NDArray[np.float64]
@@ -50,8 +48,6 @@ NEAR_TABLE = 0.1
 """Largest height of a fixture's origin above or below the table's top, m; LIBERO's are up to 30 mm above it."""
 UNKNOWN = "tasks"
 """Folder of a task with an unknown memory type."""
-OURS = "memobench"
-"""Model name in files that earlier versions of this package wrote of its own world."""
 
 
 # --- demonstrations ---
@@ -64,83 +60,38 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
         Unusable: the group contradicts itself or the task, or is of another scene than the task's.
     """
     sim = _simulation(task)
-    states, fixture_poses = _placed(sim, demo)
+    states, fixture_poses = place(sim, compile_scene(demo.model_file), demo.states)
     exec_start = execution_start(task, demo)
     _check_clock(demo.states, exec_start)
     frames = key_frames(task, demo, exec_start)
-    extras = demo.extras
-    written = extras.satisfied_intervals
-    evaluate = written is None and (not frames or min(frames) < 0)
-    columns = _read_states(sim, task, states, fixture_poses, exec_start, ours=is_ours(demo), evaluate=evaluate)
+    evaluate = not frames or min(frames) < 0
+    columns = _read_states(sim, task, states, fixture_poses, exec_start, evaluate)
     try:
-        restored = Demonstration(
+        return Demonstration(
             task=task,
-            seed=extras.seed,
-            referent=extras.referent,
-            variant=extras.variant,
+            seed=NO_SEED,
+            referent=REFERENTS[0],
+            variant=0,
             states=states,
             actions=demo.actions,
             proprio=columns.proprio,
             images=None,
             exec_start=exec_start,
-            satisfied=(
-                truth_from_intervals(written, len(demo.states))
-                if written is not None
-                else _known_or_evaluated(frames, columns.satisfied)
-            ),
-            success=(
-                (columns.success or (bool(frames) and min(frames) >= 0)) if extras.success is None else extras.success
-            ),
+            satisfied=_known_or_evaluated(frames, columns.satisfied),
+            success=columns.success or not evaluate,
             fixture_poses=fixture_poses,
-            scene_hash=extras.scene_hash,
+            scene_hash="",
             stand_ins=sim.stand_ins,
             objects=columns.objects,
         )
-        found = digest(restored)
     except MemobenchError as error:
         raise Unusable(str(error)) from None
-    if extras.digest not in (None, found):
-        raise Unusable("its states, actions or labels are not those that were written (the digest differs)")
-    return restored
-
-
-def _placed(sim: Simulation, demo: PublishedDemo) -> tuple[States, dict[str, Pose]]:
-    """Return states and poses of the fixtures in the simulation's scene."""
-    if not is_ours(demo) or demo.extras.fixture_poses is None:
-        return place(sim, compile_scene(demo.model_file), demo.states)
-    if demo.states.shape[1] != sim.state_dim:
-        raise Unusable(f"states have width {demo.states.shape[1]}, expected {sim.state_dim} of task {sim.task.name}")
-    return demo.states, {name: np.array(pose) for name, pose in demo.extras.fixture_poses.items()}
-
-
-def is_ours(demo: PublishedDemo) -> bool:
-    """Return whether an earlier version of this package wrote a demonstration, with truth and success."""
-    return demo.extras.success is not None
-
-
-def world_of(demo: PublishedDemo) -> World:
-    """Return the world of a demonstration's scenes: this package's own if it wrote them, else LIBERO's.
-
-    Raises:
-        Unusable: its model file is missing, or no XML.
-    """
-    ours = is_ours(demo) or parse_scene(demo.model_file).get("model") == OURS
-    return MEMOBENCH if ours else LIBERO
 
 
 def _known_or_evaluated(frames: list[int], satisfied: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the (T, K) truth: from the key frame on if it is known, else as evaluated on the states."""
     known = np.arange(len(satisfied))[:, None] >= np.array(frames)
     return np.where(np.array(frames, dtype=int) >= 0, known, satisfied)
-
-
-def truth_from_intervals(intervals: Sequence[Sequence[Sequence[int]]], length: int) -> NDArray[np.bool_]:
-    """Return the truth (T, K) of K checkpoints from their [start, stop) pairs."""
-    truth = np.zeros((length, len(intervals)), dtype=np.bool_)
-    for k, pairs in enumerate(intervals):
-        for start, stop in pairs:
-            truth[start:stop, k] = True
-    return truth
 
 
 def execution_start(task: Task, demo: PublishedDemo) -> int:
@@ -202,13 +153,11 @@ def _read_states(
     states: States,
     fixture_poses: dict[str, Pose],
     exec_start: int,
-    *,
-    ours: bool,
     evaluate: bool,
 ) -> StateColumns:
     """Set the states in the simulator in order and read columns; ``evaluate``: whether to evaluate the formulas."""
-    hold_steps = HOLD_STEPS // UPSTREAM_EVALUATIONS if task.world == LIBERO else HOLD_STEPS
-    evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)], hold_steps)
+    goals = [task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)]
+    evaluator = Evaluator(goals, HOLD_STEPS // UPSTREAM_EVALUATIONS)
     look = ObjectSlots(sim)
     proprio, objects = [], []
     satisfied = np.zeros((len(states), len(task.checkpoints)), dtype=np.bool_)
@@ -216,7 +165,6 @@ def _read_states(
     for frame, state in enumerate(states):
         sim.set_state(state, fixture_poses)
         proprio.append(sim.proprio())
-        sim.highlights = highlights_at(task, sim, frame) if ours and frame < exec_start else ()
         objects.append(look.observe())
         if frame == exec_start:
             sim.begin_execution()
@@ -277,7 +225,7 @@ def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
         Unusable: the group has no task, or is of another scene than the task's.
     """
     sim = _simulation(task_of(file, demo))
-    states, fixture_poses = _placed(sim, demo)
+    states, fixture_poses = place(sim, compile_scene(demo.model_file), demo.states)
     sim.set_state(states[0], fixture_poses)
     stored = next(file.images(demo.group)).items()
     pairs = [(_small(sim.render(CAMERAS[camera])), _small(picture)) for camera, picture in stored]
@@ -464,19 +412,17 @@ def _fixture_pose(scene: mujoco.MjModel, name: str) -> Pose:
 
 
 def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
-    """Return the task that a demonstration shows, in its world, from the file's own BDDL and metadata.
+    """Return the task that a demonstration shows, from the file's own BDDL and metadata.
 
     Raises:
         Unusable: they do not make a task, or its name or memory type names no folder.
     """
     name = _folder_name(task_name(file), "the task's name")
-    ours = file.task_metadata
-    metadata = dict(demo.metadata if ours is None else ours)
-    if ours is None:
-        # The frames differ between demonstrations, the task must not: its scene is compiled once.
-        goals = metadata.get("subtask_goals")
-        metadata["key_frame"] = [-1] * len(goals) if isinstance(goals, list) else []
-        metadata["timestep_exec_start_idx"] = -1
+    metadata = dict(demo.metadata)
+    # The frames differ between demonstrations, the task must not: its scene is compiled once.
+    goals = metadata.get("subtask_goals")
+    metadata["key_frame"] = [-1] * len(goals) if isinstance(goals, list) else []
+    metadata["timestep_exec_start_idx"] = -1
     memory_type = _folder_name(file.attribute("memory_type") or _memory_type(name, file) or UNKNOWN, "memory_type")
     task = _load(name, memory_type, _bddl_text(file, name), json.dumps(metadata, sort_keys=True))
     if name in task_names(suite=None):
@@ -485,8 +431,7 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
             task = replace(task, family=known.family)
         if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
             task = known
-    task = task.in_world(world_of(demo))
-    return task.variant(demo.extras.variant) if ours is not None else task
+    return task
 
 
 def _bddl_text(file: PublishedFile, name: str) -> str:

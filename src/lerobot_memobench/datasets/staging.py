@@ -38,7 +38,7 @@ from lerobot_memobench.io import file_hash, read_json, remove_drafts, short, wri
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
-from lerobot_memobench.tasks.task import MEMOBENCH
+from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
 
 TEMPORARY = ".tmp-"
 REQUEST_FILE = "request.json"
@@ -46,7 +46,7 @@ RECORD_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
 FINISHED_EARLY = "finished_early"
 """Key of a dataset's request: whether episodes of it were left out."""
-DEFAULTS: dict[str, Any] = {"perturb": False, "prompted_episodes": None, FINISHED_EARLY: False, "world": MEMOBENCH}
+DEFAULTS: dict[str, Any] = {"perturb": False, "prompted_episodes": None, FINISHED_EARLY: False, WORLD: FORMER}
 DEFAULTS |= {"convention": UPRIGHT, "upside_down": False}  # the latter was an option of `memobench convert`
 """Values of keys that a request may lack."""
 ADVICE = "it is damaged; delete its folder and run the command again"
@@ -218,7 +218,6 @@ class EpisodeStage:
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:
     """Return the fields of an episode for meta/episodes, manifest and card."""
-    elsewhere = {"world": demo.task.world, "stand_ins": list(demo.stand_ins)}
     return {
         "task_name": demo.task.name,
         "memory_type": demo.task.memory_type,
@@ -233,7 +232,7 @@ def episode_info(demo: Demonstration) -> dict[str, Any]:
         "exec_start_index": int(demo.exec_start),
         "key_frames": labels(demo).key_frames.tolist(),
         "scene_hash": demo.scene_hash,
-        **({} if demo.task.world == MEMOBENCH else elsewhere),
+        **{WORLD: LIBERO, "stand_ins": list(demo.stand_ins)},
         "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
         "digest": digest(demo),
     }

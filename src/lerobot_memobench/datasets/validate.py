@@ -58,6 +58,7 @@ from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.scene_hash import check_world
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
@@ -368,8 +369,8 @@ def replay(
         task, start, wanted, executed, held = recorded.task, 0, recorded.actions, recorded.applied, recorded.held
         columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
     else:
-        published = (task or get_task(recorded.task_name)).in_world(recorded.world)
-        task, start = published.variant(recorded.variant), recorded.start
+        check_world(recorded.world, "the episode")
+        task, start = (task or get_task(recorded.task_name)).variant(recorded.variant), recorded.start
         columns, whole = recorded.columns, recorded.whole
         if "action" not in columns:
             raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")

@@ -37,10 +37,11 @@ from lerobot_memobench.io import (
 )
 from lerobot_memobench.protocol import BY_PAPER
 from lerobot_memobench.sim.convention import UPRIGHT
+from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
 from lerobot_memobench.tasks.difficulty import STANDARD, Difficulty
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import MEMOBENCH, PUBLISHED, Task
+from lerobot_memobench.tasks.task import PUBLISHED, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
@@ -137,8 +138,8 @@ class Outcome(TypedDict, total=False):
         failure: failure class; None for a success.
         suite: ``strict``; absent for published tasks.
         difficulty: absent for the standard one.
-        world: ``libero``; absent for the package's own scenes.
-        stand_ins: world ``libero``: classes whose missing scans this package's objects replaced.
+        world: ``libero``; absent for the scenes that version 0.2 modelled in code.
+        stand_ins: classes whose missing scans this package's objects replaced.
         protocol: ``upstream``, the authors' evaluation; absent for the paper's.
         convention: of the pictures; absent for upright ones.
         lost: strict tasks: whether the goal became unreachable.
@@ -250,7 +251,7 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
         **({} if task.suite == PUBLISHED else {"held_steps": episode.pacing.held_steps}),
         **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
-        **({} if task.world == MEMOBENCH else {"world": task.world, "stand_ins": list(episode.stand_ins)}),
+        **{WORLD: LIBERO, "stand_ins": list(episode.stand_ins)},
         **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),
         "scene_hash": episode.scene_hash,
         **({} if episode.sim.settled else {"settled": False}),
@@ -290,7 +291,7 @@ def not_run_record(
         "checkpoints": [],
         **({} if task.suite == PUBLISHED else {"suite": task.suite}),
         **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
-        **({} if task.world == MEMOBENCH else {"world": task.world}),
+        WORLD: LIBERO,
         "not_run": why,
     }
 
@@ -505,7 +506,7 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 
 
 OMITTED: dict[str, Any] = {
-    **{"suite": PUBLISHED, "world": MEMOBENCH, "difficulty": STANDARD, "protocol": BY_PAPER},
+    **{"suite": PUBLISHED, WORLD: FORMER, "difficulty": STANDARD, "protocol": BY_PAPER},
     "convention": UPRIGHT,
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, HOLD: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
     **{"window_steps": 1, "delay_steps": 0, "salt": None},

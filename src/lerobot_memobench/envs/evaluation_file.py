@@ -26,6 +26,7 @@ from lerobot_memobench.envs.episode_log import (
 from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import LARGEST, Count, Name, Number, Whole, is_there, read_json, write_file
+from lerobot_memobench.sim.scene_hash import WORLD
 
 EVALUATION_FILE = "evaluation.json"
 EARLIER_CARD, EARLIER_PROTOCOL = "card.json", "protocol.json"
@@ -50,7 +51,7 @@ _FIELDS: dict[str, Any] = {
         for each in fields(EnvSettings)
         if each.name not in NOT_COMPARED
     },
-    **{HOLD: Count | None, GOALS: Count, SCENE_HASHES: Count, INPUTS: Name | None},
+    **{WORLD: Name | list[Name], HOLD: Count | None, GOALS: Count, SCENE_HASHES: Count, INPUTS: Name | None},
 }
 Settings: Any = TypedDict("Settings", _FIELDS, total=False)  # type: ignore[misc]
 """Settings that must agree between two evaluations to be compared, as a file holds them."""
@@ -149,7 +150,7 @@ class SealedStart(TypedDict):
     Attributes:
         started: time.
         suite: published or strict.
-        world: ``libero``; absent for the package's own scenes.
+        world: ``libero``; absent for the scenes that version 0.2 modelled in code.
         referent: fixed, random or drawn.
         replan_steps: actions executed per prediction; None for the policy's own number.
         tasks: number of tasks.

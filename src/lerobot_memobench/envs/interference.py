@@ -59,7 +59,7 @@ class Interference:
     def _open(self) -> None:
         name = self._names[self._done]
         if name not in self._episodes:
-            self._episodes[name] = Episode(get_task(name).in_world(self._task.world), self._settings)
+            self._episodes[name] = Episode(get_task(name), self._settings)
         self.shown = self._episodes[name]
         self.shown.reset(int(self._seeds[self._done]))
 

@@ -56,7 +56,6 @@ from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
 from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
-from lerobot_memobench.tasks.task import World
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +110,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             settings = settings.changed(prompt_in=STEPS)
         self.settings = settings
         self.render_mode = render_mode
-        self._task = self._task.in_world(cast("World", settings.world)).at(cast("Difficulty", settings.difficulty))
+        self._task = self._task.at(cast("Difficulty", settings.difficulty))
         self.task = self._task.name
         if settings.needs_prompt and self._task.prompt is None:
             raise MemobenchError(

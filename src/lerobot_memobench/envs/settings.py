@@ -25,10 +25,10 @@ from lerobot_memobench.protocol import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
-from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
+from lerobot_memobench.sim.scene_hash import LIBERO, SCENE_HASH_VERSION, WORLD
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
-from lerobot_memobench.tasks.task import DRAWN, MEMOBENCH, PUBLISHED, REFERENTS, STRICT, SUITES, WORLDS
+from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
@@ -42,7 +42,7 @@ policies the prompt plays in `reset`. ``auto`` chooses by the policy; without a 
 
 REFERENT_VALUES = (*REFERENTS, DRAWN)
 """Values of ``referent``; strict tasks always use the last one."""
-QUALITIES = ("fast", "default", "high")
+QUALITIES = ("default", "high")
 EVERY = -1
 """Value of ``videos``: record every episode."""
 SLOWEST = 10
@@ -91,7 +91,6 @@ class EnvSettings:
     """
 
     suite: str = setting(PUBLISHED, "published tasks, or strict: 30 variants that need a memory", SUITES)
-    world: str = setting(MEMOBENCH, "scenes of this package, or of the paper with LIBERO's assets", WORLDS)
     difficulty: str = setting(STANDARD, "number of repetitions in strict tasks", DIFFICULTIES)
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
@@ -111,7 +110,7 @@ class EnvSettings:
     )
     window_steps: int = setting(1, "control steps of observations in an input of a policy without a memory", least=1)
     delay_steps: int = setting(0, "control steps from an observation to the first action planned from it", least=0)
-    render: str = setting("default", "fast has no shadows; high is for figures and ten times slower", QUALITIES)
+    render: str = setting("default", "high is for figures and four times slower", QUALITIES)
     oracle_memory: bool = setting(False, "the instruction ends with the completed checkpoints (oracle memory control)")
     pause_steps: int = setting(0, "control steps of each pause, at moments drawn by the seed (pause control)", least=0)
     speed: float = setting(1.0, "1, 0.5, 0.33, ...: an action takes 1, 2, 3, ... control steps (speed control)")
@@ -234,13 +233,13 @@ class EnvSettings:
     def protocol_block(self) -> dict[str, Any]:
         """Settings that must agree to join or compare two evaluations."""
         agreed = {name: value for name, value in asdict(self).items() if name not in NOT_COMPARED}
-        return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
+        return {WORLD: LIBERO, **agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
 
 
 NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
 """Settings without effect on rollouts."""
-SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED)
-"""Settings with an effect on rollouts."""
+SETTINGS = (WORLD, *(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED))
+"""Settings with an effect on rollouts, and the source of the scenes."""
 
 
 def revision(suite: str, difficulty: str) -> dict[str, int]:

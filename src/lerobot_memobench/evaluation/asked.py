@@ -15,8 +15,9 @@ from lerobot_memobench.envs.settings import SCENE_HASHES, SETTINGS, steps_per_ac
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, seed_base
 from lerobot_memobench.io import count_of
+from lerobot_memobench.sim.scene_hash import WORLD
 from lerobot_memobench.tasks.catalogue import task_folder, task_names
-from lerobot_memobench.tasks.task import LIBERO, REFERENTS, STRICT
+from lerobot_memobench.tasks.task import REFERENTS, STRICT
 
 # --- extent ---
 
@@ -73,12 +74,11 @@ def extent_of(card: Mapping[str, Any], lines: Iterable[Record]) -> Extent | None
 
 STATED = {*SETTINGS, INPUTS} & {*typing.get_type_hints(EpisodeRecord)}
 """Settings that the file and each line hold under one name."""
-NOT_RUN = {"suite", "world", "difficulty"}
+NOT_RUN = {"suite", WORLD, "difficulty"}
 """Settings that a line omits for their usual value even where its episode was not run."""
 REQUIRED: Mapping[str, tuple[str, Any]] = {
     **dict.fromkeys(("choice", "answered", "variants", "chance"), ("evidence", True)),
     **dict.fromkeys(("lost", "held_steps"), ("suite", STRICT)),
-    "stand_ins": ("world", LIBERO),
 }
 """Field that a line holds under one setting only -> that setting and its value."""
 

@@ -11,6 +11,7 @@ from lerobot_memobench.evaluation.metrics import Record, policy_inputs, stand_in
 from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
+from lerobot_memobench.sim.scene_hash import FORMER, WORLD
 
 CONTROLLED = ("pause_steps", "speed", *MEMORY_CONTROLS)
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
@@ -44,15 +45,16 @@ def policy_name(run: Run) -> str:
 
 
 def protocol_phrases(run: Run) -> list[str]:
-    """Return suite, world, referent, seeds, episodes per task, replan interval and controls of an evaluation."""
+    """Return suite, scenes, referent, seeds, episodes per task, replan interval and controls of an evaluation."""
     records, suite = run.records, of_all(run.records, "suite")
     return [
         f"own tasks, suite={suite}"
         if run.card.get("settings", {}).get("env", {}).get("task_dir")
         else f"{suite} suite",
+        *(["scenes that version 0.2 modelled in code"] if of_all(records, WORLD) == FORMER else []),
         *(
             f"{key} {value}"
-            for key in ("world", "difficulty", "protocol", "convention")
+            for key in ("difficulty", "protocol", "convention")
             if (value := of_all(records, key)) != OMITTED[key]
         ),
         *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),

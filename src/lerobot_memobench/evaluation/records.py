@@ -32,6 +32,7 @@ from lerobot_memobench.evaluation.asked import check_lines, extent_of
 from lerobot_memobench.evaluation.evidence import FoundEvidence, evidence_of, ran_evidence
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import count_of
+from lerobot_memobench.sim.scene_hash import FORMER, WORLD
 
 # --- the protocol ---
 
@@ -68,7 +69,7 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     seeded = all(record.get("seed") is not None for record in records)
     values: dict[str, set[Any]] = {
         "seed_base": {seed_base(record) for record in records if seeded},
-        **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", "world", "protocol", "convention")},
+        **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", WORLD, "protocol", "convention")},
         **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
     }
     for key, distinct in values.items():
@@ -77,7 +78,7 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return found
 
 
-APART = ("suite", "world")
+APART = ("suite", WORLD)
 """Settings whose values are reported separately: other tasks, other scenes."""
 
 
@@ -165,6 +166,7 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
                 raise MemobenchError(
                     f"{runs[0].folder} is an evaluation of {key}={values[0]} and {run.folder} one of {key}={value}, "
                     f"whose figures do not compare; report each {key} by itself"
+                    f"{f' (world={FORMER}: scenes that version 0.2 modelled in code)' if key == WORLD else ''}"
                 )
     return _with_methods(runs)
 

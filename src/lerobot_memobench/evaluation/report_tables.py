@@ -23,7 +23,8 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
 from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
 from lerobot_memobench.sim.convention import UPRIGHT
-from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES, PUBLISHED
+from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
+from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 
 def inputs_phrase(words: str) -> str:
@@ -322,7 +323,7 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
 # --- with the paper's figures ---
 
 PAPER_PROTOCOL = {
-    **{"world": LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True, "horizon": HORIZON},
+    **{WORLD: LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True, "horizon": HORIZON},
     **{"seed_base": EVALUATION_SEED, "convention": UPRIGHT},
 }
 PAPER_INPUTS = "pixels"

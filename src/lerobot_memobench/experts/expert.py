@@ -30,7 +30,7 @@ from lerobot_memobench.experts.travel import (
     protrudes_from_drawer,
     region_box,
 )
-from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import (
     LATCHES,

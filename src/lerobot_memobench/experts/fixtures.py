@@ -39,7 +39,7 @@ from lerobot_memobench.experts.travel import (
     rise,
     sustained,
 )
-from lerobot_memobench.sim.assets.asset import Articulation
+from lerobot_memobench.sim.asset import Articulation
 
 HANDLE_TILT = np.radians(35)
 """Downward tilt of the hand at a handle: the flange clears the table, rad."""

@@ -52,8 +52,7 @@ from lerobot_memobench.experts.travel import (
     rise,
     travel,
 )
-from lerobot_memobench.sim.assets.asset import Asset, Grasp
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE_TOP, Asset, Grasp
 
 MAX_ATTEMPTS = 4
 """Maximum attempts at grasping an object or moving a handle, door or knob."""

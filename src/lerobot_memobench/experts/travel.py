@@ -21,8 +21,7 @@ from lerobot_memobench.experts.hand import (
     length,
     unit,
 )
-from lerobot_memobench.sim.assets.asset import Articulation, Asset
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE_TOP, Articulation, Asset
 from lerobot_memobench.sim.robot import BASE_POSITION
 from lerobot_memobench.tasks.formula import Atom
 

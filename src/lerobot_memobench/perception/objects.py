@@ -19,7 +19,7 @@ from torch.nn.functional import normalize
 from lerobot_memobench.perception.detector import Detections, Detector, detections
 from lerobot_memobench.perception.geometry import View, depth_at_height, rays, views_of
 from lerobot_memobench.perception.visual_encoder import resized
-from lerobot_memobench.sim.assets.kitchen import TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes, fill_slots
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS

@@ -15,7 +15,8 @@ from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import BLOCKS, WIDTHS, VisualEncoder
 
 SHIPPED = Path(__file__).parent / "detector.safetensors"
-"""The detector that comes with the package: results/detector.md."""
+"""The detector that comes with the package, trained on the scenes that version 0.2 modelled in code:
+results/detector.md."""
 PACKAGE, RANDOM = "package", "random"
 """Names that do not mean a file: the package's detector, and a visual encoder with random weights."""
 

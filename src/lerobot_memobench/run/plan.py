@@ -293,11 +293,11 @@ def check_scenes(plan: EvaluationPlan) -> None:
 
 def _check_simulator(environment: MemobenchEnvConfig) -> None:
     """Refuse a machine on which every episode would fail: without the arm or the assets."""
+    from lerobot_memobench.sim.libero.files import check_assets
     from lerobot_memobench.sim.robot import robosuite_version
-    from lerobot_memobench.sim.worlds import WORLDS
 
     robosuite_version()
-    WORLDS[environment.world].check()
+    check_assets()
 
 
 # --- the benchmark's defaults ---

@@ -46,6 +46,7 @@ from lerobot_memobench.run.card import PACKAGES, detector_hash, drawn_with, firs
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
 from lerobot_memobench.sim.convention import UPRIGHT
+from lerobot_memobench.sim.scene_hash import WORLD, check_world
 from lerobot_memobench.tasks.difficulty import STANDARD
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -55,7 +56,9 @@ MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
 """Setting of the environment -> its largest number."""
 NAMED = {"success", "steps", "checkpoints"}
 """Fields that a card must name of an episode: a repetition compares them."""
-OF_EARLIER_VERSIONS = re.compile(r"--(eval\.recording.*|job_name=.*|env\.render_every=1|env\.max_parallel_tasks=1)")
+OF_EARLIER_VERSIONS = re.compile(
+    r"--(eval\.recording.*|job_name=.*|env\.render_every=1|env\.world=\w+|env\.max_parallel_tasks=1)"
+)
 """Flags on cards of earlier versions on which no outcome depends."""
 
 REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
@@ -100,8 +103,8 @@ def repeat(
         MemobenchError: the card cannot be repeated here.
     """
     card = repeatable_card(path, server)
-    check_policy(card)
     check_version(card)
+    check_policy(card)
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_card(card, out)
@@ -185,6 +188,7 @@ def check_version(card: Mapping[str, Any]) -> None:
         MemobenchError: it names that version.
     """
     run, protocol = card["runs"][-1], card["protocol"]
+    check_world(protocol.get(WORLD), "the card")
     version = f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
     problem = first_variant_mismatch(card["episodes"])
     for name, here in revision(protocol.get("suite", PUBLISHED), protocol.get("difficulty", STANDARD)).items():
@@ -272,6 +276,7 @@ def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> Ev
         checked(vars(asked), CardSettings)
     except Malformed as error:
         raise MemobenchError(f"the card's settings: {error}; run its command yourself if you trust it") from None
+    asked = replace(asked, env={name: value for name, value in asked.env.items() if name != WORLD})
     if asked.output_dir is not None:
         raise _refused("output_dir", asked.output_dir, "no card sets it")
     if not all(OBSERVATION.fullmatch(name) for pair in asked.rename_map.items() for name in pair):

@@ -27,13 +27,11 @@ from lerobot_memobench.run.card import (
     write_card,
 )
 from lerobot_memobench.run.evaluate import Advance, evaluate
-from lerobot_memobench.run.plan import Cell, EvaluationPlan
+from lerobot_memobench.run.plan import Cell, EvaluationPlan, Shard
 from lerobot_memobench.run.sealed import counted
 
 VIDEOS = "videos"
 """Folder of the videos, in that of the log."""
-SHARDS = "shard-*-of-*"
-"""Folders of the parts of an evaluation, in its own."""
 
 Note = Callable[[str], None]
 """Called with a message for the user; the run continues."""
@@ -61,7 +59,7 @@ def run_evaluation(
         else:
             check_new(plan.output)
             check_new(plan.log)
-        for part in sorted(plan.output.parent.glob(SHARDS)) if plan.options.shard is not None else ():
+        for part in sorted(plan.output.parent.glob(Shard.FOLDERS)) if plan.options.shard is not None else ():
             resumed_card(part, card, lambda text: None)  # else the parts could not be merged
         cells = missing(plan)
         if cells:

@@ -23,7 +23,7 @@ from lerobot_memobench.policies.lerobot_config import SEALED_LEDGER
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.run.card import PACKAGES, versions
 from lerobot_memobench.run.plan import EvaluationPlan
-from lerobot_memobench.tasks.task import MEMOBENCH
+from lerobot_memobench.sim.scene_hash import WORLD
 
 COMMITTED = ("started", "policy", "scenes", "release")
 """Fields of a start that the card repeats."""
@@ -73,8 +73,7 @@ def _line_of(card: Mapping[str, Any], folder: str) -> dict[str, Any]:
     protocol = card["protocol"]
     return {
         "started": dt.datetime.now(dt.UTC).isoformat(timespec="microseconds"),
-        **{name: protocol.get(name) for name in ("suite", "referent", "replan_steps")},
-        **_world(protocol),
+        **{name: protocol.get(name) for name in ("suite", WORLD, "referent", "replan_steps")},
         "tasks": len(protocol["tasks"]),
         "episodes": protocol["episodes"],
         "policy": policy_hash(card),
@@ -136,15 +135,10 @@ def scenes_hash(card: Mapping[str, Any]) -> str:
     return _hash(
         [
             *(card["task_files"], card["policy"].get("seed"), protocol["episodes"]),
-            *(protocol.get("referent"), protocol.get("evidence", False), *_world(protocol).values()),
+            *(protocol.get("referent"), protocol.get("evidence", False), protocol.get(WORLD)),
             *filter(None, [protocol.get("salt")]),  # earlier versions draw none
         ]
     )
-
-
-def _world(protocol: Mapping[str, Any]) -> dict[str, str]:
-    """Return the world of the scenes, {} for the package's own, which earlier lines do not name."""
-    return {} if protocol.get("world", MEMOBENCH) == MEMOBENCH else {"world": protocol["world"]}
 
 
 def _hash(facts: Any) -> str:
@@ -163,9 +157,8 @@ def in_words(start: Mapping[str, Any]) -> str:
     if not start["earlier"]:
         return number
     last = start["earlier"][-1]
-    world = f"world {last['world']}, " if "world" in last else ""
     interval = "" if last["replan_steps"] is None else f", replan interval {last['replan_steps']}"
     return (
-        f"{number}; the previous run on {last['started'][:10]}: {last['suite']} suite, {world}"
+        f"{number}; the previous run on {last['started'][:10]}: {last['suite']} suite, "
         f"referent {last['referent']}, {count_of(last['tasks'], 'task')}{interval}"
     )

@@ -34,7 +34,6 @@ from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import card_of, extended, first_variant_mismatch, with_episodes, write_card
 from lerobot_memobench.run.plan import EvaluationPlan, Shard, with_changes
 from lerobot_memobench.run.run import (
-    SHARDS,
     VIDEOS,
     Note,
     check_folder,

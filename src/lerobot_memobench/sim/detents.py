@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.sim.assets.asset import Articulation, Asset
-from lerobot_memobench.sim.assets.builder import SITE_GROUP
+from lerobot_memobench.sim.asset import SITE_GROUP, Articulation, Asset
 
 Array = NDArray[np.float64]
 

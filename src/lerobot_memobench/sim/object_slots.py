@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.assets.asset import Articulation
-from lerobot_memobench.sim.assets.registry import known_classes, split_class
+from lerobot_memobench.sim.asset import COLLISION_GROUP, Articulation, split_class
+from lerobot_memobench.sim.libero.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
@@ -112,11 +112,11 @@ class ObjectSlots:
         self._point_indices = np.arange(len(self._points)).reshape(-1, POINTS_PER_THING)
         self._cameras = [sim.model.camera(name).id for name in MJCF_CAMERAS.values()]
         self._group = np.zeros(6, np.uint8)
-        self._group[sim.opaque_group] = 1
+        self._group[COLLISION_GROUP] = 1
 
-    def owners(self, geoms: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the index in `things` of each geom's owner, for ids of any shape; -1 without owner and for id -1."""
-        return np.where(geoms >= 0, self._owner[self._sim.model.geom_bodyid[geoms]], -1)
+    def owners(self, bodies: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the index in `things` of each body's owner, for ids of any shape; -1 without owner and for id -1."""
+        return np.where(bodies >= 0, self._owner[bodies], -1)
 
     def observe(self) -> NDArray[np.float32]:
         """Return the observation (SIZE,) of the present state."""
@@ -132,9 +132,7 @@ class ObjectSlots:
         """Return `POINTS_PER_THING` distant points slightly inside a thing's opaque geoms, in its body's frame."""
         model = self._sim.model
         found = []
-        for geom in np.flatnonzero(
-            (self._owner[model.geom_bodyid] == index) & (model.geom_group == self._sim.opaque_group)
-        ):
+        for geom in np.flatnonzero((self._owner[model.geom_bodyid] == index) & (model.geom_group == COLLISION_GROUP)):
             points = corners(model, geom)
             points = points @ rotation(model.geom_quat[geom]).T + model.geom_pos[geom]
             inner = model.geom_bodyid[geom]
@@ -165,7 +163,8 @@ class ObjectSlots:
                 model, data, origin, rays[inside].ravel(), self._group, True, -1, geoms, distances,
                 *_NORMALS_ARGUMENT, count, mujoco.mjMAXVAL,
             )  # fmt: skip
-            owners, mine = self.owners(geoms), tried[inside] // POINTS_PER_THING
+            owners = self.owners(np.where(geoms >= 0, model.geom_bodyid[geoms], -1))
+            mine = tried[inside] // POINTS_PER_THING
             hits += np.bincount(mine[owners == mine], minlength=len(hits))
         return hits >= MIN_VISIBLE_POINTS
 

@@ -1,4 +1,4 @@
-"""Hash of a scene, by which evaluations of the same scenes are recognised."""
+"""Source and hash of a scene, by which evaluations of the same scenes are recognised."""
 
 from __future__ import annotations
 
@@ -6,14 +6,37 @@ import hashlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from lerobot_memobench.errors import MemobenchError
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+WORLD, LIBERO, FORMER = "world", "libero", "memobench"
+"""Field of logs, datasets and evaluation files that names the source of the scenes; its value; and its value, which
+files may omit, for the scenes that version 0.2 modelled in code."""
 SCENE_HASH_VERSION = 2
 """Raise it with each change of a scene's hash: of this function, of states, or of rounding in the simulation.
 
 1: release 0.2.0.
 """
+
+
+def check_world(found: str | None, what: str, error: type[MemobenchError] = MemobenchError) -> None:
+    """Refuse a record of scenes that this version does not have.
+
+    Args:
+        found: value of `WORLD`; None if it is omitted.
+        what: subject of the message.
+        error: type of the error.
+
+    Raises:
+        MemobenchError: the record is of the former scenes.
+    """
+    if found != LIBERO:
+        raise error(
+            f"{what} is of the scenes that version 0.2 modelled in code; this version has LIBERO's scenes only, use "
+            "version 0.2 for it"
+        )
 
 
 def scene_hash(state: NDArray, fixture_poses: Mapping[str, NDArray]) -> str:

@@ -17,14 +17,14 @@ from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING_SIGNS, make_controller
 from lerobot_memobench.sim.hiding import HiddenObject, HiddenObjects
-from lerobot_memobench.sim.placement import Placement
+from lerobot_memobench.sim.libero.placement import Placement, Placer
+from lerobot_memobench.sim.libero.scene import GLOW_OFF, GLOW_ON, get_scene
 from lerobot_memobench.sim.raster.drawlist import DrawList, Image
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
 from lerobot_memobench.sim.scene_hash import scene_hash
-from lerobot_memobench.sim.world import StartState
-from lerobot_memobench.sim.worlds import WORLDS, get_scene
+from lerobot_memobench.sim.world import StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
 
@@ -109,18 +109,17 @@ class Simulation:
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
-        self.stand_ins, self.opaque_group = scene.stand_ins, scene.opaque_group
-        kind = WORLDS[task.world]
-        self.world = kind.predicates(task, self.model, self.data, scene.assets)
+        self.stand_ins = scene.stand_ins
+        self.world = World(task, self.model, self.data, scene.assets)
         self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
         self._hidden = HiddenObjects(self.model, self.data)
         self._at_home: Snapshot | None = None
         self.caught_at_home, self.settled = False, True
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
-        self._drawn: tuple[mujoco.MjModel, mujoco.MjData, DrawList | None] | None = None
+        self._drawn: tuple[mujoco.MjModel, mujoco.MjData, DrawList] | None = None
         self._controller = make_controller(self.model)
-        self._placer = kind.placer(task, self.model, self.data, scene.assets)
+        self._placer = Placer(task, self.model, self.data, scene.assets)
         self._hand = self.model.body(robot.HAND_BODY).id
         self._grip = self.model.site(robot.GRIP_SITE).id
         self._arm_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
@@ -355,23 +354,19 @@ class Simulation:
         model, data, draw_list = self._drawing()
         for asset, geom in self._glowing:
             lit = self.holds(Atom("turnon", (asset.name,)))
-            model.geom(geom).rgba = asset.glow_on if lit else asset.glow_off
+            model.geom(geom).rgba = GLOW_ON if lit else GLOW_OFF
         renderer = get_renderer(self._scene.key, model, self.render_settings, draw_list)
         return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
 
-    def geoms(self, camera: str = "agentview") -> NDArray[np.int64]:
-        """Return the id of the visible geom at each pixel of a camera's image, (height, width), -1 for none."""
+    def visible_bodies(self, camera: str = "agentview") -> NDArray[np.int64]:
+        """Return the id of the body at each pixel of a camera's image, (height, width), -1 for none."""
         model, data, draw_list = self._drawing()
         rasterizer = get_rasterizer(self._scene.key, model, self.render_settings, draw_list)
-        return rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
+        geoms = rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
+        return np.where(geoms >= 0, model.geom_bodyid[geoms], -1)
 
-    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData, DrawList | None]:
-        """Return model, data and draw list for rendering; None as draw list selects all visual geoms.
-
-        Return the simulated model, or the scene's separate visual model in the same pose.
-        """
-        if self._scene.drawing is None:
-            return self.model, self.data, None
+    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData, DrawList]:
+        """Return the scene's visual model in the present pose, its data, and its draw list."""
         if self._drawn is None:
             drawing, listed = self._scene.drawing()
             drawing = copy.copy(drawing)

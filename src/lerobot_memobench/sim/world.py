@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.assets.asset import Articulation, Asset
-from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
+from lerobot_memobench.sim.asset import COLLISION_GROUP, TABLE, Articulation, Asset
 from lerobot_memobench.sim.detents import DEAD_CENTRE
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
+
+Vector = NDArray[np.float64]
 
 ON_DISTANCE = 0.03
 """Horizontal distance of origins below which one object counts as on another, m."""
@@ -52,9 +53,36 @@ DETENT_SHIFT, DETENT_TURN = 0.001, 0.02
 """Largest distance (m) and angle (rad) of an object from its start for the detent to restore it."""
 
 
+def in_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
+    """Return whether an origin is in a region.
+
+    LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`.
+
+    Args:
+        place: origin (3,), m.
+        position, rotation, size: pose and half sizes of the region's site, (3,), (3, 3) and (3,).
+    """
+    half = np.abs(rotation @ size)
+    low, high = position - half, position + half
+    low[2] -= IN_SLACK
+    return bool(np.all(place > low) and np.all(place < high))
+
+
+def over_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
+    """Return whether an origin is on top of a region, with or without contact; arguments as of `in_region`.
+
+    LIBERO applies the site's rotation where its inverse would be correct.
+    """
+    offset = rotation @ (place - position)
+    above = size[2] - ON_SITE_BELOW < offset[2] < size[2] + ON_SITE_ABOVE
+    return bool(above and np.all(np.abs(offset[:2]) < size[:2]))
+
+
 class World:
     """Evaluate predicates of the present state of one simulation.
 
+    The formulas are those of LIBERO's `site_object.py` and `base_object_states.py`: `On` a region of the table needs no
+    contact, and only geoms of robosuite's collision group count as contacts.
     Positions and contacts must match the present state (after `mujoco.mj_step1` or `mujoco.mj_forward`).
 
     Attributes:
@@ -75,6 +103,7 @@ class World:
             self._owner[geom] = roots.get(body, -1)
             if model.geom(geom).name.startswith(TABLE):
                 self._owner[geom] = self._table
+        self._owner[model.geom_group != COLLISION_GROUP] = -1
         self.joints: dict[str, tuple[Articulation, int]] = {}
         for name, asset in assets.items():
             for region, articulation in asset.articulations.items():
@@ -139,10 +168,7 @@ class World:
 
     def _in(self, a: str, region: str) -> bool:
         self._index(a)
-        site = self._site(region)
-        local = self._data.site_xmat[site].reshape(3, 3).T @ (self._data.body(a).xpos - self._data.site_xpos[site])
-        half = self._model.site_size[site]
-        return bool(np.all(np.abs(local[:2]) < half[:2]) and -half[2] - IN_SLACK < local[2] < half[2])
+        return in_region(self._data.body(a).xpos, *self._box_of(region))
 
     def _on_object(self, a: str, b: str) -> bool:
         self._index(a)
@@ -153,18 +179,20 @@ class World:
 
     def _on_site(self, a: str, region: str) -> bool:
         self._index(a)
-        position = self._data.body(a).xpos
+        if not over_region(self._data.body(a).xpos, *self._box_of(region)):
+            return False
         declared = self._task.regions.get(region)
-        if declared is not None and declared.target == TABLE:
-            inside = any(x1 <= position[0] <= x2 and y1 <= position[1] <= y2 for x1, y1, x2, y2 in declared.ranges)
-            height = position[2] - TABLE_TOP
-            return inside and -ON_SITE_BELOW < height < ON_SITE_ABOVE and self.touching(a, TABLE)
+        on_table = declared is not None and declared.target == TABLE
+        return on_table or self.touching(a, self._owner_of(region))
+
+    def _box_of(self, region: str) -> tuple[Vector, Vector, Vector]:
+        """Return position (3,), rotation (3, 3) and half size (3,) of a region's site."""
         site = self._site(region)
-        local = self._data.site_xmat[site].reshape(3, 3).T @ (position - self._data.site_xpos[site])
-        half = self._model.site_size[site]
-        height = local[2] - half[2]
-        inside = bool(np.all(np.abs(local[:2]) < half[:2]) and -ON_SITE_BELOW < height < ON_SITE_ABOVE)
-        return inside and self.touching(a, self._owner_of(region))
+        return (
+            self._data.site_xpos[site].copy(),
+            self._data.site_xmat[site].reshape(3, 3),
+            self._model.site_size[site],
+        )
 
     def _site(self, region: str) -> int:
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.difficulty import EASY, STANDARD, Difficulty, draws
 from lerobot_memobench.tasks.formula import Atom, Formula, rename
@@ -20,15 +20,12 @@ MemoryType = Literal["temporal", "spatial", "object", "procedural"]
 Operation = Literal["S", "U", "C"]
 PromptKind = Literal["routine", "pick", "point", "highlight", "hide"]
 Suite = Literal["published", "strict"]
-World = Literal["memobench", "libero"]
 Texts = tuple[str, str, str]
 
 MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
 OPERATIONS: tuple[Operation, ...] = get_args(Operation)
 SUITES: tuple[Suite, ...] = get_args(Suite)
 PUBLISHED, STRICT = SUITES
-WORLDS: tuple[World, ...] = get_args(World)
-MEMOBENCH, LIBERO = WORLDS
 REFERENTS = ("fixed", "random")
 #: Referent of strict episodes, which ignore the referent setting (`Task.drawn`).
 DRAWN = "drawn"
@@ -141,9 +138,7 @@ class Task:
         derived_from: published task with the same scene; None for a task with its own scene.
         drawn: whether each episode draws its variant by seed and ignores the referent setting; False for a variant.
         spoilt_as: failure class of an episode with an unreachable goal; None classifies by checkpoints.
-        world: assets, placement, contacts and predicates: `memobench` (this package) or `libero` (the paper). A setting
-            of the evaluation, never of a task's files.
-        difficulty: variants that are drawn; a setting of the evaluation too.
+        difficulty: variants that are drawn; a setting of the evaluation, never of a task's files.
     """
 
     name: str
@@ -169,29 +164,18 @@ class Task:
     derived_from: str | None = None
     drawn: bool = False
     spoilt_as: str | None = None
-    world: World = "memobench"
     difficulty: Difficulty = STANDARD
 
     # Compare files, variant and settings, so that pickled copies in worker processes are equal and hashable.
     def _key(self) -> tuple[str | int, ...]:
         metadata = json.dumps(self.metadata, sort_keys=True)
-        return self.name, self.bddl_text, metadata, self.variant_index, self.world, self.difficulty
+        return self.name, self.bddl_text, metadata, self.variant_index, self.difficulty
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Task) and self._key() == other._key()
 
     def __hash__(self) -> int:
-        return hash((self.name, self.bddl_text, self.variant_index, self.world))
-
-    def in_world(self, world: World) -> Task:
-        """Return the task in another world, with equal layout, instruction, goal and checkpoints.
-
-        Raises:
-            MemobenchError: the world is unknown.
-        """
-        check_choice("world", world, WORLDS)
-        published = self.published and self.published.in_world(world)
-        return dataclasses.replace(self, world=world, published=published)
+        return hash((self.name, self.bddl_text, self.variant_index))
 
     def at(self, difficulty: Difficulty) -> Task:
         """Return the task with the variants of another difficulty (strict tasks only)."""

@@ -70,6 +70,7 @@ MEMORY_DEFAULTS: Mapping[str, object] = {
     "memory_stride": None,
     "memory_fusion": None,
     "memory_phase": False,
+    "memory_repeats": True,
     "subgoals": None,
 }
 """Settings that a memory does not take over from another memory's checkpoint or recipe -> their defaults."""

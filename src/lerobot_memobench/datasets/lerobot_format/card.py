@@ -17,8 +17,9 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import files_below
 from lerobot_memobench.paper import raw_tables
 from lerobot_memobench.sim.convention import convention_of
+from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.task import LIBERO, MEMORY_TYPES
+from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 CARD_FILE = "README.md"
 MADE_BY = "## How it was made"
@@ -253,12 +254,15 @@ def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]
     ]
 
 
+SCENES = "The scenes are made of LIBERO's assets."
+
+
 def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a paragraph on the world of the scenes, none for the package's own."""
-    found = [info for info in infos if info.get("world") == LIBERO]
-    missing = sorted({name for info in found for name in info.get("stand_ins") or ()})
+    """Return a paragraph on the source of the scenes."""
+    missing = sorted({name for info in infos for name in info.get("stand_ins") or ()})
     stand_ins = f" This package's objects replace missing scans: {', '.join(missing)}." if missing else ""
-    return [f"The scenes are the paper's, of LIBERO's assets (`world={LIBERO}`).{stand_ins}"] if found else []
+    former = any(info.get(WORLD) != LIBERO for info in infos)
+    return ["The scenes are those that version 0.2 modelled in code." if former else f"{SCENES}{stand_ins}"]
 
 
 def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
@@ -302,13 +306,13 @@ def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
 def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
     """Return a dataset's licence, as the hub names it, and the licence section of its card.
 
-    They depend on the world of the scenes and on the source of the demonstrations.
+    They depend on the source of the scenes and on that of the demonstrations.
 
     Args:
         infos: information on its episodes (`staging.episode_info`).
     """
     infos = list(infos)
-    there = [info for info in infos if info.get("world") == LIBERO]
+    there = [info for info in infos if info.get(WORLD) == LIBERO]
     theirs = {
         "The demonstrations": any(info["seed"] < 0 for info in infos),  # converted: `memobench generate` knows the seed
         "The scanned objects": any(map(_shows_scans, there)),

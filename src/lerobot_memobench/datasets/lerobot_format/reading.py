@@ -29,7 +29,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Malformed, Number, Whole, files_below, first_fault, parsed
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.task import MEMOBENCH, STRICT, World
+from lerobot_memobench.tasks.task import STRICT
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -68,8 +68,8 @@ class EpisodeRecord(BaseModel):
         key_frames: one per checkpoint, -1 if it was not completed.
         fixture_poses: fixture to position and quaternion wxyz.
         digest: sha256 of states, actions and labels; None in datasets of earlier versions.
-        world: world of its scene; None for the package's own.
-        stand_ins: classes whose missing scans this package's objects replaced; None in the package's own world.
+        world: ``libero``; None for the scenes that version 0.2 modelled in code, as for stand_ins.
+        stand_ins: classes whose missing scans this package's objects replaced.
         versions: versions of the packages on which the numbers depend; None if unknown.
     """
 
@@ -88,7 +88,7 @@ class EpisodeRecord(BaseModel):
     scene_hash: str | None = None
     fixture_poses: dict[str, list[Number]] | None = None
     digest: str | None = None
-    world: World | None = None
+    world: str | None = None
     stand_ins: list[str] | None = None
     versions: dict[str, str] | None = None
 
@@ -253,7 +253,7 @@ class RecordedEpisode:
     columns: Columns
     whole: dict[str, Any]
     start: int = 0
-    world: World = MEMOBENCH
+    world: str | None = None
 
 
 def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
@@ -293,7 +293,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
         columns,
         whole,
         place.start,
-        record.world or MEMOBENCH,
+        record.world,
     )
 
 

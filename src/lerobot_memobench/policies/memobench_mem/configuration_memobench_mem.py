@@ -196,7 +196,7 @@ READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
     "a memory": (_remembers, "memory_settings memory_fusion memory_stride"),
     "a memory of objects other than motion": (
         lambda it: it.uses_objects and _remembers(it, lambda one: not one.asks_motion),
-        "memory_phase",
+        "memory_phase memory_repeats",
     ),
     "a memory that learns from texts": (lambda it: it.privileged_memory, "subgoals"),
     "an alignment": (lambda it: it.align != NONE, "align_targets text_encoder"),
@@ -310,6 +310,9 @@ class MemobenchMemConfig(PI05Config):
     memory_phase: bool = False
     """Whether a remembered frame of objects records its phase, prompt or execution. A memory with this information can
     count the steps since the execution began, which strict tasks hide."""
+    memory_repeats: bool = True
+    """Whether a frame equal to the last remembered one is remembered too. If false, the holds of strict tasks do not
+    fill the memory, and do not use up the frames that a chunk reads."""
 
     # -- training
     objective: str = FROM_SIZE
@@ -336,7 +339,7 @@ class MemobenchMemConfig(PI05Config):
     """Actions of a chunk; None: 16 at ``small``, else 50."""
     n_action_steps: int = FROM_SIZE
     """Actions executed of a chunk before the next one is planned; None: 6 at ``small``, else 50. A policy of objects
-    executes the whole chunk if the hand has not moved since the last plan (`rollout.Row.begin_chunk`)."""
+    executes the chunk's following actions if its hand has stalled (`rollout.Row.begin_chunk`)."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
     image_resolution: tuple[int, int] | None = None
     tokenizer_name: str | None = None

@@ -396,6 +396,10 @@ class MemobenchMemPolicy(PI05Policy):
         with self.precision.computing(self._device):
             for row, frame in zip(rows, frames.split(1), strict=True):  # one by one, so that rows are independent
                 held = self.rollout.rows[row]
+                repeated = held.memory is not None and held.stored is not None and torch.equal(frame, held.stored)
+                held.stored = frame
+                if repeated and not self.config.memory_repeats:
+                    continue
                 query = self._query(batch, [row], writes=True)
                 state = memory.init(1) if held.memory is None else held.memory
                 held.memory = memory.observe(state, frame, torch.tensor([held.position], device=self._device), query)

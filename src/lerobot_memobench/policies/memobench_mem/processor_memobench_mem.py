@@ -236,7 +236,14 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             return found
         mechanism, stride = find_mechanism(config.memory), lookup.stride
         settings = read_settings(config.memory, config.memory_settings)
-        recalled = [(episode, np.asarray(mechanism.slots(frame // stride, settings))) for episode, frame in places]
+
+        def slots(episode: int, last: int) -> np.ndarray:
+            if config.memory_repeats:
+                return np.asarray(mechanism.slots(last, settings))
+            written = lookup.changes(episode)
+            return written[mechanism.slots(int(np.searchsorted(written, last, "right")) - 1, settings)]
+
+        recalled = [(episode, slots(episode, frame // stride)) for episode, frame in places]
         ahead = [np.arange(frame // stride + 1, frame // stride + 1 + mechanism.ahead) for _, frame in places]
         memory, numbers = _histories(lookup, recalled, ahead)
         if self.subgoals:

@@ -27,9 +27,11 @@ class Row:
         clock: phase and control step since the phase began. position: control step since the episode began.
         memory: state of the memory mechanism; None before the first frame. intact: its state before a corruption.
         emptied: whether the next frame is the memory's first, after a corruption.
+        stored: the last frame that was written.
         missed: step of the first frame that should have been written and was not observed; None: none.
         queue: remaining planned actions. last: the last action (A,).
-        pose: of the hand when the last chunk was planned (`begin_chunk`).
+        pose: of the hand when the last chunk was planned, and skipped: actions of that chunk that were left out
+            (`begin_chunk`).
         reads: memory reads of the episode's chunks, if they are watched.
     """
 
@@ -39,11 +41,13 @@ class Row:
     memory: Any = None
     intact: Any = None
     emptied: bool = False
+    stored: Tensor | None = None
     missed: int | None = None
     seed: int = 0
     queue: deque[Tensor] = field(default_factory=deque)
     last: Tensor | None = None
     pose: Tensor | None = None
+    skipped: int = 0
     reads: list[Chunk] = field(default_factory=list)
 
     def drop_chunk(self) -> None:
@@ -52,9 +56,11 @@ class Row:
         self.last = self.pose = None
 
     def begin_chunk(self, chunk: Tensor, count: int, state: Tensor | None = None) -> None:
-        """Queue the first ``count`` actions of a chunk (n, A), or all of them if the hand has stalled.
+        """Queue the first ``count`` actions of a chunk (n, A), or the following ones if the hand has stalled.
 
-        A hand that replans the same action after too few steps could stall forever.
+        A hand that replans the same action after too few steps could stall forever. A hand whose pose is the same bit
+        for bit has not stalled: the environment holds it, or it rests. A plan has ``count`` actions in all cases, as
+        the policy declares to the environment, so that plans stay in step with its holds.
 
         Args:
             state: the robot's state (8,), m and rad, to compare with that of the last chunk; None: never stalled.
@@ -64,8 +70,9 @@ class Row:
             rotated = rotation(state[None, 3:HAND_DIM]).flatten() * PER_RADIAN
             pose = torch.cat([state[:3], rotated, state[HAND_DIM:]]).cpu()
         last, self.pose = self.pose, pose
-        stalled = pose is not None and last is not None and bool((pose - last).abs().max() < STALLED)
-        self.queue.extend(chunk if stalled else chunk[:count])
+        moved = 0.0 if pose is None or last is None else float((pose - last).abs().max())
+        self.skipped = min(self.skipped + count, len(chunk) - count) if 0 < moved < STALLED else 0
+        self.queue.extend(chunk[self.skipped : self.skipped + count])
 
     def draw_seed(self, observed: Iterable[Tensor]) -> None:
         """Set the seed of the episode's noise from its first observation and the process's seed."""

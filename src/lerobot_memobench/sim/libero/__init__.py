@@ -1,1 +1,1 @@
-"""The paper's world: LIBERO's scenes, contacts and predicates, built from LIBERO's assets without its simulator."""
+"""Scenes of LIBERO's assets: models, placements and pictures, built without LIBERO's simulator."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import nan, pi
 
-from lerobot_memobench.sim.assets.asset import ALONG_X, ALONG_Y, Grasp, JointRule
+from lerobot_memobench.sim.asset import ALONG_X, ALONG_Y, Grasp, JointRule
 
 Turn = tuple[str, float]
 """Axis (x, y or z) and angle, rad."""

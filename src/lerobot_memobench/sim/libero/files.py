@@ -21,7 +21,7 @@ from huggingface_hub import constants
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, file_hash
-from lerobot_memobench.sim.assets.registry import split_class
+from lerobot_memobench.sim.asset import split_class
 
 ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
 """Environment variable with the folder that contains `stable_scanned_objects`, `scenes` and the other asset folders, or
@@ -31,7 +31,7 @@ SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"
 OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"
 """Environment variable with the user's folder of objects, `<class>/<class>.xml`."""
 OWN_OBJECTS = Path(__file__).parents[1] / "objects"
-"""Folder of this package's objects of the scanned classes, in LIBERO's layout; written by `scripts/objects.py`."""
+"""Folder of this package's objects of the scanned classes, in LIBERO's layout."""
 REPOSITORY = "lerobot/libero-assets"
 """Dataset repository of the Hugging Face hub with LIBERO's assets, which LeRobot's extra `libero` downloads."""
 HUB_CACHE = f"the hub's cache of {REPOSITORY}"

@@ -1,4 +1,4 @@
-"""Cache the visual assets of LIBERO's world in the user's cache folder: welded meshes, textures at one size.
+"""Cache the visual assets of scenes in the user's cache folder: welded meshes, textures at one size.
 
 LIBERO's files have 80 MB and take seconds to read. Each is read once; later processes compile a model with box
 placeholders and draw the cached meshes. Objects with many faces are simplified; kitchen and arm are not.
@@ -70,7 +70,7 @@ def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
     model = spec.compile()
     _set_frames(model, meshes)
     shapes = {name: _shape(arrays) for name, arrays in meshes.items()}
-    return model, build_draw_list(model, meshes=shapes, as_mujoco=True)
+    return model, build_draw_list(model, shapes)
 
 
 # --- cache files ---
@@ -122,7 +122,7 @@ def _extract(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) ->
     frame = np.concatenate([model.mesh_pos[mesh], model.mesh_quat[mesh], model.geom_size[shown[0]]])
     material = model.geom_matid[shown[0]]
     textured = material >= 0 and model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value] >= 0
-    shape = triangles_of(model, int(shown[0]), sharp=True)
+    shape = triangles_of(model, int(shown[0]))
     *vertices, triangles = in_pieces(welded(_thinned(shape) if textured else shape), MAX_PIECE_TRIANGLES)
     return {"frame": frame, "vertices": np.concatenate(vertices, axis=1), "triangles": triangles}
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_name, refusing
-from lerobot_memobench.sim.assets.kitchen import TABLE
+from lerobot_memobench.sim.asset import TABLE, split_class
 from lerobot_memobench.sim.libero import files
 from lerobot_memobench.sim.libero.classes import CLASSES, Turn
 from lerobot_memobench.tasks.task import STRICT
@@ -72,9 +72,9 @@ def class_file(class_name: str, suite: str) -> ClassFile:
     Published tasks use the authors' scan if the user has it; strict tasks use this package's objects for all users.
 
     Raises:
-        MemobenchError: the class is unknown in LIBERO's world, or its files are missing or have unexpected content.
+        MemobenchError: the class is unknown, or its files are missing or have unexpected content.
     """
-    own = {folder.name: folder / f"{folder.name}.xml" for folder in files.OWN_OBJECTS.iterdir()}
+    own = own_objects()
     given = files.user_objects({TABLE, *CLASSES, *own})
     if class_name in CLASSES:
         known = CLASSES[class_name]
@@ -87,8 +87,19 @@ def class_file(class_name: str, suite: str) -> ClassFile:
     if class_name not in own:
         near = nearest(class_name, {*CLASSES, *own, *given})
         add = f"set {files.OBJECTS_VARIABLE} to a folder with {class_name}/{class_name}.xml, see {GUIDE}"
-        raise MemobenchError(f"the world 'libero' has no class {class_name!r} ({near}); to add it, {add}")
+        raise MemobenchError(f"there is no class {class_name!r} ({near}); to add it, {add}")
     return replace(_object_class(own[class_name], SCAN_TURNS), stand_in=suite != STRICT)
+
+
+@cache
+def own_objects() -> dict[str, Path]:
+    """Return class -> MJCF file of this package's objects."""
+    return {folder.name: folder / f"{folder.name}.xml" for folder in files.OWN_OBJECTS.iterdir()}
+
+
+def known_classes() -> list[str]:
+    """Return the classes that scenes may contain, sorted, each family of variants (`split_class`) once."""
+    return sorted({TABLE, *CLASSES, *(split_class(name)[0] for name in own_objects())})
 
 
 @cache

@@ -12,18 +12,17 @@ Episode k of the paper's evaluation has seed 7 + k. All draws of a scene come fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.assets.asset import Asset
-from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_SIZE, TABLE_TOP
+from lerobot_memobench.sim.asset import TABLE, TABLE_SIZE, TABLE_TOP, Asset
 from lerobot_memobench.sim.libero.classes import Turn, parts_of
 from lerobot_memobench.sim.libero.mjcf import ClassFile, class_file
-from lerobot_memobench.sim.placement import Placement, Pose, placing_atoms, write
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
@@ -39,9 +38,36 @@ Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]
 """x1, y1, x2, y2, m."""
 CENTRE_ONLY: Rectangle = (0.0, 0.0, 0.0, 0.0)
+Pose = NDArray[np.float64]
+"""Position and quaternion wxyz, (7,)."""
 
 
-class LiberoPlacer:
+@dataclass(frozen=True)
+class Placement:
+    """Initial poses and joint positions."""
+
+    poses: dict[str, Pose]
+    """World pose of each fixture and object."""
+    joints: dict[str, float]
+    """Position of each articulated joint, m or rad."""
+
+
+def placing_atoms(task: Task, assets: Iterable[str]) -> dict[str, Atom]:
+    """Return the placing `init` atom of each instance, in the order of `init`.
+
+    Raises:
+        MemobenchError: an instance has no placing atom.
+    """
+    places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
+    missing = [name for name in assets if name not in places]
+    if missing:
+        raise MemobenchError(
+            f"task {task.name} has no start for {missing[0]!r}; add (On {missing[0]} <region>) to its :init"
+        )
+    return places
+
+
+class Placer:
     """Place fixtures and objects of one simulation.
 
     Args:
@@ -112,7 +138,7 @@ class LiberoPlacer:
             if atom.args[0] in (instance, f"{instance}_{region}") and atom.predicate in part.ranges
         }
         if not found:
-            raise MemobenchError(f"task {self._task.name}: {atom} of :init applies to no joint in the world 'libero'")
+            raise MemobenchError(f"task {self._task.name}: {atom} of :init applies to no joint")
         return found
 
     def _centre_fixtures(self, joints: dict[str, float]) -> None:
@@ -151,6 +177,10 @@ class LiberoPlacer:
         """
         name, where = atom.args
         if where in self._assets:
+            if where not in poses:
+                raise MemobenchError(
+                    f"task {self._task.name}: {where!r} has no place yet; put it before {name!r} in :init"
+                )
             return [CENTRE_ONLY], poses[where][:3] + np.array([0.0, 0.0, self._files[where].top + OBJECT_DROP_HEIGHT])
         region = self._task.regions[where]
         if region.target == TABLE:
@@ -175,6 +205,21 @@ def is_clear_of(thing: ClassFile, place: tuple[float, float, float], other: Clas
     """Return whether an object's disc is clear of another's, or far enough above it."""
     distance = np.hypot(place[0] - pose[0], place[1] - pose[1])
     return bool(distance > other.radius + thing.radius or place[2] - pose[2] > other.top - thing.bottom)
+
+
+def write(placement: Placement, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]) -> None:
+    """Write a placement into a model (fixtures) and data (objects, joints); keep velocities."""
+    for name, pose in placement.poses.items():
+        body = model.body(name)
+        if assets[name].kind == "fixture":
+            model.body_pos[body.id], model.body_quat[body.id] = pose[:3], pose[3:]
+        else:
+            address = int(model.joint(f"{name}_joint0").qposadr[0])
+            data.qpos[address : address + 7] = pose
+    for joint, q in placement.joints.items():
+        data.qpos[int(model.joint(joint).qposadr[0])] = q
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
 
 
 # --- turns ---

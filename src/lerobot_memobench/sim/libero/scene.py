@@ -1,4 +1,4 @@
-"""Build a task's scene in LIBERO's world: kitchen, arm of robosuite 1.4.0, objects, fixtures.
+"""Build a task's scene of LIBERO's assets: kitchen, arm of robosuite 1.4.0, objects, fixtures.
 
 The simulated model has no visual geoms; it moves bit-equally to the complete model and is built in some 25 ms. Visual
 assets (80 MB) are loaded for the first image (`looks`).
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import xml.etree.ElementTree as ET
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from functools import cache
@@ -20,23 +21,27 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.assets.asset import (
+from lerobot_memobench.sim.asset import (
     ALONG_X,
     ALONG_Y,
+    COLLISION_GROUP,
+    SITE_GROUP,
+    TABLE,
+    TABLE_SIZE,
+    TABLE_TOP,
     Articulation,
     Asset,
     Grasp,
     Handle,
     JointRule,
     Quaternion,
+    split_class,
 )
-from lerobot_memobench.sim.assets.builder import COLLISION_GROUP, SITE_GROUP, VISUAL_GROUP
-from lerobot_memobench.sim.assets.kitchen import TABLE, TABLE_TOP
 from lerobot_memobench.sim.detents import add_detents
 from lerobot_memobench.sim.libero import mjcf
 from lerobot_memobench.sim.libero.classes import CLASSES, LiberoClass, Part, parts_of
 from lerobot_memobench.sim.libero.looks import drawing_model
-from lerobot_memobench.sim.raster.drawlist import DrawList
+from lerobot_memobench.sim.raster.drawlist import VISUAL_GROUP, DrawList
 from lerobot_memobench.sim.scene import (
     AGENTVIEW,
     AGENTVIEW_POSITION,
@@ -48,8 +53,6 @@ from lerobot_memobench.sim.scene import (
 from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.task import STRICT, Task
 
-TABLE_HALF = (0.5, 0.6, 0.025)
-"""Half size of the table's board, m."""
 ZONE_HALF_HEIGHT = 0.007
 """Half height of the site of a table region, m."""
 FLOOR_TEXTURE, WALL_TEXTURE = "textures/gray_ceramic_tile.png", "textures/yellow_linen_wall_texture.png"
@@ -66,15 +69,31 @@ GRASP_DEPTH = 0.032
 """Depth of a grasp below an object's top, m; fingers reach 4 cm below the palm."""
 MAX_GRASP_WIDTH = 0.068
 """Largest width of a grasp, m."""
+CACHED_SCENES = 4
+"""Compiled scenes cached per process, some MB each; evaluation runs tasks one after another."""
 UNKNOWN_CLASS = LiberoClass("")
 """A scan; only its bounding box is known."""
+
+
+_scenes: OrderedDict[tuple[str, ...], Scene] = OrderedDict()
+
+
+def get_scene(task: Task) -> Scene:
+    """Return the compiled scene of a task, cached per process; see `build_scene`."""
+    key = scene_key(task)
+    if key not in _scenes:
+        _scenes[key] = build_scene(task)
+    _scenes.move_to_end(key)
+    while len(_scenes) > CACHED_SCENES:
+        _scenes.popitem(last=False)
+    return _scenes[key]
 
 
 def build_scene(task: Task) -> Scene:
     """Return the compiled scene of a task.
 
     Raises:
-        MemobenchError: LIBERO's assets are missing or have unexpected content, or the world lacks a class of the task.
+        MemobenchError: LIBERO's assets are missing or have unexpected content, or a class of the task is unknown.
     """
     with _naming(task):
         model = scene_spec(task).compile()
@@ -90,7 +109,7 @@ def build_scene(task: Task) -> Scene:
         with _naming(task):
             return drawing_model(scene_spec(task, visuals=True))
 
-    return Scene(scene_key(task), model, assets, tuple(sorted(set(missing))), drawing, COLLISION_GROUP)
+    return Scene(scene_key(task), model, assets, tuple(sorted(set(missing))), drawing)
 
 
 @contextlib.contextmanager
@@ -98,7 +117,7 @@ def _naming(task: Task) -> Iterator[None]:
     try:
         yield
     except ValueError as error:  # MuJoCo cannot read a file
-        raise MemobenchError(f"the scene of task {task.name} in the world 'libero' cannot be built: {error}") from None
+        raise MemobenchError(f"the scene of task {task.name} cannot be built: {error}") from None
 
 
 def instances(task: Task) -> Iterator[tuple[str, str]]:
@@ -190,14 +209,14 @@ def _kitchen(arena: ET.Element, task: Task) -> Iterator[ET.Element]:
 
 def _lay_out(table: ET.Element) -> None:
     """Set sizes and positions of the table's board and legs."""
-    x, y, half = TABLE_HALF
+    x, y, half = (side / 2 for side in TABLE_SIZE)
     table.set("pos", mjcf.format_numbers((0, 0, TABLE_TOP - half)))
     leg = (TABLE_TOP - half) / 2
     corners = iter(((1, 1), (-1, 1), (-1, -1), (1, -1)))
     for part in table:
         name = part.get("name", "")
         if name in ("table_collision", "table_visual"):
-            part.set("size", mjcf.format_numbers(TABLE_HALF))
+            part.set("size", mjcf.format_numbers((x, y, half)))
         elif name == "table_top":
             part.set("pos", mjcf.format_numbers((0, 0, half)))
         elif name.startswith("table_leg"):
@@ -246,11 +265,12 @@ def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
 
 
 def _strip(world: ET.Element, assets: ET.Element) -> None:
-    """Remove visual geoms, materials and lights."""
+    """Remove visual geoms, materials, lights and colours; MuJoCo's rays pass through transparent geoms."""
     _remove(world, lambda one: one.tag == "light")
     _remove(world, mjcf.is_visual)
     for geom in world.iter("geom"):
-        geom.attrib.pop("material", None)
+        for name in ("material", "rgba"):
+            geom.attrib.pop(name, None)
     used = {geom.get("mesh") for geom in world.iter("geom")}
     _remove(assets, lambda one: one.tag != "mesh" or one.get("name") not in used)
 
@@ -259,6 +279,18 @@ def _remove(root: ET.Element, unwanted: Callable[[ET.Element], bool]) -> None:
     for parent in list(root.iter()):
         for child in [child for child in parent if unwanted(child)]:
             parent.remove(child)
+
+
+def standing_heights() -> dict[str, float]:
+    """Return class -> height of its origin above its support, m; variants by the name of their family."""
+    root = ET.fromstring("<mujoco><asset/><worldbody/></mujoco>")
+    classes = {split_class(name)[0]: name for name in (*CLASSES, *mjcf.own_objects())}
+    for family, name in classes.items():
+        root[1].append(mjcf.instance(name, family, mjcf.class_file(name, STRICT)))
+    _strip(root[1], root[0])
+    model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
+    upright = {family: Y_UP if CLASSES.get(name, UNKNOWN_CLASS).y_up else None for family, name in classes.items()}
+    return {family: -_bounds(model, model.body(family).id, turn)[0][2] for family, turn in upright.items()}
 
 
 Triple = tuple[float, float, float]
@@ -288,8 +320,6 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
         round=known.round,
         upright=upright,
         glow=(f"{name}_{GLOW}",) if class_name in GLOW_SITES else (),
-        glow_on=GLOW_ON,
-        glow_off=GLOW_OFF,
     )
 
 

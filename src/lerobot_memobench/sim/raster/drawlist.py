@@ -22,7 +22,7 @@ TABLE_LINES = 5
 """Lines of four numbers per row of the table: pose (3), colour, material."""
 
 MAX_PIECE_TRIANGLES = 2000
-"""Largest number of mesh triangles per row in scenes drawn as by MuJoCo; rows outside the image are skipped."""
+"""Largest number of mesh triangles per row; rows outside the image are skipped."""
 
 _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 """A geom of this colour takes its material's colour, as in MuJoCo."""
@@ -47,22 +47,18 @@ class DrawList:
         triangles: (M, 3) vertex indices, counter-clockwise from outside.
         geoms: (rows,) geom ids.
         still: number of static rows (no joint between them and the world), which come first.
-        casting: (rows,) whether a row casts shadows.
         layers: (L, LAYER_SIZE, LAYER_SIZE, 3) uint8 textures, the first one white.
         materials: (rows, 4) specular, shininess exponent, emission, layer.
         mirror: reflecting geom, if any.
-        as_mujoco: see `build_draw_list`.
     """
 
     vertices: NDArray[np.void]
     triangles: NDArray[np.int32]
     geoms: NDArray[np.int64]
     still: int
-    casting: NDArray[np.bool_]
     layers: NDArray[np.uint8]
     materials: Floats
     mirror: Mirror | None = None
-    as_mujoco: bool = False
 
     def fill(self, table: Floats, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Write poses, colours and materials of the present state into a table (rows, TABLE_LINES, 4)."""
@@ -72,20 +68,12 @@ class DrawList:
         table[:, 4] = self.materials
 
 
-def build_draw_list(
-    model: mujoco.MjModel,
-    shadowless: tuple[str, ...] = (),
-    meshes: Mapping[str, Triangles] | None = None,
-    as_mujoco: bool = False,
-) -> DrawList:
-    """Collect the visual geoms of a model.
+def build_draw_list(model: mujoco.MjModel, meshes: Mapping[str, Triangles] | None = None) -> DrawList:
+    """Collect the visual geoms of a model, with sharp mesh edges as MuJoCo's renderer.
 
     Args:
         model: compiled scene.
-        shadowless: names of bodies that cast no shadow.
-        meshes: replacements of the scene's meshes by name; see `shapes.mesh_in_file`.
-        as_mujoco: whether to imitate MuJoCo's renderer: sharp mesh edges, and light clipped to 1 before it is
-            multiplied by the texture.
+        meshes: replacements of the scene's meshes by name.
 
     Raises:
         MemobenchError: a visual geom has an unsupported type.
@@ -94,7 +82,7 @@ def build_draw_list(
     moves = model.body_weldid[model.geom_bodyid[visual]] != 0
     layers, layer_of = layers_of(model)
     ids = [*visual[~moves].tolist(), *visual[moves].tolist()]
-    parts = [(geom, *part) for geom in ids for part in _textured(model, geom, meshes, as_mujoco, layer_of)]
+    parts = [(geom, *part) for geom in ids for part in _textured(model, geom, meshes, layer_of)]
     ends = np.cumsum([0, *(len(shape[0]) for _, _, shape in parts)]).tolist()
     vertices = np.empty(ends[-1], dtype=VERTEX)
     for row, (_, _, (positions, normals, uv, _)) in enumerate(parts):
@@ -109,18 +97,10 @@ def build_draw_list(
         np.concatenate([np.zeros((0, 3), np.int32), *indices]).astype(np.int32),
         rows,
         int((model.body_weldid[bodies] == 0).sum()),
-        ~np.isin(bodies, _bodies(model, shadowless)),
         layers,
         np.array(materials, dtype=np.float32).reshape(-1, 4),
         find_mirror(model, rows),
-        as_mujoco,
     )
-
-
-def _bodies(model: mujoco.MjModel, names: tuple[str, ...]) -> list[int]:
-    """Return the ids of the named bodies that exist in the model."""
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names]
-    return [body for body in ids if body >= 0]
 
 
 def colours(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> Floats:
@@ -144,7 +124,6 @@ def _textured(
     model: mujoco.MjModel,
     geom: int,
     meshes: Mapping[str, Triangles] | None,
-    as_mujoco: bool,
     layer_of: dict[int, tuple[int, ...]],
 ) -> Iterator[tuple[int, Triangles]]:
     """Yield texture layers of a geom and their triangles with texture coordinates."""
@@ -155,13 +134,10 @@ def _textured(
     is_mesh = kind == mujoco.mjtGeom.mjGEOM_MESH.value
     # MuJoCo computes light at vertices and subdivides boxes, which is visible with textures and spots only.
     fine = kind == mujoco.mjtGeom.mjGEOM_BOX.value and (texture in layer_of or _has_spots(model))
-    shape = box_cells(model, geom) if fine else triangles_of(model, geom, meshes, as_mujoco)
+    shape = box_cells(model, geom) if fine else triangles_of(model, geom, meshes)
     mapped = is_mesh and (bool(shape[2].any()) or model.mesh_texcoordadr[mesh] >= 0)
     if texture not in layer_of or mapped:
-        yield from (
-            (layers[0], piece)
-            for piece in (pieces_of(shape, MAX_PIECE_TRIANGLES) if is_mesh and as_mujoco else (shape,))
-        )
+        yield from ((layers[0], piece) for piece in (pieces_of(shape, MAX_PIECE_TRIANGLES) if is_mesh else (shape,)))
     elif len(layers) == 1:
         yield layers[0], flat_coordinates(model, geom, shape)
     else:

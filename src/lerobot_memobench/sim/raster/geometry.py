@@ -1,4 +1,4 @@
-"""Rasterize triangles: cull rows, find the nearest triangle of each pixel, and draw shadow-map depths."""
+"""Rasterize triangles: cull rows, and find the nearest triangle of each pixel."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from lerobot_memobench.sim.raster.compiled import compiled
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int32]
-
-TILE = 16
-"""Side of a shadow-map tile, texels; changes by moving casters are tracked per tile."""
 
 LEVEL_EDGE_SLOPE = 1e-9
 """Relative slope below which an edge counts as horizontal."""
@@ -36,7 +33,7 @@ class Shapes(NamedTuple):
 
 
 class Clip(NamedTuple):
-    """Vertices in the clip space of a camera or light, (N,) each; ``visible``: (rows,)."""
+    """Vertices in the clip space of a camera, (N,) each; ``visible``: (rows,)."""
 
     x: Floats
     y: Floats
@@ -225,95 +222,3 @@ def draw_triangles(
                     if depths[before + np.uint64(step)] < inverse <= nearest and inverse > farthest:
                         depths[before + np.uint64(step)] = inverse
                         shown[before + np.uint64(step)] = t
-
-
-@compiled
-def draw_depths(shapes: Any, rows: Any, table: Any, matrix: Any, clip: Any, shadow_map: Any, touched: Any) -> None:
-    """Update each texel with the depth of the surface nearest to a directional light.
-
-    Depths are biased away from the light by more than a texel's slope to avoid self-shadowing.
-
-    Args:
-        shapes: `Shapes`.
-        rows: indices of rows.
-        table: poses, (all rows, TABLE_LINES, 4).
-        matrix: from the world to the light's clip space, (4, 4).
-        clip: `Clip`, overwritten; ``w`` holds depths.
-        shadow_map: (size, size), from 0 to 1, updated.
-        touched: (tiles, tiles), set to 1 for changed tiles.
-    """
-    size = shadow_map.shape[0]
-    half = 0.5 * size
-    depths = shadow_map.reshape(-1)
-    m = np.empty((3, 4), np.float32)
-    for row in rows:
-        for k in range(3):
-            for j in range(4):
-                total = matrix[k, 0] * table[row, 0, j] + matrix[k, 1] * table[row, 1, j]
-                total += matrix[k, 2] * table[row, 2, j]
-                m[k, j] = total + matrix[k, 3] if j == 3 else total
-        for i in range(shapes.first_vertex[row], shapes.first_vertex[row + 1]):
-            x, y, z = shapes.position[i, 0], shapes.position[i, 1], shapes.position[i, 2]
-            clip.x[i] = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-            clip.y[i] = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-            clip.w[i] = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        for t in range(shapes.first_triangle[row], shapes.first_triangle[row + 1]):
-            i, j, k = shapes.triangles[t, 0], shapes.triangles[t, 1], shapes.triangles[t, 2]
-            x0, y0 = (clip.x[i] + 1.0) * half, (clip.y[i] + 1.0) * half
-            x1, y1 = (clip.x[j] + 1.0) * half, (clip.y[j] + 1.0) * half
-            x2, y2 = (clip.x[k] + 1.0) * half, (clip.y[k] + 1.0) * half
-            area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
-            if area <= 1e-9:
-                continue
-            low, high = min(x0, x1, x2) - 0.5, max(x0, x1, x2) - 0.5
-            if high < 0.0 or low > size - 1:
-                continue
-            left, right = math.ceil(max(low, 0.0)), int(min(high, size - 1.0))
-            low, high = min(y0, y1, y2) - 0.5, max(y0, y1, y2) - 0.5
-            if high < 0.0 or low > size - 1:
-                continue
-            top, bottom = math.ceil(max(low, 0.0)), int(min(high, size - 1.0))
-            if left > right or top > bottom:
-                continue
-            # A look-up reads a texel and its successors.
-            for tile_y in range(max(top - 1, 0) // TILE, bottom // TILE + 1):
-                for tile_x in range(max(left - 1, 0) // TILE, right // TILE + 1):
-                    touched[tile_y, tile_x] = 1
-            a0, b0, a1, b1, a2, b2 = y1 - y2, x2 - x1, y2 - y0, x0 - x2, y0 - y1, x1 - x0
-            c0 = x1 * y2 - x2 * y1 + 0.5 * (a0 + b0)
-            c1 = x2 * y0 - x0 * y2 + 0.5 * (a1 + b1)
-            c2 = x0 * y1 - x1 * y0 + 0.5 * (a2 + b2)
-            edge0, edge1, edge2 = _bounds(a0, b0, c0), _bounds(a1, b1, c1), _bounds(a2, b2, c2)
-            scale = 0.0
-            across, down, at_origin, slope = 0.0, 0.0, 0.0, np.float32(0)
-            for y in range(top, bottom + 1):
-                first, last = _span(left, right, y, edge0, edge1, edge2)
-                if first > last:
-                    continue
-                if scale == 0.0:
-                    scale = 1.0 / area
-                    d0, d1, d2 = 0.5 * clip.w[i] + 0.5, 0.5 * clip.w[j] + 0.5, 0.5 * clip.w[k] + 0.5
-                    across = (a0 * d0 + a1 * d1 + a2 * d2) * scale
-                    down = (b0 * d0 + b1 * d1 + b2 * d2) * scale
-                    at_origin = (c0 * d0 + c1 * d1 + c2 * d2) * scale
-                    at_origin += 2.0 * max(abs(across), abs(down)) + 4.0 / 65536.0
-                    slope = np.float32(across)
-                depth = np.float32(across * first + (down * y + at_origin))
-                before = np.uint64(y * size + first)  # numba looks whether other indices are negative
-                for step in range(last + 1 - first):
-                    here = min(max(depth + slope * np.float32(step), np.float32(0)), np.float32(1))
-                    depths[before + np.uint64(step)] = min(depths[before + np.uint64(step)], here)
-
-
-@compiled
-def restore_depths(shadow_map: Any, still: Any, touched: Any) -> None:
-    """Restore the depths of static rows in the touched tiles."""
-    size = shadow_map.shape[0]
-    for tile_y in range(touched.shape[0]):
-        for tile_x in range(touched.shape[1]):
-            if touched[tile_y, tile_x]:
-                touched[tile_y, tile_x] = 0
-                end = min((tile_x + 1) * TILE, size)
-                for y in range(tile_y * TILE, min((tile_y + 1) * TILE, size)):
-                    for x in range(tile_x * TILE, end):
-                        shadow_map[y, x] = still[y, x]

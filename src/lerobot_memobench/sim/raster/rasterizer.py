@@ -1,8 +1,8 @@
 """Draw a `DrawList` on the CPU with deferred shading: find the visible triangle of each pixel, then shade it once.
 
 The lighting model is MuJoCo's: headlight, ambient light, directional lights and spots, Blinn's specular term and
-modulating textures. The first shadow-casting directional light has soft-edged shadows. For a static camera the image of
-static rows is cached; only moving rows and changed shadows are drawn.
+modulating textures; light is clipped to 1 before it is multiplied by the texture. Shadows are not drawn, because
+LIBERO's lights cast none. For a static camera the image of static rows is cached; only moving rows are drawn.
 """
 
 from __future__ import annotations
@@ -10,39 +10,20 @@ from __future__ import annotations
 import copy
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.raster.compiled import compiled
 from lerobot_memobench.sim.raster.drawlist import DrawList, Floats, Image, Mirror
-from lerobot_memobench.sim.raster.geometry import (
-    TILE,
-    Shapes,
-    Target,
-    clip_space,
-    draw_depths,
-    draw_triangles,
-    restore_depths,
-)
+from lerobot_memobench.sim.raster.geometry import Shapes, Target, clip_space, draw_triangles
 from lerobot_memobench.sim.raster.highlights import Highlight, fill_table, table_of, with_discs
-from lerobot_memobench.sim.raster.shading import (
-    BACKGROUND,
-    PICTURE,
-    TRANSLUCENT,
-    Surfaces,
-    scratch,
-    shade,
-)
+from lerobot_memobench.sim.raster.shading import PICTURE, TRANSLUCENT, Surfaces, scratch, shade
 from lerobot_memobench.sim.raster.textures import LAYER_SIZE, levels_of
 from lerobot_memobench.sim.raster.view import Lights, SceneLights, camera_matrix, clipping, cropped, mirrored
 
-BACKGROUND_CHANNELS = 9
-"""Values per background pixel: unshadowed colour (3), colour removed by shadow (3), position in the shadow map (3)."""
 MAX_COORDINATE = 1e6
 """Largest coordinate in a scene, m."""
 OPAQUE_ALPHA = 0.995
@@ -53,21 +34,11 @@ MAX_STILL_STATES = 4
 
 @dataclass(frozen=True)
 class Background:
-    """A camera's image of the static rows: colours, depths, and the shadow-dependent parts of colours."""
+    """A camera's image of the static rows: colours, depths and visible triangles."""
 
     image: Image
     depth: Floats
     triangle: NDArray[np.int32]
-    kept: Floats
-    tile: NDArray[np.int32]
-
-
-@dataclass(frozen=True)
-class StillState:
-    """One state of the static rows: shadow map, and backgrounds by camera matrix."""
-
-    shadow_map: Floats
-    backgrounds: dict[bytes, Background] = field(default_factory=dict)
 
 
 class Rasterizer:
@@ -77,12 +48,11 @@ class Rasterizer:
         model: model with lights and clipping planes.
         draw_list: triangles to draw.
         width, height: size of the frames, pixels.
-        shadow_size: side of the shadow map, pixels; 0 disables shadows.
     """
 
-    def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int, shadow_size: int) -> None:
+    def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int) -> None:
         self._list, self._width, self._height = draw_list, width, height
-        self._scene_lights = SceneLights(model, shadow_size > 0 and bool(draw_list.casting.any()), draw_list.as_mujoco)
+        self._scene_lights = SceneLights(model)
         rows = len(draw_list.geoms)
         self._table = table_of(draw_list)
         vertices, triangles = with_discs(draw_list)
@@ -98,17 +68,8 @@ class Rasterizer:
         self._clip = clip_space(len(vertices), len(self._table))
         self._work = scratch(len(vertices), len(triangles), width * height)
         self._target = Target(np.zeros((height, width), np.float32), np.zeros((height, width), np.int32))
-        still = np.arange(rows) < draw_list.still
-        self._still_casters = np.flatnonzero(still & draw_list.casting).astype(np.int32)
-        self._moving_casters = np.flatnonzero(~still & draw_list.casting).astype(np.int32)
-        size = shadow_size if self._scene_lights.caster is not None else 1
-        self._tiles = -(-size // TILE)
-        self._shadow_map = np.ones((size, size), np.float32)
-        # One extra entry for pixels that no shadow can change.
-        self._touched = np.zeros(self._tiles**2 + 1, np.uint8)
-        self._still: OrderedDict[bytes, StillState] = OrderedDict()
+        self._still: OrderedDict[bytes, dict[bytes, Background]] = OrderedDict()
         self._upper = _upper_side(draw_list, len(triangles))
-        self._shown: bytes | None = None
 
     # --- draw -----------------------------------------------------------------------------------------------
 
@@ -124,25 +85,15 @@ class Rasterizer:
             highlights: discs, drawn in this order.
         """
         view = self._view(model, data, camera, highlights)
-        still = self._bring_shadows_up_to_date(view)
         rows = self._rows
         opaque = self._table[: len(rows), 3, 3] >= OPAQUE_ALPHA
         moving = rows >= self._list.still
         if model.body_weldid[model.cam_bodyid[view.camera]] == 0:
-            background = self._background(still, view, rows[opaque & ~moving])
+            background = self._background(view, rows[opaque & ~moving])
             image = background.image.copy()
             self._target.depth[:] = background.depth
             self._target.triangle[:] = -1
             view.draw_triangles(rows[opaque & moving])
-            if self._scene_lights.caster is not None:
-                light_background(
-                    background.kept,
-                    background.tile,
-                    self._touched,
-                    self._target.triangle.reshape(-1),
-                    self._shadow_map,
-                    image.reshape(-1, 3),
-                )
             behind = background.triangle
         else:
             image = np.zeros((self._height, self._width, 3), np.uint8)
@@ -178,7 +129,7 @@ class Rasterizer:
         fill_table(self._table, self._list, model, data, highlights)
         view = View(self, model, data, camera)
         rows = len(self._rows) + len(highlights)
-        for numbers in (self._table[:rows, :3], view.matrix, view.light_matrix):
+        for numbers in (self._table[:rows, :3], view.matrix):
             if numbers.size and not float(np.abs(numbers).max()) < MAX_COORDINATE:
                 raise MemobenchError(
                     f"a drawn body, camera or highlight is not within {MAX_COORDINATE:g} m; expected a finite state"
@@ -189,63 +140,27 @@ class Rasterizer:
         self._target.depth[:] = 0.0
         self._target.triangle[:] = -1
 
-    # --- static rows and their shadows ----------------------------------------------------------------------
+    # --- static rows ----------------------------------------------------------------------------------------
 
-    def _bring_shadows_up_to_date(self, view: View) -> StillState:
-        """Draw the shadow map of the present state; return the cached images of its static rows."""
-        scene = self._table[: self._list.still].tobytes() + view.lighting
-        still = self._still.get(scene)
-        if still is None:
-            still = self._still[scene] = StillState(np.ones_like(self._shadow_map))
-            if self._scene_lights.caster is not None:
-                self._draw_depths(view, self._still_casters, still.shadow_map, np.zeros_like(self._touched))
-            if len(self._still) > MAX_STILL_STATES:
-                self._still.popitem(last=False)
-        self._still.move_to_end(scene)
-        if self._scene_lights.caster is not None:
-            shown = scene + self._table[: len(self._list.geoms), :3].tobytes()
-            if shown != self._shown:
-                self._shadow_map_of(still, same=self._shown is not None and self._shown.startswith(scene))
-                self._draw_depths(view, self._moving_casters, self._shadow_map, self._touched)
-                self._shown = shown
-        return still
+    def _background(self, view: View, rows: NDArray[np.int32]) -> Background:
+        """Return a static camera's image of the static rows, cached by their state and the camera."""
+        state, camera = self._table[: self._list.still].tobytes() + view.lighting, view.matrix.tobytes()
+        cameras = self._still.setdefault(state, {})
+        self._still.move_to_end(state)
+        if len(self._still) > MAX_STILL_STATES:
+            self._still.popitem(last=False)
+        if camera not in cameras:
+            if len(cameras) >= MAX_STILL_STATES:  # a camera that is moved for each frame
+                cameras.pop(next(iter(cameras)))
+            cameras[camera] = self._draw_background(view, rows)
+        return cameras[camera]
 
-    def _shadow_map_of(self, still: StillState, same: bool) -> None:
-        if same:
-            restore_depths(self._shadow_map, still.shadow_map, self._tile_square(self._touched))
-        else:
-            self._shadow_map[:] = still.shadow_map
-            self._touched[:] = 0
-
-    def _tile_square(self, touched: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return touched[:-1].reshape(self._tiles, self._tiles)
-
-    def _draw_depths(self, view: View, rows: NDArray[np.int32], shadow_map: Floats, touched: NDArray[np.uint8]) -> None:
-        draw_depths(
-            self._shapes, rows, self._table, view.light_matrix, self._clip, shadow_map, self._tile_square(touched)
-        )
-
-    def _background(self, still: StillState, view: View, rows: NDArray[np.int32]) -> Background:
-        """Return a static camera's image of the static rows."""
-        key = view.matrix.tobytes()
-        if key not in still.backgrounds:
-            if len(still.backgrounds) >= MAX_STILL_STATES:  # a camera that is moved for each frame
-                still.backgrounds.pop(next(iter(still.backgrounds)))
-            still.backgrounds[key] = self._draw_background(still, view, rows)
-        return still.backgrounds[key]
-
-    def _draw_background(self, still: StillState, view: View, rows: NDArray[np.int32]) -> Background:
-        pixels = self._width * self._height
+    def _draw_background(self, view: View, rows: NDArray[np.int32]) -> Background:
         image = np.zeros((self._height, self._width, 3), np.uint8)
-        kept = np.zeros((BACKGROUND_CHANNELS, pixels), np.float32)
-        tile = np.zeros(pixels, np.int32)
         self._clear()
         view.draw_triangles(rows)
-        view.shade(BACKGROUND, image, kept)
-        shadow_tiles(kept, still.shadow_map.shape[0], self._tiles, tile)
-        none, everywhere = np.full(pixels, -1, np.int32), np.ones_like(self._touched)
-        light_background(kept, tile, everywhere, none, still.shadow_map, image.reshape(-1, 3))
-        return Background(image, self._target.depth.copy(), self._target.triangle.copy(), kept, tile)
+        view.shade(PICTURE, image)
+        return Background(image, self._target.depth.copy(), self._target.triangle.copy())
 
     # --- reflections ----------------------------------------------------------------------------------------
 
@@ -305,7 +220,6 @@ class View:
         self.target = of._target
         self._near, self._far = (np.float32(distance) for distance in clipping(model))
         self._lights: Lights = of._scene_lights.update(data, self.camera)
-        self.light_matrix = of._scene_lights.light_matrix(model, data)
         # The headlight moves with the camera, whose matrix is a separate key.
         self.lighting = self._lights.to[1:].tobytes() + self._lights.axis[1:].tobytes()
 
@@ -329,14 +243,13 @@ class View:
         of = self._of
         draw_triangles(of._shapes, rows, of._table, self.matrix, self._near, self._far, of._clip, self.target)
 
-    def shade(self, mode: int, image: Image, kept: Floats | None = None) -> None:
+    def shade(self, mode: int, image: Image) -> None:
         """Shade the pixels with a visible triangle; see `shading.shade`."""
         of = self._of
-        kept = np.zeros((BACKGROUND_CHANNELS, 0), np.float32) if kept is None else kept
         shade(
-            of._shapes, of._surfaces, of._table, self._lights, self.eye, self.light_matrix, of._clip, of._shadow_map,
-            self.target, of._work, mode, image.reshape(-1, 3), kept,
-        )  # fmt: skip
+            *(of._shapes, of._surfaces, of._table, self._lights, self.eye, of._clip, self.target, of._work, mode),
+            image.reshape(-1, 3),
+        )
 
 
 def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
@@ -358,61 +271,3 @@ def _shapes(vertices: NDArray[np.void], triangles: NDArray[np.int32], rows: int)
     low, high = (f.reduceat(positions, first_vertex[:-1], axis=0) for f in (np.minimum, np.maximum))
     centre, half = 0.5 * (low + high), 0.5 * (high - low) + np.float32(1e-6)
     return Shapes(positions, first_vertex, triangles, first_triangle, centre, half)
-
-
-# --- background: only shadows of moving rows change the cached image of static rows ---
-
-_0, _1, _HALF, _255 = np.float32(0), np.float32(1), np.float32(0.5), np.float32(255)
-
-
-@compiled
-def shadow_tiles(kept: Any, size: Any, tiles: Any, tile: Any) -> None:
-    """Compute the shadow-map tile of each background pixel.
-
-    Args:
-        kept: (BACKGROUND_CHANNELS, pixels).
-        size: side of the shadow map, texels.
-        tiles: tiles per side; pixels that no shadow can change get the index after the last tile.
-        tile: (pixels,), overwritten.
-    """
-    wide, last = np.float32(size), np.float32(size - 2)
-    for p in range(tile.size):
-        if kept[3, p] > _0 or kept[4, p] > _0 or kept[5, p] > _0:
-            left = int(min(max(kept[6, p] * wide - _HALF, _0), last))
-            top = int(min(max(kept[7, p] * wide - _HALF, _0), last))
-            tile[p] = top // TILE * tiles + left // TILE
-        else:
-            tile[p] = tiles * tiles
-
-
-@compiled
-def light_background(kept: Any, tile: Any, touched: Any, triangle: Any, shadow_map: Any, image: Any) -> None:
-    """Recolour the background pixels whose shadow-map tile was touched.
-
-    Args:
-        kept: (BACKGROUND_CHANNELS, pixels).
-        tile: see `shadow_tiles`.
-        touched: flag per tile, and one more for pixels that no shadow can change.
-        triangle: (pixels,), −1 where the background is visible.
-        shadow_map: (size, size).
-        image: (pixels, 3) uint8, updated.
-    """
-    size = shadow_map.shape[0]
-    wide, last = np.float32(size), np.float32(size - 2)
-    for k in range(tile.size):
-        if not touched[tile[k]] or triangle[k] >= 0:
-            continue
-        a = min(max(kept[6, k] * wide - _HALF, _0), last)
-        b = min(max(kept[7, k] * wide - _HALF, _0), last)
-        left, top = np.int32(a), np.int32(b)
-        across, down, depth = a - np.float32(left), b - np.float32(top), kept[8, k]
-        p = _1 if depth <= shadow_map[top, left] else _0
-        q = _1 if depth <= shadow_map[top, left + 1] else _0
-        r = _1 if depth <= shadow_map[top + 1, left] else _0
-        s = _1 if depth <= shadow_map[top + 1, left + 1] else _0
-        upper, lower = p + across * (q - p), r + across * (s - r)
-        u, v = kept[6, k], kept[7, k]
-        lit = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)
-        for c in range(3):
-            colour = kept[c, k] + lit * kept[3 + c, k]
-            image[k, c] = np.uint8(min(max(colour, _0), _255) + _HALF)

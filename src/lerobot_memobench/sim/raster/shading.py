@@ -1,4 +1,4 @@
-"""Shade pixels: compute light at vertices, and textures and shadows per pixel.
+"""Shade pixels: compute light at vertices, and textures per pixel.
 
 Pixels are shaded in batches with vectorised loops. All rows of `BATCH` numbers lie in one array, so that the compiler
 can prove that they do not overlap.
@@ -22,13 +22,13 @@ CHUNK = 16
 """Pixels are appended to a batch in whole chunks; surplus numbers are overwritten or unused. Indices are unsigned in
 these loops, because numba checks signed ones for negative values, which prevents vectorisation."""
 STRIDE = BATCH + CHUNK
-ATTRIBUTES = 11
-"""Attributes per vertex: unshadowed light (3), light removed by shadow (3), texture coordinates (2), shadow map (3)."""
-PICTURE, BACKGROUND, TRANSLUCENT = 0, 1, 2
-"""Output modes: write the image, write the cached background, blend over the image."""
+ATTRIBUTES = 5
+"""Attributes per vertex: light (3), texture coordinates (2)."""
+PICTURE, TRANSLUCENT = 0, 1
+"""Output modes: write the image, blend over the image."""
 
 # Float rows of a batch: the attributes, followed by
-_INVERSE, _LIT, _LEVEL, _SHARE, _PAINT, _ACROSS, _DOWN, _DEPTHS, _FLOAT_ROWS = 11, 12, 13, 14, 15, 18, 19, 20, 24
+_INVERSE, _LEVEL, _SHARE, _PAINT, _ACROSS, _DOWN, _FLOAT_ROWS = 5, 6, 7, 8, 11, 12, 13
 # Integer rows of a batch: pixel, start of the texture, level, start of the level, side of the level, addresses of four
 # texels, the four texels.
 _WHERE, _LAYER, _BELOW, _OFFSET, _SIDE, _ADDRESS, _TEXEL, _INTEGER_ROWS = 0, 1, 2, 3, 4, 5, 9, 13
@@ -94,8 +94,8 @@ def scratch(vertices: int, triangles: int, pixels: int) -> Scratch:
 
 @compiled
 def shade(
-    shapes: Any, surfaces: Any, table: Any, lights: Any, eye: Any, light_matrix: Any, clip: Any, shadow_map: Any,
-    target: Any, work: Any, mode: Any, image: Any, kept: Any,
+    shapes: Any, surfaces: Any, table: Any, lights: Any, eye: Any, clip: Any, target: Any, work: Any, mode: Any,
+    image: Any,
 ) -> None:  # fmt: skip
     """Shade every pixel with a visible triangle.
 
@@ -104,19 +104,15 @@ def shade(
         surfaces: `Surfaces`.
         lights: `lights.Lights`.
         eye: position of the camera, (3,).
-        light_matrix: from the world to the caster's clip space, (4, 4).
-        shadow_map: see `geometry.draw_depths`.
         work: `Scratch`.
-        mode: `PICTURE`, `BACKGROUND` or `TRANSLUCENT`.
-        image: (H * W, 3) uint8, updated in the modes `PICTURE` and `TRANSLUCENT`.
-        kept: (background.BACKGROUND_CHANNELS, H * W), updated in the mode `BACKGROUND`.
+        mode: `PICTURE` or `TRANSLUCENT`.
+        image: (H * W, 3) uint8, updated.
     """
     height, width = target.triangle.shape
     runs = _find_runs(target.triangle, work.runs)
     vertices, triangles = _list_shown(runs, shapes.triangles, work)
-    _light(work.vertices[:vertices], shapes.position, surfaces, table, lights, eye, light_matrix, work.attributes)
+    _light(work.vertices[:vertices], shapes.position, surfaces, table, lights, eye, work.attributes)
     _set_up(work.triangles[:triangles], shapes.triangles, clip, width, height, work.attributes, work.planes)
-    shadows = lights.caster >= 0
     t, i, texels, side = work.floats, work.integers, surfaces.texels, surfaces.side
     size = (4 * side * side - 1) // 3  # of all levels of a layer
     for textured in (False, True):
@@ -140,7 +136,7 @@ def shade(
                 here = min(length - done, BATCH - count)
                 if here > 0:
                     pixel = start + done
-                    _fill(work.planes, slot, pixel, width, here, count, textured, shadows, work.ramp, t, i)
+                    _fill(work.planes, slot, pixel, width, here, count, textured, work.ramp, t, i)
                     if textured:
                         _choose_levels(
                             work.planes, slot, pixel, width, here, count, layer * size, side, work.ramp, t, i
@@ -150,8 +146,8 @@ def shade(
                 if count == BATCH or n == runs or (mode == TRANSLUCENT and done == length):
                     if count < BATCH:
                         _rest(count, t, i)
-                    _colour(textured, shadows, texels, side, shadow_map, mode, t, i)
-                    _write(count, mode, alpha, image, kept, t, i)
+                    _colour(textured, texels, side, t, i)
+                    _write(count, mode, alpha, image, t, i)
                     count = 0
 
 
@@ -239,10 +235,8 @@ def _power(base: Any, exponent: Any) -> Any:
 
 
 @compiled
-def _light(
-    vertices: Any, position: Any, surfaces: Any, table: Any, lights: Any, eye: Any, light_matrix: Any, attributes: Any
-) -> None:
-    """Compute the attributes of vertices: MuJoCo's light with Blinn's specular term."""
+def _light(vertices: Any, position: Any, surfaces: Any, table: Any, lights: Any, eye: Any, attributes: Any) -> None:
+    """Compute the attributes of vertices: MuJoCo's light with Blinn's specular term, clipped to 1."""
     for i in vertices:
         out = attributes[i]
         row = surfaces.row[i]
@@ -262,7 +256,7 @@ def _light(
         scale = _1 / math.sqrt(max(vx * vx + vy * vy + vz * vz, _TINY))
         vx, vy, vz = vx * scale, vy * scale, vz * scale
         for c in range(3):
-            out[c], out[3 + c] = emission * colour[c], _0
+            out[c] = emission * colour[c]
         for n in range(lights.to.shape[0]):
             lx, ly, lz, strength = lights.to[n, 0], lights.to[n, 1], lights.to[n, 2], _1
             if lights.placed[n]:
@@ -286,17 +280,12 @@ def _light(
             if specular > _0:
                 towards = (nx * hx + ny * hy + nz * hz) / math.sqrt(max(hx * hx + hy * hy + hz * hz, _TINY))
                 glint = np.float32(_power(min(towards, _1), max(shininess, _0))) * specular
-            first = 3 if n == lights.caster else 0
             for c in range(3):
                 part = facing * lights.diffuse[n, c] * colour[c] + glint * lights.specular[n, c]
-                out[first + c] += strength * part
-        if lights.clamped:
-            for c in range(6):
-                out[c] = min(out[c], _1)
-        out[6], out[7] = surfaces.uv[i, 0], surfaces.uv[i, 1]
+                out[c] += strength * part
         for c in range(3):
-            at = light_matrix[c, 0] * px + light_matrix[c, 1] * py + light_matrix[c, 2] * pz + light_matrix[c, 3]
-            out[8 + c] = _HALF * at + _HALF
+            out[c] = min(out[c], _1)
+        out[3], out[4] = surfaces.uv[i, 0], surfaces.uv[i, 1]
 
 
 @compiled
@@ -341,7 +330,7 @@ def _set_up(listed: Any, corners: Any, clip: Any, width: Any, height: Any, attri
 
 @compiled
 def _fill(
-    planes: Any, slot: Any, pixel: Any, width: Any, length: Any, count: Any, textured: Any, shadows: Any, ramp: Any,
+    planes: Any, slot: Any, pixel: Any, width: Any, length: Any, count: Any, textured: Any, ramp: Any,
     t: Any, i: Any,
 ) -> None:  # fmt: skip
     """Append a run of pixels of one triangle from ``pixel`` to the batch, which holds ``count``."""
@@ -349,7 +338,7 @@ def _fill(
     y = pixel // width
     x = pixel - y * width
     for n in range(ATTRIBUTES + 1):
-        if (6 <= n < 8 and not textured) or ((3 <= n < 6 or 8 <= n < 11) and not shadows):
+        if 3 <= n < 5 and not textured:
             continue
         at = np.float32(planes[slot, n, 0] * x + (planes[slot, n, 1] * y + planes[slot, n, 2]))
         slope = np.float32(planes[slot, n, 0])
@@ -370,8 +359,8 @@ def _choose_levels(
     y = pixel // width
     first, step = 0.0, 0.0
     e, f, g = planes[slot, _INVERSE, 0], planes[slot, _INVERSE, 1], planes[slot, _INVERSE, 2]
-    a, b, c = planes[slot, 6, 0], planes[slot, 6, 1], planes[slot, 6, 2]
-    p, q, r = planes[slot, 7, 0], planes[slot, 7, 1], planes[slot, 7, 2]
+    a, b, c = planes[slot, 3, 0], planes[slot, 3, 1], planes[slot, 3, 2]
+    p, q, r = planes[slot, 4, 0], planes[slot, 4, 1], planes[slot, 4, 2]
     for end in range(1 if length == 1 else 2):
         x = pixel - y * width + end * (length - 1)
         distance = 1.0 / (e * x + f * y + g)
@@ -405,9 +394,9 @@ def _rest(count: Any, t: Any, i: Any) -> None:
 
 
 @compiled
-def _colour(textured: Any, shadows: Any, texels: Any, side: Any, shadow_map: Any, mode: Any, t: Any, i: Any) -> None:
-    """Compute the colours of a batch into its first three rows; without shadow in the mode `BACKGROUND`."""
-    _divide(t, textured, shadows)
+def _colour(textured: Any, texels: Any, side: Any, t: Any, i: Any) -> None:
+    """Compute the colours of a batch into its first three rows."""
+    _divide(t, textured)
     if textured:
         mixed = _begin_sampling(side, t, i)
         _sample(texels, side, t, i)
@@ -417,14 +406,11 @@ def _colour(textured: Any, shadows: Any, texels: Any, side: Any, shadow_map: Any
     else:
         for x in range(_PAINT * STRIDE, (_PAINT + 3) * STRIDE):
             t[x] = _255
-    _paint(t, shadows)
-    if shadows and mode != BACKGROUND:
-        _look_up(shadow_map, t, i)
-        _join(t)
+    _paint(t)
 
 
 @compiled
-def _write(count: Any, mode: Any, alpha: Any, image: Any, kept: Any, t: Any, i: Any) -> None:
+def _write(count: Any, mode: Any, alpha: Any, image: Any, t: Any, i: Any) -> None:
     """Write the first ``count`` pixels of a batch to the output of the mode."""
     if mode == PICTURE:
         for x in range(3 * STRIDE):
@@ -433,13 +419,6 @@ def _write(count: Any, mode: Any, alpha: Any, image: Any, kept: Any, t: Any, i: 
             where = i[_WHERE * STRIDE + k]
             for c in range(3):
                 image[where, c] = np.uint8(t[c * STRIDE + k])
-    elif mode == BACKGROUND:
-        for k in range(count):
-            where = i[_WHERE * STRIDE + k]
-            for n in range(6):
-                kept[n, where] = t[n * STRIDE + k]
-            for n in range(6, 9):
-                kept[n, where] = t[(n + 2) * STRIDE + k]
     else:
         for k in range(count):
             where = i[_WHERE * STRIDE + k]
@@ -449,7 +428,7 @@ def _write(count: Any, mode: Any, alpha: Any, image: Any, kept: Any, t: Any, i: 
 
 
 @compiled
-def _divide(t: Any, textured: Any, shadows: Any) -> None:
+def _divide(t: Any, textured: Any) -> None:
     """Multiply the attributes by the distance (perspective correction)."""
     for x in range(BATCH):
         t[_INVERSE * STRIDE + x] = _1 / t[_INVERSE * STRIDE + x]
@@ -461,41 +440,17 @@ def _divide(t: Any, textured: Any, shadows: Any) -> None:
     if textured:
         for x in range(BATCH):
             distance = t[_INVERSE * STRIDE + x]
-            t[6 * STRIDE + x] *= distance
-            t[7 * STRIDE + x] *= distance
-    if shadows:
-        for x in range(BATCH):
-            distance = t[_INVERSE * STRIDE + x]
             t[3 * STRIDE + x] *= distance
             t[4 * STRIDE + x] *= distance
-            t[5 * STRIDE + x] *= distance
-            t[8 * STRIDE + x] *= distance
-            t[9 * STRIDE + x] *= distance
-            t[10 * STRIDE + x] *= distance
 
 
 @compiled
-def _paint(t: Any, shadows: Any) -> None:
+def _paint(t: Any) -> None:
     """Multiply light by texture colours."""
     for x in range(BATCH):
         t[x] *= t[_PAINT * STRIDE + x]
         t[STRIDE + x] *= t[(_PAINT + 1) * STRIDE + x]
         t[2 * STRIDE + x] *= t[(_PAINT + 2) * STRIDE + x]
-    if shadows:
-        for x in range(BATCH):
-            t[3 * STRIDE + x] *= t[_PAINT * STRIDE + x]
-            t[4 * STRIDE + x] *= t[(_PAINT + 1) * STRIDE + x]
-            t[5 * STRIDE + x] *= t[(_PAINT + 2) * STRIDE + x]
-
-
-@compiled
-def _join(t: Any) -> None:
-    """Add the unshadowed share of the caster's light."""
-    for x in range(BATCH):
-        lit = t[_LIT * STRIDE + x]
-        t[x] += lit * t[3 * STRIDE + x]
-        t[STRIDE + x] += lit * t[4 * STRIDE + x]
-        t[2 * STRIDE + x] += lit * t[5 * STRIDE + x]
 
 
 @compiled
@@ -536,8 +491,8 @@ def _sample(texels: Any, side: Any, t: Any, i: Any) -> None:
         i[_OFFSET * STRIDE + x] = np.int32(i[_LAYER * STRIDE + x] + np.int32(before))
     for x in range(BATCH):
         side_here = i[_SIDE * STRIDE + x]
-        a = t[6 * STRIDE + x] * np.float32(side_here) - _HALF
-        b = t[7 * STRIDE + x] * np.float32(side_here) - _HALF
+        a = t[3 * STRIDE + x] * np.float32(side_here) - _HALF
+        b = t[4 * STRIDE + x] * np.float32(side_here) - _HALF
         left, top = np.int32(a), np.int32(b)
         left = np.int32(left - np.int32(np.float32(left) > a))
         top = np.int32(top - np.int32(np.float32(top) > b))
@@ -575,38 +530,3 @@ def _sample(texels: Any, side: Any, t: Any, i: Any) -> None:
         value = value + third * np.float32(r >> blue) + last * np.float32(s >> blue)
         before = t[(_PAINT + 2) * STRIDE + x]
         t[(_PAINT + 2) * STRIDE + x] = before + share * (value - before)
-
-
-# --- shadows ---
-
-
-@compiled
-def _look_up(shadow_map: Any, t: Any, i: Any) -> None:
-    """Compute the visible share of the caster's light by bilinear interpolation of four shadow-map tests."""
-    size = np.int32(shadow_map.shape[0])
-    flat = shadow_map.reshape(-1)
-    wide = np.float32(size)
-    last = np.float32(size - 2)
-    for x in range(BATCH):
-        a = min(max(t[8 * STRIDE + x] * wide - _HALF, _0), last)
-        b = min(max(t[9 * STRIDE + x] * wide - _HALF, _0), last)
-        left, top = np.int32(a), np.int32(b)
-        t[_ACROSS * STRIDE + x] = a - np.float32(left)
-        t[_DOWN * STRIDE + x] = b - np.float32(top)
-        i[_ADDRESS * STRIDE + x] = top * size + left
-    for x in range(BATCH):
-        at = np.uint32(i[_ADDRESS * STRIDE + x])
-        t[_DEPTHS * STRIDE + x] = flat[at]
-        t[(_DEPTHS + 1) * STRIDE + x] = flat[at + np.uint32(1)]
-        t[(_DEPTHS + 2) * STRIDE + x] = flat[at + np.uint32(size)]
-        t[(_DEPTHS + 3) * STRIDE + x] = flat[at + np.uint32(size + 1)]
-    for x in range(BATCH):
-        depth, across, down = t[10 * STRIDE + x], t[_ACROSS * STRIDE + x], t[_DOWN * STRIDE + x]
-        p = _1 if depth <= t[_DEPTHS * STRIDE + x] else _0
-        q = _1 if depth <= t[(_DEPTHS + 1) * STRIDE + x] else _0
-        r = _1 if depth <= t[(_DEPTHS + 2) * STRIDE + x] else _0
-        s = _1 if depth <= t[(_DEPTHS + 3) * STRIDE + x] else _0
-        upper, lower = p + across * (q - p), r + across * (s - r)
-        u, v = t[8 * STRIDE + x], t[9 * STRIDE + x]
-        # There are no shadows outside the map.
-        t[_LIT * STRIDE + x] = _1 if min(u, _1 - u, v, _1 - v) < _0 else upper + down * (lower - upper)

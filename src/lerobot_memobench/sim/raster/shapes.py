@@ -23,16 +23,13 @@ Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floatin
 """Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
 
 
-def triangles_of(
-    model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangles] | None = None, sharp: bool = False
-) -> Triangles:
+def triangles_of(model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangles] | None = None) -> Triangles:
     """Return a geom's triangles in its own frame.
 
     Args:
         model: compiled scene.
         geom: id of the geom.
-        meshes: replacements of the model's meshes by name; see `mesh_in_file`.
-        sharp: whether edges of other meshes are sharp.
+        meshes: replacements of the model's meshes by name.
 
     Raises:
         MemobenchError: the geom's type is not supported.
@@ -41,7 +38,7 @@ def triangles_of(
     size = np.asarray(model.geom_size[geom])
     match kind:
         case mujoco.mjtGeom.mjGEOM_MESH:
-            return _named_mesh(model, int(model.geom_dataid[geom]), meshes or {}, sharp)
+            return _named_mesh(model, int(model.geom_dataid[geom]), meshes or {})
         case mujoco.mjtGeom.mjGEOM_BOX:
             return _box(size)
         case mujoco.mjtGeom.mjGEOM_PLANE:
@@ -60,26 +57,19 @@ def triangles_of(
     )
 
 
-def _named_mesh(model: mujoco.MjModel, mesh: int, meshes: Mapping[str, Triangles], sharp: bool) -> Triangles:
+def _named_mesh(model: mujoco.MjModel, mesh: int, meshes: Mapping[str, Triangles]) -> Triangles:
     """Return a mesh, or its replacement, in the frame of the model's mesh, which is also its geom's.
 
     The compiler moves each mesh to its centre and principal axes, which differ for a mesh with more faces.
     """
     name = model.mesh(mesh).name
     if name not in meshes:
-        return _mesh(model, mesh, MIN_NORMAL_COSINE if sharp else -np.inf)
+        return _mesh(model, mesh)
     here = _mesh_axes(model, mesh)
     if not model.mesh_pos[mesh].any() and (here == np.eye(3)).all():
         return meshes[name]
     points, normals, uv, triangles = meshes[name]
     return (points - model.mesh_pos[mesh]) @ here, normals @ here, uv, triangles
-
-
-def mesh_in_file(model: mujoco.MjModel, mesh: int) -> Triangles:
-    """Return a mesh with sharp edges, in the frame of its file."""
-    axes = _mesh_axes(model, mesh)
-    points, normals, uv, triangles = _mesh(model, mesh, MIN_NORMAL_COSINE)
-    return points @ axes.T + model.mesh_pos[mesh], normals @ axes.T, uv, triangles
 
 
 def welded(shape: Triangles) -> Triangles:
@@ -129,25 +119,19 @@ def _mesh_axes(model: mujoco.MjModel, mesh: int) -> NDArray[np.float64]:
     return axes.reshape(3, 3)
 
 
-def _mesh(model: mujoco.MjModel, mesh: int, agreement: float = -np.inf) -> Triangles:
-    """Return a mesh's triangles with one vertex per combination of point, normal and texture coordinate.
-
-    Args:
-        model: compiled model.
-        mesh: id of the mesh.
-        agreement: cosine between vertex and face normal below which the face normal is used.
-    """
+def _mesh(model: mujoco.MjModel, mesh: int) -> Triangles:
+    """Return a mesh's triangles with one vertex per combination of point, normal and texture coordinate."""
     face, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     point, normal = int(model.mesh_vertadr[mesh]), int(model.mesh_normaladr[mesh])
     uv = int(model.mesh_texcoordadr[mesh])
     points = model.mesh_face[face : face + faces]
     normals = model.mesh_normal[normal : normal + int(model.mesh_normalnum[mesh])]
     normal_of = model.mesh_facenormal[face : face + faces]
-    if uv < 0 and agreement > -1:  # a mesh with texture coordinates has explicit normals
+    if uv < 0:  # a mesh with texture coordinates has explicit normals
         a, b, c = (model.mesh_vert[point + points[:, corner]] for corner in range(3))
         flat = np.cross(b - a, c - a)
         flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-        edged = np.einsum("fcx,fx->fc", normals[normal_of], flat) < agreement
+        edged = np.einsum("fcx,fx->fc", normals[normal_of], flat) < MIN_NORMAL_COSINE
         normal_of = np.where(edged, len(normals) + np.arange(faces)[:, None], normal_of)
         normals = np.concatenate([normals, flat])
     corners = np.stack(

@@ -1,1 +1,0 @@
-"""Speed of the simulator and of evaluation, against stock robosuite 1.4.1."""

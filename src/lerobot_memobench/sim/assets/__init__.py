@@ -1,1 +1,0 @@
-"""Procedural fixtures and objects: geometry, textures and metadata without binary files."""
