@@ -143,16 +143,9 @@ def test_a_slipped_handle_is_grasped_again() -> None:
     assert left == 0
 
 
-@pytest.mark.parametrize(
-    ("name", "shut"),
-    [
-        (STOVE, Atom("turnoff", ("flat_stove_1",))),
-        pytest.param(MICROWAVE, Atom("close", ("microwave_1",)), marks=pytest.mark.slow),
-    ],
-)
-def test_joints_are_pushed_against_their_stop(name: str, shut: Atom) -> None:
+def test_doors_are_pushed_against_their_stop() -> None:
     """A less exact policy that stops some steps earlier still closes the joint."""
-    moved, pressed = False, 0
+    shut, moved, pressed = Atom("close", ("microwave_1",)), False, 0
 
     def look(episode: Episode, action: np.ndarray) -> np.ndarray:
         nonlocal moved, pressed
@@ -160,7 +153,7 @@ def test_joints_are_pushed_against_their_stop(name: str, shut: Atom) -> None:
         pressed += bool(moved and episode.sim.holds(shut) and action[6] > 0 and np.abs(action[:6]).max() > 0.05)
         return action
 
-    played = play(get_task(name), 20_000, disturb=look)
+    played = play(get_task(MICROWAVE), 20_000, disturb=look)
     assert not played.faults
     for _ in range(HOLD_FRAMES):
         played.episode.step(look(played.episode, played.episode.expert_action()))
