@@ -174,6 +174,21 @@ def test_tests_that_pages_name_exist() -> None:
     assert missing == []
 
 
+COMMIT = re.compile(r"(?:commits? (?:\()?|^\| |git show )`?([0-9a-f]{7,40})(?=[`:])", re.MULTILINE)
+
+
+def test_commits_that_pages_name_are_in_the_history() -> None:
+    found = {each for page in DOCUMENTS for each in COMMIT.findall(page.read_text(encoding="utf-8"))}
+    assert found
+    if not (ROOT / ".git").exists() or git("rev-parse", "--is-shallow-repository") != "false":
+        pytest.skip("this folder has no history")
+    assert [each for each in sorted(found) if git("cat-file", "-t", each) != "commit"] == []
+
+
+def git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+
+
 # --- figures ---
 
 

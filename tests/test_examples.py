@@ -100,9 +100,9 @@ def test_rl_wrapper_rewards_progress_and_checkpoint() -> None:
     env = example["make"](20_000)
     observation, _ = env.reset(seed=3)
     assert env.unwrapped.episode.seed == 20_000
-    offsets = [(0.03, -0.08, 0.14), (0.03, -0.08, 0.045), (0.03, 0.06, 0.045)]  # from the knob, m
+    offsets = [(0.09, 0.02, 0.14), (0.09, 0.02, 0.005), (-0.09, 0.02, 0.005)]  # from the knob, m
     rewards, knob, done = [], observation[3:6] + observation[:3], False
-    for offset in np.repeat(offsets, [8, 6, 20], axis=0):
+    for offset in np.repeat(offsets, [10, 6, 18], axis=0):
         action = (knob / 10 + offset - observation[:3] / 10) / 0.05 / 2
         observation, reward, done, truncated, info = env.step(np.clip(action, -1, 1).astype(np.float32))
         assert env.observation_space.contains(observation)

@@ -352,7 +352,7 @@ def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
     folder = shutil.copytree(tmp_path / "board" / "row_90", tmp_path / "two")
     every(lambda record: record.update(scene_hash=scene_of(record["task"], record["seed"] + 1)))(folder)
     check_submission(read_submission(folder))
-    with pytest.raises(MemobenchError, match=r"memobench_small has .* for this seed"):
+    with pytest.raises(MemobenchError, match=r"row_50 has .* for this seed"):
         check_submission(read_submission(folder), others)
 
 

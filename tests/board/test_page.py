@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_memobench.board.submission import About, write_submission
 from tests.support import browser as chromium
+from tests.support.board import ABOUT, evaluation
 from tests.support.scripts import load_script
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -16,10 +18,15 @@ DOCS = Path(__file__).parents[2] / "docs"
     chromium.find_chromium() is None,
     reason="Chromium is missing; `make test` installs it where it may, else: apt-get install chromium",
 )
-def test_board_is_sorted_by_a_click(tmp_path: Path) -> None:
+def test_board_is_sorted_by_a_click(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The page has the heading *Board*, whose id is ``board``, as MkDocs makes it."""
     markdown = pytest.importorskip("markdown", reason="the dependencies of the site are missing")
     board = load_script("board_page")
+    for k, name in enumerate(("one", "two")):
+        made = evaluation(tmp_path / name, speed=50 + 40 * k, evidence=k == 0)
+        about = About(**ABOUT | {"model": name.title(), "parameters": 10 + k})
+        write_submission(tmp_path / "board" / name, about, {"": made})
+    monkeypatch.setattr(board, "BOARD", tmp_path / "board")
     text = (DOCS / "benchmark" / "board.md").read_text().replace(board.PLACE, board.table())
     html = markdown.markdown(text, extensions=["md_in_html", "tables", "toc"])
     assert '<h1 id="board">' in html

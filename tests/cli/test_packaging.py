@@ -92,7 +92,7 @@ def test_late_imports_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_setup_renders_all_qualities(monkeypatch: pytest.MonkeyPatch) -> None:
     rendered = []
-    monkeypatch.setattr(Simulation, "geoms", lambda simulation, camera: rendered.append(camera))
+    monkeypatch.setattr(Simulation, "visible_bodies", lambda simulation, camera: rendered.append(camera))
     load_script("compile_imports").render()
     assert rendered == [*MJCF_CAMERAS] * len(QUALITIES)
 

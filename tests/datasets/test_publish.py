@@ -115,7 +115,7 @@ def test_push_load_and_stream(hub, machine, folder, tmp_path):
     assert 'root="<this folder>"' in (folder / "README.md").read_text()
     (example,) = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
     assert f'LeRobotDataset("{REPO}")' in example
-    for part in ("\nlicense: apache-2.0\n", "## Limitations", "name information that only", "## Licence\n\nApache-2.0"):
+    for part in ("\nlicense: other\n", "## Limitations", "name information that only", "CC BY 4.0"):
         assert part in card
 
     hub.requests.clear()

@@ -203,7 +203,7 @@ def test_horizon_counts_actions_at_full_speed_without_pauses() -> None:
 
 
 def test_unreachable_goals_end_strict_episodes_only() -> None:
-    never = Never(Atom("turnoff", ("flat_stove_1",)))
+    never = Never(Atom("on", ("moka_pot_1", "kitchen_table_moka_pot_init_region")))
     published = run(dataclasses.replace(get_task(STOVE), goal=never), horizon=45)
     assert (published.progress.lost, published.lost, published.exec_steps) == (True, False, 45)
     strict = run(get_task(STRICT_STOVE))
@@ -255,12 +255,12 @@ def test_failure_class_of_a_wrong_answer_and_of_a_short_horizon(name: str) -> No
 # --- the authors' evaluation ---
 
 CHECK = "check_the_top_drawer_of_the_cabinet"
-TOP = "wooden_cabinet_1_top_region"
-SHUT, OPENED = Atom("close", (TOP,)), Atom("open", (TOP,))
+OPENED = Atom("open", ("wooden_cabinet_1_top_region",))
+AT_START = Atom("on", ("akita_black_bowl_1", "kitchen_table_akita_black_bowl_init_region"))
 
 
 def drawer(goal: Formula, checkpoint: Formula = OPENED) -> Task:
-    """Return the task with another goal and checkpoint; its drawer is closed from the start."""
+    """Return the task with another goal and checkpoint; its bowl rests where it starts."""
     task = get_task(CHECK)
     return dataclasses.replace(
         task, goal=goal, checkpoints=(dataclasses.replace(task.checkpoints[0], goal=checkpoint),)
@@ -268,16 +268,16 @@ def drawer(goal: Formula, checkpoint: Formula = OPENED) -> Task:
 
 
 def test_upstream_evaluates_twice_per_step_and_while_the_scene_settles() -> None:
-    three_times = drawer(Then((SHUT, SHUT, SHUT)))
+    three_times = drawer(Then((AT_START, AT_START, AT_START)))
     assert run(three_times, seed=7).exec_steps == 30
     assert run(three_times, seed=7, protocol="upstream").exec_steps == 15 - 10
 
 
 def test_upstream_ends_when_all_checkpoints_have_held() -> None:
-    upstream = run(drawer(OPENED, SHUT), seed=7, protocol="upstream")
+    upstream = run(drawer(OPENED, AT_START), seed=7, protocol="upstream")
     assert (upstream.exec_steps, upstream.success, upstream.checkpoints_satisfied) == (1, False, True)
     assert episode_record(upstream, 0, 0.1)["failure"] == "execution_failure"
-    paper = run(drawer(OPENED, SHUT), seed=7, horizon=3)
+    paper = run(drawer(OPENED, AT_START), seed=7, horizon=3)
     assert (paper.exec_steps, paper.checkpoints_satisfied) == (3, False)
 
 

@@ -32,6 +32,7 @@ from lerobot_memobench.run.card import (
 from lerobot_memobench.run.rerun import check_version
 from lerobot_memobench.run.run import resumed_card
 from lerobot_memobench.run.shards import merge
+from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import logs
 
@@ -43,7 +44,14 @@ def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, 
 
 def card(**changes: Any) -> dict[str, Any]:
     parts: dict[str, Any] = {
-        "protocol": {"tasks": ["a"], "episodes": 2, "seed_base": 7, "referent": "fixed", "horizon": 1200},
+        "protocol": {
+            "tasks": ["a"],
+            "episodes": 2,
+            "seed_base": 7,
+            "referent": "fixed",
+            "horizon": 1200,
+            WORLD: LIBERO,
+        },
         "policy": policy_facts({"type": "act", "chunk_size": 50, "device": "cuda"}, 7),
         "checkpoint": None,
         "trained_on": None,
@@ -60,7 +68,7 @@ def test_a_card_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert read_evaluation(tmp_path, whole=True) == json.loads(json.dumps(full))
     text = (tmp_path / "evaluation.json").read_text()
     assert sum('"scene_hash"' in line for line in text.splitlines()) == 3  # one episode a line
-    assert full["episodes"][0] == {k: v for k, v in record("a").items() if k not in ("wall_s", "replan_steps")}
+    assert full["episodes"][0] == {k: v for k, v in record("a").items() if k not in ("wall_s", "replan_steps", WORLD)}
     kept = with_episodes(full, [record("a", 0, success=False), record("a", 3)])["episodes"]
     assert [(each["episode"], each["success"]) for each in kept] == [(k, True) for k in range(4)]
     write_card(tmp_path, card())

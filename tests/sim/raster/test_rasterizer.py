@@ -79,7 +79,7 @@ def test_non_finite_state_is_refused(place: float) -> None:
     sim.reset(7)
     expected = sim.render()
     sim.data.joint(f"{next(iter(sim.task.objects))}_joint0").qpos[:3] = place
-    for draw in (sim.render, sim.geoms):
+    for draw in (sim.render, sim.visible_bodies):
         with pytest.raises(MemobenchError, match="expected a finite state"):
             draw()
     sim.reset(7)
