@@ -4,7 +4,7 @@
 
 All runs are public commands. The second part is a strict task, under the expert and the two policies of the package,
 which were trained alike except for the memory. The three act in the same scenes, of the first evaluation seeds, on
-privileged object state. A policy without a memory guesses; twelve episodes show it. The same command resumes.
+privileged object state. A policy without a memory cannot know which carton is meant. The same command resumes.
 
 | output | |
 |---|---|

@@ -176,9 +176,7 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
         arguments = arguments.default("policy.n_action_steps", REPLAN)
     config: Any = policy_config(arguments)
     if config is None:
-        raise MemobenchError(
-            "name a policy: a checkpoint folder, policy=memobench_strict, or a type such as policy=act"
-        )
+        raise MemobenchError("name a policy: a checkpoint folder, policy=memobench_strict, or a type (policy=act)")
     path = arguments.get("policy.path")
     config.pretrained_path = None if path is None else Path(path)
     data = str(arguments.get("dataset.repo_id")), arguments.get("dataset.root")
