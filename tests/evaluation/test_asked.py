@@ -120,11 +120,15 @@ def test_an_export_counts_lines_without_a_protocol(killed: Path, tmp_path: Path)
     assert entry["overall_score"] is None
 
 
+FIXED_GOALS = "a routine without a memory solves published goals"
+
+
 def test_a_complete_run_has_an_overall_score(tmp_path: Path) -> None:
     lines = [line(name, episode) for name in task_names() for episode in range(50)]
     (run,) = read_runs([evaluation(tmp_path / "whole", lines)])
     (entry,) = json.loads(vla_eval_json(run))["results"]
-    assert (run.missing, run.notes, entry["overall_score"]) == (None, [], 100.0)
+    assert (run.missing, entry["overall_score"]) == (None, 100.0)
+    assert [note.split(" with ")[0] for note in run.notes] == [FIXED_GOALS]
     assert "incomplete" not in headline([run])
 
 
@@ -164,7 +168,7 @@ def other_value(name: str) -> Any:
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lines = [line(name, episode) for name in sorted(task_names()[:2]) for episode in range(4)]
     folder = evaluation(tmp_path_factory.mktemp("small") / "a", lines, episodes=4, tasks=2)
-    assert read_runs([folder])[0].notes == []
+    assert len(read_runs([folder])[0].notes) == 1  # on fixed goals
     return folder
 
 
@@ -210,4 +214,5 @@ def test_lines_that_are_gone_are_noted(small: Path, tmp_path: Path) -> None:
     assert [note.split(":")[0] for note in read_runs([folder])[0].notes] == [
         "log and card disagree about 2 episodes, the first",
         "missing",
+        f"{FIXED_GOALS} with fixed referents; claims of memory need suite=strict",
     ]

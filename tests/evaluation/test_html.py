@@ -250,8 +250,7 @@ def test_videos_behind_links_stay(run: Path, tmp_path: Path) -> None:
     kept = film(run / "videos" / "kept.mp4", 3)
     other = evaluation(tmp_path / "other", [record(episode=5)])
     before = {path: path.read_bytes() for path in (run / "videos").iterdir()}
-    (note,) = write_html([other], out).notes
-    assert str(out / "videos" / "run") in note
+    assert [note for note in write_html([other], out).notes if str(out / "videos" / "run") in note]
     with pytest.raises(MemobenchError, match=r"videos/run is a link to .*; remove the link"):
         write_html([run], out)
     shutil.rmtree(out / "videos")

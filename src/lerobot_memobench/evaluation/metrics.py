@@ -15,8 +15,9 @@ from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
+from lerobot_memobench.tasks.catalogue import suite_of
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
-from lerobot_memobench.tasks.task import MEMORY_TYPES, OPERATIONS, STRICT_FAILURES
+from lerobot_memobench.tasks.task import MEMORY_TYPES, OPERATIONS, PUBLISHED, STRICT_FAILURES
 
 Record = Mapping[str, Any]
 """A rollout: one line of the episode log."""
@@ -131,7 +132,15 @@ def mixtures(records: Iterable[Record]) -> list[str]:
 
 def notes_on(records: Sequence[Record]) -> list[str]:
     """Return notes for a reader of the rollouts' figures, a sentence each."""
-    return faults(records) + unshown_prompts(records) + unsettled(records) + mixtures(records) + missing_scans(records)
+    scenes = unshown_prompts(records) + unsettled(records)
+    return faults(records) + scenes + mixtures(records) + missing_scans(records) + fixed_goals(records)
+
+
+def fixed_goals(records: Iterable[Record]) -> list[str]:
+    """Return a sentence where published goals had their fixed referents."""
+    fixed = any(record.get("referent") == "fixed" and suite_of(record["task"]) == PUBLISHED for record in records)
+    note = "a routine without a memory solves published goals with fixed referents; claims of memory need suite=strict"
+    return [note] if fixed else []
 
 
 def stand_ins_of(records: Iterable[Record]) -> list[str]:
