@@ -105,7 +105,8 @@ def _add_false(noisy: Tensor, there: Tensor, size: float) -> None:
 
 def in_order(slots: Tensor) -> Tensor:
     """Return slots (N, n, WIDTH) sorted as by `sim.object_slots.fill_slots`: by class and place, empty slots last."""
-    x = field(slots, "position")[..., 0].clamp(-4, 4) / 10
-    order = (field(slots, "class").squeeze(-1) + x).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
+    kind, place = field(slots, "class").squeeze(-1), field(slots, "position")
+    first = torch.where(kind == classes().index("drawer"), -place[..., 2], place[..., 0])  # drawers from the top
+    order = (kind + first.clamp(-4, 4) / 10).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
     rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
     return rows
