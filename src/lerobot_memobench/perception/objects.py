@@ -190,28 +190,18 @@ def upright(slots: Tensor) -> Tensor:
     Only the x axis of their rotation is used; objects that look the same from all sides have that of their placement.
     """
     slots = slots.clone()
-    facing, from_all_sides, _ = _classes_of(slots)
+    kind = field(slots, "class").squeeze(-1).long().cpu()
+    facing, from_all_sides, y_up = _classes()[kind].to(slots).split(1, dim=-1)
     # Doors and knobs turn about the vertical; a drawer's position, up to 0.16 m, is too small to change the sign below.
     angle = facing + field(slots, "joint")
     front = torch.cat([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
     axis = normalize(field(slots, "rotation")[..., :3] * slots.new_tensor([1.0, 1.0, 0.0]), dim=-1, eps=1e-6)
     axis = torch.where((axis * front).sum(dim=-1, keepdim=True) < 0, -axis, axis)
     axis = torch.where(from_all_sides > 0, front, axis)
-    set_axis(slots, axis * (field(slots, "present") > 0))
+    x, y, z = axis.split(1, dim=-1)
+    y_axis = torch.where(y_up > 0, slots.new_tensor([0.0, 0.0, 1.0]), torch.cat([-y, x, z], dim=-1))
+    field(slots, "rotation")[:] = torch.cat([axis, y_axis], dim=-1) * (field(slots, "present") > 0)
     return slots
-
-
-def set_axis(slots: Tensor, axis: Tensor) -> None:
-    """Write rotations of upright objects into slots (..., WIDTH), given level x axes (..., 3)."""
-    x, y, z = axis.unbind(-1)
-    y_axis = torch.where(_classes_of(slots)[2] > 0, slots.new_tensor([0.0, 0.0, 1.0]), torch.stack([-y, x, z], dim=-1))
-    field(slots, "rotation")[:] = torch.cat([axis, y_axis], dim=-1)
-
-
-def _classes_of(slots: Tensor) -> tuple[Tensor, ...]:
-    """Return the columns of `_classes` for the class of each slot, (..., 1) each."""
-    kind = field(slots, "class").squeeze(-1).long().cpu()
-    return _classes()[kind].to(slots).split(1, dim=-1)
 
 
 @cache

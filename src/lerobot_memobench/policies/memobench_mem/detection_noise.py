@@ -12,7 +12,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from lerobot_memobench.perception.objects import set_axis, upright
+from lerobot_memobench.perception.objects import upright
 from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.libero.scene import standing_heights
 from lerobot_memobench.sim.object_layout import WIDTH, field
@@ -82,10 +82,10 @@ def _standing() -> Tensor:
 
 
 def _turn(noisy: Tensor, angle: Tensor) -> None:
-    """Rotate the level x axes of things by angles (N, SLOTS), rad."""
-    x, y, z = field(noisy, "rotation")[..., :3].unbind(-1)
-    sine, cosine = angle.sin(), angle.cos()
-    set_axis(noisy, torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1))
+    """Rotate things about the vertical by angles (N, SLOTS), rad."""
+    x, y, z = field(noisy, "rotation").unflatten(-1, (2, 3)).unbind(-1)
+    sine, cosine = angle.sin()[..., None], angle.cos()[..., None]
+    field(noisy, "rotation")[:] = torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1).flatten(-2)
 
 
 def _add_false(noisy: Tensor, there: Tensor, size: float) -> None:
