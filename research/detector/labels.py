@@ -34,8 +34,8 @@ THING = np.dtype(
     ]
 )
 """Label of an object. ``pixels``: how many of the rendered image (256 x 256) show it. ``anchor``: their centre, a place
-in the image. ``position``: of its origin in the world, m. ``joint``: m or rad, NaN without one. ``lit``: it is in a
-highlight. ``turn``: cosine and sine of twice the angle of its x axis in the image (a half turn changes its looks
+in the image. ``position``: in the world, m, as in object slots. ``joint``: m or rad, NaN without one. ``lit``: it is in
+a highlight. ``turn``: cosine and sine of twice the angle of its x axis in the image (a half turn changes its looks
 little); NaN of round objects."""
 
 PICTURE = np.dtype(
@@ -136,7 +136,7 @@ class Labeller:
         for index, thing in enumerate(self._slots.things):
             anchor = np.array([across[index] / width, down[index] / height]) / max(counts[index], 1)
             joint = np.nan if thing.joint is None else self._sim.data.qpos[thing.joint]
-            position = self._sim.data.xpos[thing.body]
+            position = self._slots.position(thing)
             lit, turn = is_lit(position, self._sim.highlights), self._turn(thing.body, camera)
             labels[index] = (self._kinds[index], counts[index], anchor, position, joint, lit, turn)
         return labels[counts > 0]

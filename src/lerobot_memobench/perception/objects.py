@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from math import pi
 
 import numpy as np
 import torch
@@ -20,8 +21,11 @@ from lerobot_memobench.perception.detector import Detections, Detector, detectio
 from lerobot_memobench.perception.geometry import View, depth_at_height, rays, views_of
 from lerobot_memobench.perception.visual_encoder import resized
 from lerobot_memobench.sim.asset import TABLE_TOP
+from lerobot_memobench.sim.libero.classes import CLASSES
+from lerobot_memobench.sim.libero.placement import sample_orientation
+from lerobot_memobench.sim.libero.scene import UNKNOWN_CLASS
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
-from lerobot_memobench.sim.object_slots import classes, fill_slots
+from lerobot_memobench.sim.object_slots import classes, fill_slots, rotation
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 
 Array = NDArray[np.float64]
@@ -32,17 +36,10 @@ PARTS = (*DRAWERS, "door", "knob")
 """Kinds that have a joint; their indices come first."""
 ONE = frozenset({*PARTS, "flat_stove", "kitchen_table", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"})
 """Kinds with one object per scene."""
-TURNED = ONE - {"flat_stove", "kitchen_table", "knob"} | {"drawer"}
-"""Kinds, and the class of drawers, with an x axis towards the robot. The x axis of the others points away from it; the
-detected axis is turned by half a turn if needed."""
-# fmt: off
-ROUND = frozenset({
-    "akita_black_bowl", "artichoke", "beefsteak_tomato", "biscuit", "bottle_of_coffee",
-    "bottle_of_olive_oil", "bottle_of_protein_powder", "broccoli", "brussels_sprouts", "cap",
-    "cork", "plate", "white_bowl",
-})
-# fmt: on
-"""Kinds that look the same from all sides: their x axis is the world's, as tasks place them."""
+FACING = {"flat_stove": 0.0, "knob": pi / 2} | dict.fromkeys(
+    ("drawer", "door", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"), pi
+)
+"""Class of fixture or part -> angle of its x axis in the world, as tasks place it and at joint position 0, rad."""
 MIN_SCORE_ALONE = 0.1
 """Smallest score of a detection by one camera alone."""
 APART, SAME = 0.03, 0.04
@@ -124,12 +121,14 @@ class ObjectLocalizer:
 
     def slots(self, found: Mapping[str, Detections], views: Mapping[str, View]) -> Tensor:
         """Return the slots (SIZE,) of each camera's detections at one time."""
-        rows = []
-        for one in self.objects(found, views)[:SLOTS]:
-            joint = one.joint if self.detector.kinds[one.kind] in PARTS else 0.0
+        rows, places = [], []
+        for one in sorted(self.objects(found, views)[:SLOTS], key=lambda one: one.kind):
+            kind = self.detector.kinds[one.kind]
+            joint = one.joint if kind in PARTS else 0.0
+            places.append(one.position * (kind not in DRAWERS))  # those are in the order of their kinds, from the top
             lit = float(one.lit > LIT)
             rows.append([1.0, self._class[one.kind], *one.position, *one.axis, 0.0, 0.0, 0.0, joint, lit])
-        slots = torch.from_numpy(fill_slots(np.array(rows).reshape(-1, WIDTH)))
+        slots = torch.from_numpy(fill_slots(np.array(rows).reshape(-1, WIDTH), np.array(places).reshape(-1, 3)))
         return upright(slots.unflatten(0, (SLOTS, WIDTH))).flatten()
 
     def objects(self, found: Mapping[str, Detections], views: Mapping[str, View]) -> list[DetectedObject]:
@@ -188,25 +187,29 @@ def precision(sight: Array, across: float, along: float) -> Array:
 def upright(slots: Tensor) -> Tensor:
     """Return slots (..., SLOTS, WIDTH) with upright objects that face the direction in which tasks place them.
 
-    Only the x axis of their rotation is used.
+    Only the x axis of their rotation is used; objects that look the same from all sides have that of their placement.
     """
     slots = slots.clone()
-    there, kind = field(slots, "present") > 0, field(slots, "class").squeeze(-1).long().cpu()
+    kind = field(slots, "class").squeeze(-1).long().cpu()
+    facing, from_all_sides, y_up = _classes()[kind].to(slots).split(1, dim=-1)
+    # Doors and knobs turn about the vertical; a drawer's position, up to 0.16 m, is too small to change the sign below.
+    angle = facing + field(slots, "joint")
+    front = torch.cat([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
     axis = normalize(field(slots, "rotation")[..., :3] * slots.new_tensor([1.0, 1.0, 0.0]), dim=-1, eps=1e-6)
-    turned, from_all_sides = (_classes(kinds)[kind][..., None].to(slots.device) for kinds in (TURNED, ROUND))
-    axis = torch.where((axis[..., :1] < 0) != turned, -axis, axis)
-    axis = torch.where(from_all_sides, slots.new_tensor([1.0, 0.0, 0.0]), axis)
-    set_axis(slots, axis * there)
+    axis = torch.where((axis * front).sum(dim=-1, keepdim=True) < 0, -axis, axis)
+    axis = torch.where(from_all_sides > 0, front, axis)
+    x, y, z = axis.split(1, dim=-1)
+    y_axis = torch.where(y_up > 0, slots.new_tensor([0.0, 0.0, 1.0]), torch.cat([-y, x, z], dim=-1))
+    field(slots, "rotation")[:] = torch.cat([axis, y_axis], dim=-1) * (field(slots, "present") > 0)
     return slots
 
 
-def set_axis(slots: Tensor, axis: Tensor) -> None:
-    """Write rotations about the vertical into slots (..., WIDTH), given level x axes (..., 3)."""
-    x, y, z = axis.unbind(-1)
-    field(slots, "rotation")[:] = torch.stack([x, y, z, -y, x, z], dim=-1)
-
-
 @cache
-def _classes(names: frozenset[str]) -> Tensor:
-    """Return whether each object class is among the names, (classes,) bool."""
-    return torch.tensor([name in names for name in classes()])
+def _classes() -> Tensor:
+    """Return each class's angle of `FACING`, and whether it is round and whether its y axis points up, (classes, 3)."""
+    rows = []
+    for name in classes():
+        known = CLASSES.get(name, UNKNOWN_CLASS)
+        placed = rotation(sample_orientation(known.turns, np.random.RandomState(0)))[:, 0]
+        rows.append([FACING.get(name, np.arctan2(placed[1], placed[0])), known.round, known.y_up])
+    return torch.tensor(rows)

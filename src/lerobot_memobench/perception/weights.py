@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -14,9 +16,10 @@ from lerobot_memobench.io import write_file
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import BLOCKS, WIDTHS, VisualEncoder
 
+logger = logging.getLogger(__name__)
+
 SHIPPED = Path(__file__).parent / "detector.safetensors"
-"""The detector that comes with the package, trained on the scenes that version 0.2 modelled in code:
-results/detector.md."""
+"""The detector that comes with the package, trained on the scenes that version 0.2 modelled in code."""
 PACKAGE, RANDOM = "package", "random"
 """Names that do not mean a file: the package's detector, and a visual encoder with random weights."""
 
@@ -30,12 +33,14 @@ def save_detector(detector: Detector, path: Path) -> None:
 
 
 def load_detector(name: str | Path) -> Detector:
-    """Return the detector of a name, `PACKAGE` or a path, in float32 and in evaluation mode.
+    """Return the detector of a name, `PACKAGE` or a path, in float32 and in evaluation mode; warn about the package's.
 
     Raises:
         MemobenchError: the file does not exist, or `save_detector` did not write it.
     """
     path = detector_file(name)
+    if path == SHIPPED:
+        warn_of_former_scenes()
     try:
         with safe_open(path, framework="pt") as file:
             shape = json.loads(file.metadata()["detector"])
@@ -49,6 +54,15 @@ def load_detector(name: str | Path) -> Detector:
             f"{path} holds no detector ({reason}); name a file of `python -m research.detector train`"
         ) from None
     return detector.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+@cache
+def warn_of_former_scenes() -> None:
+    """Log once per process that the package's detector was trained on other scenes."""
+    logger.warning(
+        "the package's detector and visual encoder were trained on the scenes of version 0.2, whose objects looked "
+        "different; train one for this version's with `python -m research.detector train` and name its file"
+    )
 
 
 def load_visual_encoder(name: str) -> VisualEncoder:

@@ -124,6 +124,11 @@ class ObjectSlots:
         rows = np.array([self._row(thing) for thing in things]).reshape(-1, WIDTH)
         return fill_slots(rows, round_to_resolution(self._sim.data.xpos[[thing.ordered_by for thing in things]]))
 
+    def position(self, thing: Thing) -> Array:
+        """Return the position (3,) of a thing in the world, m: of its origin, or of its handle if it has a site."""
+        data = self._sim.data
+        return np.asarray(data.xpos[thing.body] if thing.site is None else data.site_xpos[thing.site])
+
     def _add(self, thing: Thing) -> None:
         self._owner[thing.body] = len(self.things)
         self.things.append(thing)
@@ -170,7 +175,7 @@ class ObjectSlots:
 
     def _row(self, thing: Thing) -> Array:
         data = self._sim.data
-        position = data.xpos[thing.body] if thing.site is None else data.site_xpos[thing.site]
+        position = self.position(thing)
         turned = data.xmat[thing.body].reshape(3, 3)
         joint = 0.0 if thing.joint is None else data.qpos[thing.joint]
         lit = float(is_lit(position, self._sim.highlights))

@@ -12,7 +12,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from lerobot_memobench.perception.objects import set_axis, upright
+from lerobot_memobench.perception.objects import upright
 from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.libero.scene import standing_heights
 from lerobot_memobench.sim.object_layout import WIDTH, field
@@ -82,10 +82,10 @@ def _standing() -> Tensor:
 
 
 def _turn(noisy: Tensor, angle: Tensor) -> None:
-    """Rotate the level x axes of things by angles (N, SLOTS), rad."""
-    x, y, z = field(noisy, "rotation")[..., :3].unbind(-1)
-    sine, cosine = angle.sin(), angle.cos()
-    set_axis(noisy, torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1))
+    """Rotate things about the vertical by angles (N, SLOTS), rad."""
+    x, y, z = field(noisy, "rotation").unflatten(-1, (2, 3)).unbind(-1)
+    sine, cosine = angle.sin()[..., None], angle.cos()[..., None]
+    field(noisy, "rotation")[:] = torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1).flatten(-2)
 
 
 def _add_false(noisy: Tensor, there: Tensor, size: float) -> None:
@@ -105,7 +105,8 @@ def _add_false(noisy: Tensor, there: Tensor, size: float) -> None:
 
 def in_order(slots: Tensor) -> Tensor:
     """Return slots (N, n, WIDTH) sorted as by `sim.object_slots.fill_slots`: by class and place, empty slots last."""
-    x = field(slots, "position")[..., 0].clamp(-4, 4) / 10
-    order = (field(slots, "class").squeeze(-1) + x).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
+    kind, place = field(slots, "class").squeeze(-1), field(slots, "position")
+    first = torch.where(kind == classes().index("drawer"), -place[..., 2], place[..., 0])  # drawers from the top
+    order = (kind + first.clamp(-4, 4) / 10).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
     rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
     return rows
