@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from lerobot.policies.factory import make_policy_config
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode
@@ -125,8 +126,21 @@ def test_policy_determines_prompt_and_replanning(policy: Any, prompt_in: str, re
     settings = MemobenchEnvConfig().settings_for(policy)
     assert (settings.prompt_in, settings.replan_steps) == (prompt_in, replan)
     assert settings.window_steps == getattr(policy, "n_obs_steps", 1)
-    named = MemobenchEnvConfig(prompt_in="steps", replan_steps=2).settings_for(policy)
-    assert (named.prompt_in, named.replan_steps) == ("steps", 2)
+    named = MemobenchEnvConfig(prompt_in="steps", replan_steps=8).settings_for(policy)
+    assert (named.prompt_in, named.replan_steps) == ("steps", 8)
+
+
+@pytest.mark.parametrize("declared", [1, 399, 401])
+def test_plans_longer_than_declared_are_refused(declared: int) -> None:
+    """A plan of 400 actions, declared as 1, carried the past over home: 10 of 12 ordering episodes, ceiling 25 %."""
+    with pytest.raises(MemobenchError, match=f"env.replan_steps is {declared}, but the policy executes 400 actions"):
+        MemobenchEnvConfig(replan_steps=declared).settings_for(SimpleNamespace(n_action_steps=400))
+
+
+@pytest.mark.parametrize(("policy", "executed"), [("vqbet", 5), ("tdmpc", 2), ("act", 100)])
+def test_executed_actions_of_lerobots_policies(policy: str, executed: int) -> None:
+    config = make_policy_config(policy, device="cpu")
+    assert MemobenchEnvConfig().settings_for(config).replan_steps == executed
 
 
 def test_averaged_plans_count_as_observed_steps() -> None:

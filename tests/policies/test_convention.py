@@ -131,6 +131,13 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
         envs(theirs)
     with pytest.raises(MemobenchError, match="may expect upright pictures or mirrored ones"):
         envs(unclear)
-    assert envs(theirs, "--env.convention=libero", convention="libero")
+    assert _executed(envs(theirs, "--env.convention=libero", convention="libero")) == 100
     assert envs(unclear, "--env.convention=upright")
-    assert envs(theirs, command="lerobot-train"), "a training may continue from any checkpoint"
+    assert _executed(envs(theirs, command="lerobot-train")) is None, "a training may continue from any checkpoint"
+
+
+def _executed(suites: Any) -> int | None:
+    """Return the declared number of actions per plan, which is the least length of a hold."""
+    ((env,),) = (suite.values() for suite in suites.values())
+    found: int | None = env.call("get_wrapper_attr", "settings")[0].replan_steps
+    return found

@@ -41,6 +41,9 @@ from lerobot_memobench.tasks.task import STRICT
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
 """Called with a task's folder, the number of rows, and whether each row runs in its own process."""
 
+EXECUTED = ("n_action_steps", "n_action_repeats", "action_chunk_size")
+"""Fields of LeRobot's policies with the actions executed per plan: of most, of TD-MPC (its larger one), of VQ-BeT."""
+
 _TYPES = typing.get_type_hints(EnvSettings)
 # LeRobot reads `--env.<name>` into fields of the configuration itself.
 _WithSettings: Any = make_dataclass(
@@ -72,8 +75,9 @@ class MemobenchEnvConfig(_WithSettings):
     log_dir: str | None = None
     resume: bool = False
     fps: int = CONTROL_HZ
-    check_policy: ClassVar[Callable[[MemobenchEnvConfig], None]] = lambda config: None
-    """Checks the policy of LeRobot's own commands; set by `registration`, because policies depend on environments."""
+    check_policy: ClassVar[Callable[[MemobenchEnvConfig], Any]] = lambda config: None
+    """Checks and returns the configuration of the policy of LeRobot's own commands, None if unknown; set by
+    `registration`, because policies depend on environments."""
     features: dict[str, PolicyFeature] = field(default_factory=policy_features)
     features_map: dict[str, str] = field(default_factory=policy_names)
 
@@ -151,7 +155,10 @@ class MemobenchEnvConfig(_WithSettings):
         """
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
-        type(self).check_policy(self)
+        policy = type(self).check_policy(self)
+        if policy is not None:  # its plans; the rest is the user's
+            planned = self.settings_for(policy)
+            self.replan_steps, self.window_steps = planned.replan_steps, planned.window_steps
         opened = self.opener(None, UNKNOWN_POLICY, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
@@ -159,12 +166,22 @@ class MemobenchEnvConfig(_WithSettings):
         return suites
 
     def settings_for(self, policy: Any) -> EnvSettings:
-        """Return the settings with defaults that follow from a policy's configuration (None if unknown)."""
+        """Return the settings with defaults that follow from a policy's configuration (None if unknown).
+
+        Raises:
+            MemobenchError: ``replan_steps`` is no multiple of the actions that the policy executes per plan.
+        """
         settings = self.settings
         if settings.prompt_in == AUTO:
             settings = settings.changed(prompt_in=STEPS if policy is None else prompt_in(policy))
+        executed = max(getattr(policy, name, None) or 0 for name in EXECUTED)
         if settings.replan_steps is None:
-            settings = settings.changed(replan_steps=getattr(policy, "n_action_steps", None))
+            settings = settings.changed(replan_steps=executed or None)
+        elif executed and settings.replan_steps % executed:  # a hold must be longer than a plan, and end with one
+            raise MemobenchError(
+                f"env.replan_steps is {settings.replan_steps}, but the policy executes {executed} actions per plan; "
+                f"leave env.replan_steps out, or change the policy by replan={settings.replan_steps}"
+            )
         observed = getattr(policy, "n_obs_steps", 1)  # a hold must be longer than the policy's input
         if getattr(policy, "temporal_ensemble_coeff", None) is not None:  # ACT averages the plans of so many steps
             observed += policy.chunk_size - 1

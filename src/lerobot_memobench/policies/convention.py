@@ -81,11 +81,16 @@ def check_convention(path: str | None, policy: Any, asked: str | None) -> None:
         )
 
 
-def check_lerobots_command(environment: Any) -> None:
-    """Check the checkpoint that the command line of ``lerobot-eval`` names; a training may begin with any."""
+def check_lerobots_command(environment: Any) -> PreTrainedConfig | None:
+    """Check the checkpoint that the command line of ``lerobot-eval`` names, and return its configuration.
+
+    None for another command: a training may begin with any checkpoint.
+    """
     path = parser.get_path_arg("policy")
-    if path is not None and "eval" in Path(sys.argv[0]).name:
-        with quiet():
-            policy = PreTrainedConfig.from_pretrained(path, cli_overrides=parser.get_cli_overrides("policy") or [])
-        named = parser.parse_arg("env.convention") is not None or environment.convention != UPRIGHT
-        check_convention(path, policy, environment.convention if named else None)
+    if path is None or "eval" not in Path(sys.argv[0]).name:
+        return None
+    with quiet():
+        policy = PreTrainedConfig.from_pretrained(path, cli_overrides=parser.get_cli_overrides("policy") or [])
+    named = parser.parse_arg("env.convention") is not None or environment.convention != UPRIGHT
+    check_convention(path, policy, environment.convention if named else None)
+    return policy
