@@ -5,21 +5,25 @@ from __future__ import annotations
 import os
 import re
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.conformance.checks import CHECKS, Behaviour, Outcome, run_check, run_checks
 from lerobot_memobench.conformance.pytest_class import MemoryConformance
-from lerobot_memobench.conformance.streams import write_streams
+from lerobot_memobench.conformance.streams import TASK, _episode, write_streams
 from lerobot_memobench.conformance.subject import Subject, load_subject
+from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
+from lerobot_memobench.tasks.catalogue import get_task
 
 EXAMPLE = ("policy=window", "policy.width=32", "policy.frames=8", "policy.stride=2")
 MEM = (
@@ -45,6 +49,71 @@ class TestExample(MemoryConformance):
 def test_memobench_mem_conforms(objects: Path, tmp_path: Path) -> None:
     results = run_checks(load_subject([*MEM, f"dataset={objects}"], tmp_path))
     assert {result.outcome for result in results} == {Outcome.PASSED}, results
+
+
+# --- a strict dataset: holds, and scenes that are equal at home ---
+
+HOME = np.array([0, 0, 1.1, 3.1, 0, 0, 0, 0], np.float32)
+MOVING = 13
+ON_HOLDS = ("remembers", "reads the prompt", "plans after the prompt", "same history in training")
+
+
+@pytest.fixture(scope="module")
+def strict(objects: Path) -> Path:
+    """Four episodes: one without a prompt, then prompted ones; each is held at home, and leaves it slowly."""
+    home = _episode(get_task(TASK), 0, 0, False, 1).objects
+    made = []
+    for seed, (prompt, hold) in enumerate([(0, 30), (4, 13), (5, 14), (7, 12)]):
+        own = _episode(get_task(TASK), seed, prompt, False, MOVING)
+        order = np.r_[:prompt, np.full(hold, prompt), prompt : prompt + MOVING]
+        held = (np.arange(len(order)) >= prompt) & (np.arange(len(order)) < prompt + hold)
+        away = np.r_[np.ones(prompt), np.zeros(hold), np.linspace(0, 1, MOVING) ** 2][:, None]
+        away = away.astype(np.float32)
+        columns = {name: getattr(own, name)[order] for name in ("states", "satisfied")}
+        moved = {
+            "actions": own.actions[order] * ~held[:, None],
+            "proprio": HOME + away * (own.proprio[order] - HOME),
+            "objects": home + away * (own.objects[order] - home),
+        }
+        made.append(replace(own, held=held, **columns, **moved))
+    return write_dataset(iter(made), objects.parent / "strict")
+
+
+@pytest.mark.parametrize("repeats", [pytest.param("true", marks=pytest.mark.slow), "false"])
+def test_memory_conforms_on_holds_and_a_deaf_one_does_not(
+    repeats: str, strict: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subject = load_subject([*MEM, f"policy.memory_repeats={repeats}", f"dataset={strict}"], tmp_path)
+    results = [run_check(check, found) for found in [Behaviour(subject)] for check in ON_HOLDS]
+    assert {result.outcome for result in results} == {Outcome.PASSED}, results
+
+    class DropsThePrompt(type(subject.policy)):  # type: ignore[misc]
+        def observe(self, batch: Any) -> Any:
+            before = [row.clock for row in self.rollout.rows]
+            for row, clock, phase in zip(self.rollout.rows, before, batch["observation.phase"], strict=False):
+                if clock is not None and clock[0] == 0 and phase == 1:
+                    row.memory = row.stored = None
+            return super().observe(batch)
+
+    monkeypatch.setattr(subject.policy, "__class__", DropsThePrompt)
+    subject.policy.rollout.reset()
+    found = Behaviour(subject)
+    for check in ("reads the prompt", "same history in training"):
+        assert run_check(check, found).outcome is Outcome.FAILED, check
+
+
+def test_a_policy_without_memory_has_none_on_holds(strict: Path, tmp_path: Path) -> None:
+    """A stalled hand continues its chunk; replayed hands do not follow the actions, so none is stalled."""
+    words = [word for word in MEM if "memory" not in word or word == "policy=memobench_mem"]
+    subject = load_subject([*words, "policy.memory=none", f"dataset={strict}"], tmp_path)
+    found = Behaviour(subject)
+    outcomes = {check: run_check(check, found).outcome for check in ON_HOLDS}
+    assert outcomes == {
+        "remembers": Outcome.FAILED,
+        "reads the prompt": Outcome.NO_MEMORY,
+        "plans after the prompt": Outcome.PASSED,
+        "same history in training": Outcome.PASSED,
+    }
 
 
 # --- a policy with one flaw ---

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
 from lerobot_memobench.sim.convention import UPRIGHT
@@ -141,34 +142,39 @@ class Stream:
 
 
 def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: bool, frames: int) -> Iterator[Stream]:
-    """Yield the beginning of each episode of a LeRobotDataset as a rollout observes it, without held frames.
+    """Yield the beginning of each episode of a LeRobotDataset as a rollout observes it.
+
+    Held frames are part of a memory's history in training; a policy that reads no prompt does not train on them.
 
     Args:
         dataset: without delta timestamps.
         pictures: whether cameras are observed. objects: the observed column of object state, or None.
-        prompts: whether the prompt is observed; else the stream begins with the execution.
-        frames: number of execution frames.
+        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first. If not,
+            streams have the order of the dataset.
+        frames: number of execution frames that are not held.
     """
     from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
+    table = read_frame_table(Path(dataset.root))
+    found: list[tuple[bool, tuple[int, ...], str]] = []
     for episode in dataset.meta.episodes:
         first, end = episode["dataset_from_index"], episode["dataset_to_index"]
-        rows = dataset.hf_dataset[first:end]
-        phases = [float(phase) for phase in rows[OBS_PHASE]]
-        if EXECUTION not in phases:
-            continue
-        start = phases.index(EXECUTION)
+        acting = (first + np.flatnonzero(table.acts[first:end])[:frames]).tolist()
+        if acting:
+            indices = range(first, acting[-1] + 1) if prompts else acting
+            prompted = float(dataset.hf_dataset[first][OBS_PHASE]) != EXECUTION
+            found.append((not prompted, tuple(indices), episode["tasks"][0]))
+    if prompts:
+        found.sort(key=lambda one: (one[0], len(one[1])))
+    for _, indices, task in found:
         shown: list[dict[str, Tensor]] = []
-        held = rows.get(HELD_COLUMN, np.zeros(len(phases)))
-        acting = [first + frame for frame in range(start, len(phases)) if not held[frame]][:frames]
-        indices = (*range(first if prompts else first + start, first + start), *acting)
         for index in indices:
             item = dataset[index] if pictures else dataset.hf_dataset[index]
             frame = {key: item[key] for key in (OBS_STATE, *CLOCK)}
             frame |= {key: _as_float(item[key]) for key in item if pictures and key.startswith(f"{OBS_IMAGES}.")}
             frame |= {} if objects is None else {OBS_ENV_STATE: item[objects]}
             shown.append(frame)
-        yield Stream(tuple(shown), episode["tasks"][0], indices)
+        yield Stream(tuple(shown), task, indices)
 
 
 def _as_float(picture: Tensor) -> Tensor:

@@ -220,6 +220,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     if config.type == MEMORY_POLICY:
         training = open_training(whole, open_datasets(whole))
         policy, (before, after), dataset = training.policy, training.processors, training.samples()
+        policy.open_loop = True
     else:
         choice = choice_for(config, raw.meta.features, None, obs_type)
         if not choice.prompts:

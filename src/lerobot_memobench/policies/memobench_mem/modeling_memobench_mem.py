@@ -98,6 +98,7 @@ class MemobenchMemPolicy(PI05Policy):
         alignment: objective and head that align memory with text; None without alignment.
         precision: of the weights.
         rollout: the rows of the present rollout.
+        open_loop: whether observations do not follow the actions, as in replayed episodes: no hand is stalled.
     """
 
     config_class = MemobenchMemConfig
@@ -143,7 +144,7 @@ class MemobenchMemPolicy(PI05Policy):
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
         self.rollout = Rollout(self._remembers, config.memory_stride)
-        self._watched = False
+        self._watched = self.open_loop = False
         self.reset()
         self._thread: int | None = None  # set by the first action
 
@@ -338,7 +339,7 @@ class MemobenchMemPolicy(PI05Policy):
         wanting = [number for number in acting if not rows[number].queue]
         if wanting:
             chunks = self.plan(batch, wanting, self._noise(wanting))
-            states = batch[OBS_RAW_STATE] if self.config.uses_objects else None
+            states = batch[OBS_RAW_STATE] if self.config.uses_objects and not self.open_loop else None
             for number, chunk in zip(wanting, chunks.float().cpu(), strict=True):
                 state = None if states is None else states[number]
                 rows[number].begin_chunk(chunk, self.config.n_action_steps, state)
