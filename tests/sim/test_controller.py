@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 import threading
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -276,6 +278,14 @@ def test_another_robosuite_names_the_install_command(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(metadata, "version", version)
     with pytest.raises(MemobenchError, match=r"run: pip install --no-deps robosuite==1\.4\.1$"):
         robot.robot_xml()
+
+
+def test_the_cached_arm_is_of_this_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file holds absolute paths of meshes, and environments of one machine share the folder of caches."""
+    here = robot._cache_file()
+    elsewhere = SimpleNamespace(submodule_search_locations=["/elsewhere/robosuite"])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: elsewhere)
+    assert robot._cache_file() != here
 
 
 def test_a_modified_arm_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib.metadata
+import importlib.util
 import logging
 import re
 import warnings
@@ -120,7 +121,9 @@ def arm_hash(xml: str) -> str:
 
 def _cache_file() -> Path:
     """Return the cache file of the arm, named by a hash of everything it depends on."""
-    key = hashlib.sha256(Path(__file__).read_bytes() + robosuite_version().encode()).hexdigest()[:16]
+    found = importlib.util.find_spec("robosuite")  # the file names meshes of this environment
+    places = [] if found is None else list(found.submodule_search_locations or ())
+    key = hashlib.sha256(Path(__file__).read_bytes() + repr((robosuite_version(), places)).encode()).hexdigest()[:16]
     return cache_folder() / f"panda-{key}.xml"
 
 
