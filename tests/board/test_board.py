@@ -81,7 +81,7 @@ def test_valid_submission_is_accepted(board: Path) -> None:
 def test_board_of_the_repository_is_valid() -> None:
     rows = board_rows(ROOT / "results" / "board")
     assert {row.name: row.rerun for row in rows} == dict.fromkeys((row.name for row in rows), True)
-    assert {row.name: f"{row.rates['SR'].value:.4f}" for row in rows}["memobench_expert_libero"] == "0.9960"
+    assert {row.name: f"{row.rates['SR'].value:.4f}" for row in rows}["memobench_expert_libero"] == "0.9930"
 
 
 # --- doctored submissions ---
