@@ -63,7 +63,7 @@ def test_a_strict_task_uses_the_published_scene(name: str) -> None:
     other = {key for key, region in published.regions.items() if task.regions[key] != region}
     assert other == MOVED.get(name, set())
     assert task.memory_type == published.memory_type == task.folder.parent.name
-    assert task.scene_name == published.name
+    assert task.derived_from == published.name
     assert parse_bddl(format_bddl(parse_bddl(task.bddl_text))) == parse_bddl(task.bddl_text)
 
 

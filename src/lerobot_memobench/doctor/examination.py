@@ -22,7 +22,7 @@ from lerobot_memobench.errors import unsupported_system
 from lerobot_memobench.io import cache_base
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
-from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, OBTAIN, places, unused
+from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, OBTAIN, places, unused, usable
 from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
 
 DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"
@@ -228,9 +228,9 @@ def golden_frame() -> Finding:
 def assets() -> Finding:
     """Find LIBERO's assets, of which every scene is made; name the places that are not used."""
     found = places()
-    if not found or found[-1].fault:
+    if (place := usable(found)) is None:
         return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused(found)}", OBTAIN)
-    detail = f"LIBERO's, from {found[-1].source}: {found[-1].folder} (MIT, CC BY 4.0){unused(found)}"
+    detail = f"LIBERO's, from {place.source}: {place.folder} (MIT, CC BY 4.0){unused(found)}"
     if found[0].fault and found[0].source == ASSETS_VARIABLE:
         return Finding("assets", "warning", detail, f"correct or unset {ASSETS_VARIABLE}")
     return Finding("assets", "ok", detail)

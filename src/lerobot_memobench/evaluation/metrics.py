@@ -172,11 +172,8 @@ def unsettled(records: Iterable[Record]) -> list[str]:
         if thrown := sum(not settled for settled in scenes.values()):
             counts.append(f"{thrown} of {count_of(len(scenes), 'scene')} of {task}")
     place = "results/unsettled_scenes.md lists those of the paper's seeds"
-    return (
-        [f"an object is thrown or still moves before the first action in {', '.join(counts)}; {place}"]
-        if counts
-        else []
-    )
+    note = f"an object is thrown or still moves before the first action in {', '.join(counts)}; {place}"
+    return [note] if counts else []
 
 
 def faults(records: Iterable[Record]) -> list[str]:

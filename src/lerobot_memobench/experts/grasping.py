@@ -359,14 +359,9 @@ def pick(
         yield from rise(hand, OPEN)
         yield from travel(hand, way.above, way.turned, OPEN, target=name)
         yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
+        speed, timeout = (0.6, 60) if way.grasp.width < TIGHT_GRASP else (TIGHT_GRASP_SPEED, 120)
         yield from hand.move(
-            way.at,
-            way.turned,
-            OPEN,
-            tolerance=0.005,
-            speed=0.6 if way.grasp.width < TIGHT_GRASP else TIGHT_GRASP_SPEED,
-            timeout=60 if way.grasp.width < TIGHT_GRASP else 120,
-            give_up=way.stall_check(),
+            *(way.at, way.turned, OPEN), tolerance=0.005, speed=speed, timeout=timeout, give_up=way.stall_check()
         )
         # At a shifted grasp the first finger pushes the object to the other one, so the hand does not follow it.
         yield from hand.close(None if way.shifted else way.closing, hand.rotation)

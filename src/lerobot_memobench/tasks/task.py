@@ -182,11 +182,6 @@ class Task:
         return dataclasses.replace(self, difficulty=difficulty)
 
     @property
-    def scene_name(self) -> str:
-        """Name that seeds the scene; strict tasks share the scenes of their published task."""
-        return self.derived_from or self.name
-
-    @property
     def title(self) -> str:
         """Instruction shared by all variants, or the task's name if their instructions differ."""
         return self.name.replace("_", " ") if any(variant.language for variant in self.variants) else self.language

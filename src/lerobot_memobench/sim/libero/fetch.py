@@ -19,8 +19,8 @@ def obtain() -> files.Place:
         MemobenchError: the hub cannot be reached, or has other files.
     """
     found = files.places()
-    if found and not found[-1].fault:
-        return found[-1]
+    if (place := files.usable(found)) is not None:
+        return place
     wanted, damaged = [*files.known_hashes()], any(place.source == files.HUB_CACHE for place in found)
     try:
         snapshot_download(files.REPOSITORY, repo_type="dataset", allow_patterns=wanted, force_download=damaged)
@@ -29,8 +29,7 @@ def obtain() -> files.Place:
             raise
         problem = f"{files.REPOSITORY} could not be fetched from the hub ({' '.join(str(error).split())[:300]})"
         raise MemobenchError(f"{problem}; run: {files.INSTALL}, or {files.CARRY}") from None
-    files.check_assets()
-    return files.places()[-1]
+    return files.located()
 
 
 def copy_to(folder: Path) -> int:

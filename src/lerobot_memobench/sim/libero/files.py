@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import importlib.util
 import os
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -85,10 +85,19 @@ def check_assets() -> Path:
     Raises:
         MemobenchError: no place has all files; the message lists incomplete places and how to obtain the files.
     """
-    for place in (found := places()):
-        if not place.fault:
-            return place.folder
+    return located().folder
+
+
+def located() -> Place:
+    """Return the place of LIBERO's assets that is used; errors as of `check_assets`."""
+    if (place := usable(found := places())) is not None:
+        return place
     raise MemobenchError(f"LIBERO's assets, which every scene needs, are not on this machine{unused(found)}; {OBTAIN}")
+
+
+def usable(found: Sequence[Place]) -> Place | None:
+    """Return the one of the `places` that is used, None if all have a fault."""
+    return found[-1] if found and not found[-1].fault else None
 
 
 def unused(found: Iterable[Place]) -> str:

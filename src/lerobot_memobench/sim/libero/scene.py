@@ -96,12 +96,12 @@ def build_scene(task: Task) -> Scene:
         MemobenchError: LIBERO's assets are missing or have unexpected content, or a class of the task is unknown.
     """
     with _naming(task):
-        model = scene_spec(task).compile()
+        spec = scene_spec(task)
+        model = spec.compile()
     assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
     if task.suite == STRICT:
-        strict = scene_spec(task)
-        add_detents(strict, assets)
-        model = strict.compile()
+        add_detents(spec, assets)
+        model = spec.compile()
     missing = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name, task.suite).stand_in]
 
     @cache
