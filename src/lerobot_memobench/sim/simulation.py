@@ -170,7 +170,7 @@ class Simulation:
     def _set_up(
         self, seed: int, draw: int, settling: Callable[[Callable[[Atom], bool]], None] | None, state: Array | None
     ) -> dict[str, Array]:
-        """Set one draw of the initial state, run the stabilisation steps, and return the objects' places before them."""
+        """Set one draw of the initial state, run the stabilisation steps, and return objects' places before them."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._arm_qpos] = robot.ARM_START
         self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START

@@ -3,7 +3,7 @@
 Two facts differ from other control steps:
 
 1. `set_init_state` moves the arm, and robosuite's controller reads the new pose only after the first physics step, in
-   which it exerts no torque but that against gravity. In the first control step it then returns to the pose of its reset.
+   which it exerts no torque but that against gravity. In the first control step it returns to the pose of its reset.
 2. Up to version 3.3, MuJoCo reports half the depth of contacts between boxes. In some states groceries are 29 mm inside
    the table; at full depth they would leave it twice as fast and be in the air after these steps.
 """
