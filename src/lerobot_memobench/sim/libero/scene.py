@@ -168,7 +168,6 @@ def scene_xml(task: Task, visuals: bool) -> str:
     world, assets = root.find("worldbody"), root.find("asset")
     assert world is not None
     assert assets is not None
-    _remove(world, lambda element: element.get("name") == "robot0_link7_collision")  # robosuite 1.4.0 has none
     kitchen = mjcf.arena()
     for place, element in enumerate(_kitchen(kitchen, task)):
         world.insert(place, element)
