@@ -19,7 +19,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_inf
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import TrainConfig, checkpoint_file, read_json, statistics_shapes
 from lerobot_memobench.policies.compatibility import cameras_read
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.lerobot_config import quiet, read_trainer_config
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
 
 OF_LIBERO = ("lerobot/", "HuggingFaceVLA/", "physical-intelligence/")
@@ -82,14 +82,16 @@ def check_convention(path: str | None, policy: Any, asked: str | None) -> None:
 
 
 def check_lerobots_command(environment: Any) -> PreTrainedConfig | None:
-    """Check the checkpoint that the command line of ``lerobot-eval`` names, and return its configuration.
+    """Return the configuration of the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, else None.
 
-    None for another command: a training may begin with any checkpoint.
+    The checkpoint of an evaluation is checked; a training may begin with any.
     """
-    path = parser.get_path_arg("policy")
-    if path is None or "eval" not in Path(sys.argv[0]).name:
-        return None
+    command, path = Path(sys.argv[0]).name.replace("_", "-"), parser.get_path_arg("policy")
     with quiet():
+        if command.startswith("lerobot-train"):
+            return read_trainer_config(sys.argv[1:]).policy
+        if path is None or "eval" not in command:
+            return None
         policy = PreTrainedConfig.from_pretrained(path, cli_overrides=parser.get_cli_overrides("policy") or [])
     named = parser.parse_arg("env.convention") is not None or environment.convention != UPRIGHT
     check_convention(path, policy, environment.convention if named else None)

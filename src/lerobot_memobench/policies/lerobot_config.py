@@ -10,7 +10,7 @@ import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.envs.episode_log import Acting
 from lerobot_memobench.envs.observations import policy_inputs
@@ -18,6 +18,11 @@ from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 
+if TYPE_CHECKING:
+    from lerobot.configs.train import TrainPipelineConfig
+
+WITH_PATH = ["policy", "reward_model"]
+"""Fields for which LeRobot's parser takes a ``path``."""
 SEALED_LEDGER = "sealed_tests.jsonl"
 """File in which `run.sealed` counts a policy's runs on the sealed seeds."""
 NOT_THE_CHECKPOINT = (
@@ -44,6 +49,30 @@ def overrides(key: str, flags: Sequence[str]) -> list[str]:
     given = parser.get_cli_overrides(key, flags) or []
     # LeRobot's parser takes these out before draccus reads.
     return [flag for flag in given if not flag.startswith("--discover_packages_path")]
+
+
+def read_trainer_config(flags: Sequence[str]) -> TrainPipelineConfig:
+    """Return the configuration that the flags of ``lerobot-train`` set, the policy's from the checkpoint they name."""
+    import draccus
+    from lerobot.configs import PreTrainedConfig, parser
+    from lerobot.configs.train import TrainPipelineConfig
+
+    for key, package in parser.parse_plugin_args("discover_packages_path", flags).items():
+        parser.load_plugin(package)
+        flags = parser.filter_arg(key, flags)
+    file, rest = parser.parse_arg("config_path", flags), parser.filter_path_args(WITH_PATH, flags)
+    config: TrainPipelineConfig
+    if file is None:
+        config = draccus.parse(TrainPipelineConfig, args=rest)
+    else:
+        named = parser.extract_path_fields_from_config(file, WITH_PATH)
+        config = TrainPipelineConfig.from_pretrained(named, cli_args=parser.filter_arg("config_path", rest))
+    path = parser.get_path_arg("policy", flags)
+    if path is not None:
+        given = [*parser.get_yaml_overrides("policy"), *overrides("policy", flags)]
+        config.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=given)
+        config.policy.pretrained_path = Path(path)
+    return config
 
 
 @contextmanager

@@ -44,9 +44,10 @@ from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
 from lerobot_memobench.policies.compatibility import keeps_sizes
+from lerobot_memobench.policies.lerobot_config import read_trainer_config
 from lerobot_memobench.protocol import CLOCK, IMAGE_SIZE
 from lerobot_memobench.run.arguments import LerobotArguments
-from lerobot_memobench.training.configuration import check_environment, read_config, with_features
+from lerobot_memobench.training.configuration import check_environment, with_features
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
@@ -106,7 +107,7 @@ def viewed(
     Raises:
         MemobenchError: the dataset lacks the observations, or is streamed from the hub.
     """
-    config = read_config(arguments.for_parser)
+    config = read_trainer_config(arguments.for_parser)
     given, policy = config.dataset, config.policy
     if policy is None:
         return arguments
