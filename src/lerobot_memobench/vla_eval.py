@@ -128,16 +128,16 @@ class MEMOBench(StepBenchmark):
                 f"seed {seed} belongs to the sealed test; run it by `memobench test-sealed policy=memobench_remote "
                 "dialect=vla_eval`, which counts its runs"
             )
-        prompt_in = STEPS if send_video_history else RESET
+        planned, prompt_in = replan_steps or n_action_steps, STEPS if send_video_history else RESET
         for name in DECIDED.keys() & settings.keys():
             raise MemobenchError(f"{name} is {settings[name]!r}, but follows from other arguments; set {DECIDED[name]}")
         self._settings = EnvSettings().changed(
-            **settings, seed_base=seed, replan_steps=replan_steps or n_action_steps, prompt_in=prompt_in
+            **settings, seed_base=seed, replan_steps=planned, prompt_in=prompt_in
         )
         if self._settings.suite == STRICT and replan_steps is None and n_action_steps == 1:
             raise MemobenchError(UNKNOWN_PLAN.format("replan_steps"))
-        if self._settings.replan_steps % n_action_steps:
-            raise MemobenchError(f"replan_steps is {replan_steps}; expected a multiple of {STEPS_KEY}={n_action_steps}")
+        if planned % n_action_steps:
+            raise MemobenchError(f"replan_steps is {planned}; expected a multiple of {STEPS_KEY}={n_action_steps}")
         check_loop(self._settings)
         chosen = str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks))
         selected = MemobenchEnvConfig(tasks=chosen, **asdict(self._settings)).selected()

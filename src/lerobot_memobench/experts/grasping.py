@@ -88,6 +88,8 @@ RIM_GAP_SLOPE = 0.7
 """Gap per height of the finger above the container's floor."""
 CLOSING_LEAD = 0.03
 """Reduction of the present opening for targets while closing, because the arm lags behind the fingers, m."""
+MAX_RELEASE_OFFSET = 0.03
+"""Largest horizontal distance from the target at which an object is released, m."""
 MAX_DRAWER_OFFSET = 0.025
 """Largest distance from the target in a drawer at which an object is released, m; farther away it would lean on a
 wall."""
@@ -433,10 +435,14 @@ def carry(
         target = at(clearance)()
         return np.array([target[0], target[1], max(target[2], high - 0.02)])
 
-    yield from hand.move(over, turn, CLOSED, tolerance=0.012, turn_tolerance=0.08, give_up=lost)
-    yield from hand.move(at(clearance), turn, CLOSED, tolerance=0.012, timeout=60, give_up=lost)
-    if not lost():
+    for _ in range(MAX_ATTEMPTS if hand.strict else 1):
+        yield from hand.move(over, turn, CLOSED, tolerance=0.012, turn_tolerance=0.08, give_up=lost)
+        yield from hand.move(at(clearance), turn, CLOSED, tolerance=0.012, timeout=60, give_up=lost)
+        if lost():
+            return
         yield from hand.lower(at(0.0), turn, CLOSED, tolerance=tolerance)
+        if length((hand.position - at(0.0)())[:2]) < MAX_RELEASE_OFFSET:
+            return  # otherwise a push moved the hand aside, over the rim of a bowl or in the air
 
 
 def _hand_over(hand: Hand, held: Held, destination: Target, turn: Array) -> Callable[[float], Target]:
