@@ -88,8 +88,9 @@ RIM_GAP_SLOPE = 0.7
 """Gap per height of the finger above the container's floor."""
 CLOSING_LEAD = 0.03
 """Reduction of the present opening for targets while closing, because the arm lags behind the fingers, m."""
-MAX_RELEASE_OFFSET = 0.03
-"""Largest horizontal distance from the target at which an object is released, m."""
+MAX_RELEASE_OFFSET, LEVEL_COSINE = 0.03, 0.95
+"""Largest horizontal distance from the target at which an object is released, m, and smallest upright cosine of its
+support."""
 MAX_DRAWER_OFFSET = 0.025
 """Largest distance from the target in a drawer at which an object is released, m; farther away it would lean on a
 wall."""
@@ -441,8 +442,9 @@ def carry(
         if lost():
             return
         yield from hand.lower(at(0.0), turn, CLOSED, tolerance=tolerance)
-        if length((hand.position - at(0.0)())[:2]) < MAX_RELEASE_OFFSET:
-            return  # otherwise a push moved the hand aside, over the rim of a bowl or in the air
+        tipped = support in hand.sim.assets and hand.sim.asset_pose(support)[1][2, 2] < LEVEL_COSINE
+        if not tipped and length((hand.position - at(0.0)())[:2]) < MAX_RELEASE_OFFSET:
+            return  # otherwise a push moved the hand aside: over the rim of a bowl, or in the air
 
 
 def _hand_over(hand: Hand, held: Held, destination: Target, turn: Array) -> Callable[[float], Target]:
