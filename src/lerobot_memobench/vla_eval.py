@@ -131,9 +131,7 @@ class MEMOBench(StepBenchmark):
         planned, prompt_in = replan_steps or n_action_steps, STEPS if send_video_history else RESET
         for name in DECIDED.keys() & settings.keys():
             raise MemobenchError(f"{name} is {settings[name]!r}, but follows from other arguments; set {DECIDED[name]}")
-        self._settings = EnvSettings().changed(
-            **settings, seed_base=seed, replan_steps=planned, prompt_in=prompt_in
-        )
+        self._settings = EnvSettings().changed(**settings, seed_base=seed, replan_steps=planned, prompt_in=prompt_in)
         if self._settings.suite == STRICT and replan_steps is None and n_action_steps == 1:
             raise MemobenchError(UNKNOWN_PLAN.format("replan_steps"))
         if planned % n_action_steps:
