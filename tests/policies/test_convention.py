@@ -136,7 +136,7 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(("policy", "executed"), [("--policy.type=act", 100), ("--policy.type=vqbet", 5), ("", 100)])
-def test_lerobots_trainer_evaluates_with_the_plans_of_its_policy(
+def test_lerobots_commands_evaluate_with_the_plans_of_their_policies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str, executed: int
 ) -> None:
     """A training may continue from any checkpoint."""
@@ -144,6 +144,8 @@ def test_lerobots_trainer_evaluates_with_the_plans_of_its_policy(
     monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags, "--env.type=memobench"])
     strict = MemobenchEnvConfig(tasks="10", suite="strict", log_dir=str(tmp_path / "log"))
     assert _executed(strict.create_envs(1)) == executed
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--policy.type=memobench_expert", "--env.type=memobench"])
+    assert _executed(MemobenchEnvConfig(suite="strict", tasks="10").create_envs(1)) == 1
     file = tmp_path / "train_config.json"
     file.write_text(json.dumps({"dataset": {"repo_id": "local/demos"}, "policy": {"type": "vqbet"}}))
     monkeypatch.setattr(sys, "argv", ["lerobot_train.py", f"--config_path={file}"])

@@ -19,10 +19,9 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 
 if TYPE_CHECKING:
+    from lerobot.configs.eval import EvalPipelineConfig
     from lerobot.configs.train import TrainPipelineConfig
 
-WITH_PATH = ["policy", "reward_model"]
-"""Fields for which LeRobot's parser takes a ``path``."""
 SEALED_LEDGER = "sealed_tests.jsonl"
 """File in which `run.sealed` counts a policy's runs on the sealed seeds."""
 NOT_THE_CHECKPOINT = (
@@ -51,22 +50,23 @@ def overrides(key: str, flags: Sequence[str]) -> list[str]:
     return [flag for flag in given if not flag.startswith("--discover_packages_path")]
 
 
-def read_trainer_config(flags: Sequence[str]) -> TrainPipelineConfig:
-    """Return the configuration that the flags of ``lerobot-train`` set, the policy's from the checkpoint they name."""
+def read_lerobots_config[T: (TrainPipelineConfig, EvalPipelineConfig)](kind: type[T], flags: Sequence[str]) -> T:
+    """Return the configuration that flags of a LeRobot command set, the policy's from the checkpoint that they name."""
     import draccus
     from lerobot.configs import PreTrainedConfig, parser
-    from lerobot.configs.train import TrainPipelineConfig
 
     for key, package in parser.parse_plugin_args("discover_packages_path", flags).items():
         parser.load_plugin(package)
         flags = parser.filter_arg(key, flags)
-    file, rest = parser.parse_arg("config_path", flags), parser.filter_path_args(WITH_PATH, flags)
-    config: TrainPipelineConfig
-    if file is None:
-        config = draccus.parse(TrainPipelineConfig, args=rest)
+    named = kind.__get_path_fields__()
+    file, rest = parser.parse_arg("config_path", flags), parser.filter_path_args(named, flags)
+    if file is not None:
+        file, rest = parser.extract_path_fields_from_config(file, named), parser.filter_arg("config_path", rest)
+    config: Any
+    if file is None or not hasattr(kind, "from_pretrained"):
+        config = draccus.parse(kind, config_path=file, args=rest)
     else:
-        named = parser.extract_path_fields_from_config(file, WITH_PATH)
-        config = TrainPipelineConfig.from_pretrained(named, cli_args=parser.filter_arg("config_path", rest))
+        config = kind.from_pretrained(file, cli_args=rest)
     path = parser.get_path_arg("policy", flags)
     if path is not None:
         given = [*parser.get_yaml_overrides("policy"), *overrides("policy", flags)]

@@ -18,7 +18,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import check_features
-from lerobot_memobench.policies.lerobot_config import read_trainer_config
+from lerobot_memobench.policies.lerobot_config import read_lerobots_config
 from lerobot_memobench.sim.convention import convention_of
 
 READ = frozenset(
@@ -39,7 +39,7 @@ def read_training(flags: Sequence[str]) -> TrainPipelineConfig:
     Raises:
         MemobenchError: settings do not go together.
     """
-    config, now = read_trainer_config(flags), dt.datetime.now()
+    config, now = read_lerobots_config(TrainPipelineConfig, flags), dt.datetime.now()
     policy = config.policy
     assert policy is not None
     check_settings(config)
