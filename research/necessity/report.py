@@ -116,7 +116,7 @@ LARGEST_FIGURE = 400_000
 """Bytes: the figure of the documentation is kept in the repository."""
 
 CAMERAS = ("third person", "wrist")
-TITLE_WIDTH = 80
+TITLE_WIDTH = 92
 """Largest number of characters in a line of a title."""
 
 
