@@ -331,12 +331,13 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
     else:
         cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
     cost += 0.3 if way.grasp.width > WIDE_GRASP else 0.0
-    cost += TIGHT_COST if way.grasp.width >= TIGHT_GRASP and hand.strict else 0.0
     position, _ = hand.sim.asset_pose(name)
     if _is_rim(hand, name, way.grasp):
         cost += FAR_SIDE_COST * (1.0 + float(unit(target - position) @ hand.radial(position)))
     ends = [target] if way.place is None else [target, way.place + target - position]
     stretch = max(hand.stretch(end, turn) for end in ends)
+    if way.grasp.width >= TIGHT_GRASP and hand.strict:
+        cost += TIGHT_COST * (2.0 if hand.stretch(target, turn) > MAX_STRETCH else 1.0)
     # Beyond `MAX_STRETCH` the hand stops short and closes on an edge, which slips.
     return cost + 20.0 * max(0.0, stretch - COMFORTABLE_STRETCH) + 40.0 * max(0.0, stretch - MAX_STRETCH)
 
