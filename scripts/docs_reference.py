@@ -218,7 +218,7 @@ def spaces_page() -> str:
         "expert_action": "action of the scripted expert; with `env.expert_action=true`",
         "blind_action": "action of the published routine; with `env.blind_action=true`",
     }
-    at_policy = observations.policy_names(BOTH)
+    at_policy = observations.policy_names(settings)
     rows = []
     for name, part in sorted(flat(space), key=lambda leaf: [*units].index(leaf[0])):
         policy_name = at_policy.get(name, f"observation.{name}")

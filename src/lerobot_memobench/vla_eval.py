@@ -25,7 +25,6 @@ from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
-from lerobot_memobench.sim.convention import CONVENTIONS
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 
 try:
@@ -226,7 +225,7 @@ class MEMOBench(StepBenchmark):
         return found
 
     def _picture(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
-        picture: NDArray[np.uint8] = observation["pixels"][CONVENTIONS[self._settings.convention][name]]
+        picture: NDArray[np.uint8] = observation["pixels"][self._settings.pictures[name]]
         return picture
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:

@@ -15,20 +15,23 @@ import msgpack
 import numpy as np
 import pytest
 import torch
-from lerobot.policies import make_pre_post_processors
+from lerobot.envs import preprocess_observation
+from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import OBS_IMAGES
 from vla_eval import serve_background
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote import transports as wire
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
 from lerobot_memobench.policies.remote.session import MOST_ACTIONS, fit
 from tests.support.policy_server import PolicyServer, robomme
-from tests.support.remote_case import IMPATIENT, TASK, batch, counting, frames_of, free_port, make, pictures
+from tests.support.remote_case import IMPATIENT, PATIENT, TASK, batch, counting, frames_of, free_port, make, pictures
 from tests.support.vla_eval_server import DigestServer, ScriptedServer, action, hello
 
 
@@ -38,6 +41,26 @@ def steps_of(questions: list[dict[str, Any]]) -> list[int]:
 
 
 # --- openpi ---
+
+
+def test_openpi_gets_liberos_pictures_under_its_names_whatever_the_environment_calls_them() -> None:
+    mapping = {"agentview_image": "second", "robot0_eye_in_hand_image": "first"}
+    for given in (None, mapping):
+        config = MemobenchEnvConfig(convention="libero", camera_name_mapping=given)
+        env = MemobenchEnv("turn_on_the_stove_and_turn_it_off", config.settings)
+        observed, _ = env.reset(seed=20_000)
+        upright = env.episode.images()
+        with PolicyServer() as server:
+            policy = make_policy(RemoteConfig(port=server.port, image_size=0, **PATIENT), env_cfg=config)
+            policy.reset()
+            observed = {key: np.asarray(value)[None] for key, value in observed.items() if key != "pixels"} | {
+                "pixels": {name: picture[None] for name, picture in observed["pixels"].items()}
+            }
+            policy.select_action(preprocess_observation(observed) | {"task": ["do it"]})
+        (question,) = server.questions
+        assert set(question) == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
+        for name, picture in upright.items():
+            assert np.array_equal(question[f"observation/{name}"], picture[:, ::-1])
 
 
 def test_openpi_questions_hold_the_inputs_of_its_libero_servers() -> None:

@@ -16,12 +16,22 @@ UPRIGHT, MIRRORED = "upright", "libero"
 WRIST = {UPRIGHT: "wrist_image", MIRRORED: "image2"}
 CONVENTIONS = {convention: {"image": "image", "wrist_image": wrist} for convention, wrist in WRIST.items()}
 """Convention -> camera -> name of its picture."""
+LIBERO_CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
+"""Camera -> its name in LIBERO, which LeRobot's ``camera_name_mapping`` maps to the name of its picture."""
 
 
-def shown(pictures: Mapping[str, NDArray[np.uint8]], convention: str) -> dict[str, NDArray[np.uint8]]:
+def picture_names(convention: str, mapping: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return camera -> name of its picture, by a convention and LeRobot's ``camera_name_mapping``."""
+    given = mapping or {}
+    return {camera: given.get(LIBERO_CAMERAS[camera], name) for camera, name in CONVENTIONS[convention].items()}
+
+
+def shown(
+    pictures: Mapping[str, NDArray[np.uint8]], convention: str, mapping: Mapping[str, str] | None = None
+) -> dict[str, NDArray[np.uint8]]:
     """Return each camera's upright picture (H, W, 3) by the name and in the orientation of a convention, as a copy."""
     step = -1 if convention == MIRRORED else 1
-    return {name: pictures[camera][:, ::step].copy() for camera, name in CONVENTIONS[convention].items()}
+    return {name: pictures[camera][:, ::step].copy() for camera, name in picture_names(convention, mapping).items()}
 
 
 def convention_of(features: Mapping[str, Any]) -> str | None:

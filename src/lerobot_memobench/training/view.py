@@ -125,7 +125,7 @@ def viewed(
         height, width = sizes[0]
         notify(
             f"note: {meta.root} has pictures of {height} x {width} pixels, and policy={policy.type} does not resize "
-            f"them; it cannot be evaluated on the benchmark, which has {IMAGE_SIZE} x {IMAGE_SIZE}"
+            f"them; evaluate it with observation_height={height} observation_width={width}"
         )
     if given.streaming and not (Path(meta.root) / "data").is_dir():
         if needs_view(meta.features, choice):

@@ -20,7 +20,7 @@ from lerobot_memobench.policies.baselines.modeling_baselines import UntrainedPol
 from lerobot_memobench.policies.compatibility import begins_episode, is_frozen
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.session import Row, Session
-from lerobot_memobench.protocol import ACTION_DIM, EXECUTION
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION
 
 Action = NDArray[np.float32]
 MOST_THREADS = 256
@@ -106,6 +106,7 @@ class RemotePolicy(UntrainedPolicy):
         super().__init__(config)
         self.config: RemoteConfig = config
         self._actors: list[Actor] = []
+        self._cameras = dict(zip(CAMERAS, config.image_features, strict=False))  # LeRobot's, in the environment's order
 
     def reset(self) -> None:
         """Begin a rollout. Connections stay open; a missing server is an error before any simulation."""
@@ -138,7 +139,7 @@ class RemotePolicy(UntrainedPolicy):
             )
         while len(self._actors) < rows:
             self._add_actor()
-        jobs = [partial(actor.act, Row(batch, k)) for k, actor in enumerate(self._actors[:rows])]
+        jobs = [partial(actor.act, Row(batch, k, self._cameras)) for k, actor in enumerate(self._actors[:rows])]
         return torch.from_numpy(np.stack([job() for job in jobs] if rows == 1 else [*self._pool.map(call, jobs)]))
 
     @cached_property
