@@ -513,14 +513,14 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, WORLD: FORMER, "difficulty": STANDARD, "protocol": BY_PAPER},
     **PICTURES,
-    "camera_name_mapping": None,
+    **{"camera_name_mapping": None, "robot_state": False},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, HOLD: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
     **{"window_steps": 1, "delay_steps": 0, "salt": None},
     **MEMORY_CONTROLS,
 }
 """Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
 steps per rendered picture, exists in earlier versions only."""
-OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", "camera_name_mapping", INPUTS, "salt")
+OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", "camera_name_mapping", "robot_state", INPUTS, "salt")
 """Settings that follow from the policy, and the salt, which the start of a sealed evaluation draws. They may differ
 between compared evaluations, not between parts of one."""
 EXTENT = ("tasks", "episodes")

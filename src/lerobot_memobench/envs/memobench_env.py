@@ -64,11 +64,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (H, W, 3) upright, with ``convention=libero``
     ``pixels/image`` and ``pixels/image2`` mirrored left to right, or ``environment_state`` float32 (208,): the visible
-    objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
-    position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and
-    actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began, in the execution of a
-    strict task `NO_CLOCK` or `ENDED`; optionally ``expert_action`` (7,) and ``blind_action`` (7,). A strict task is
-    held at the start of the execution and after each return home (`Pacing.hold`); observations do not show it.
+    objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector position (3, m), axis-angle (3,
+    rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and actions have no effect, 1 in
+    execution; ``step`` (1,): control steps since the phase began, in the execution of a strict task `NO_CLOCK` or
+    `ENDED`; optionally ``robot_state`` (`ROBOT_STATE`), ``expert_action`` (7,) and ``blind_action`` (7,). A strict task
+    is held at the start of the execution and after each return home (`Pacing.hold`); observations do not show it.
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
@@ -335,6 +335,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.clock], dtype=np.float32),
         }
+        if self.settings.robot_state:
+            observation["robot_state"] = self._shown.sim.robot_state()
         if self.settings.expert_action:
             observation["expert_action"] = self._offered(episode.expert_action)
         if self.settings.blind_action:

@@ -32,6 +32,13 @@ if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
     from lerobot_memobench.sim.raster.drawlist import Image
 
+ROBOT_STATE: dict[str, dict[str, tuple[int, ...]]] = {
+    "eef": {"pos": (3,), "quat": (4,), "mat": (3, 3)},
+    "gripper": {"qpos": (2,), "qvel": (2,)},
+    "joints": {"pos": (7,), "vel": (7,)},
+}
+"""Shapes of ``robot_state``, see `Simulation.robot_state`."""
+
 SPARSE, CHECKPOINTS = "sparse", "checkpoints"
 REWARDS = (SPARSE, CHECKPOINTS)
 """Values of ``reward``; see `memobench_env.MemobenchEnv`."""
@@ -176,11 +183,18 @@ def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
     if settings.obs_type != PIXELS:
         low, high = (np.tile(np.repeat(ends, [*FIELDS.values()]), SLOTS) for ends in zip(*BOUNDS.values(), strict=True))
         parts["environment_state"] = spaces.Box(low.astype(np.float32), high.astype(np.float32), (SIZE,), np.float32)
+    if settings.robot_state:
+        groups = {name: {key: _any(shape) for key, shape in group.items()} for name, group in ROBOT_STATE.items()}
+        parts["robot_state"] = spaces.Dict({name: spaces.Dict(group) for name, group in groups.items()})
     if settings.expert_action:
         parts["expert_action"] = action_space()
     if settings.blind_action:
         parts["blind_action"] = action_space()
     return spaces.Dict(parts)
+
+
+def _any(shape: tuple[int, ...]) -> spaces.Space[Any]:
+    return spaces.Box(-np.inf, np.inf, shape, np.float64)
 
 
 def action_space() -> spaces.Space[NDArray[np.float32]]:

@@ -43,13 +43,14 @@ policies the prompt plays in `reset`. ``auto`` chooses by the policy; without a 
 
 REFERENT_VALUES = (*REFERENTS, DRAWN)
 """Values of ``referent``; strict tasks always use the last one."""
+RELATIVE = "relative"
 QUALITIES = ("default", "high")
 EVERY = -1
 """Value of ``videos``: record every episode."""
 SLOWEST = 10
 """Maximum number of control steps per action, see ``speed``."""
 
-SMALLEST, LARGEST = 64, 2048
+SMALLEST, LARGEST = 16, 2048
 """Least and greatest height and width of pictures, pixels."""
 
 EXAMPLE = '{"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}'
@@ -113,9 +114,7 @@ class EnvSettings:
     )
     observation_height: int = setting(IMAGE_SIZE, "height of pictures, pixels", least=SMALLEST)
     observation_width: int = setting(IMAGE_SIZE, "width of pictures, pixels", least=SMALLEST)
-    control_mode: str = setting(
-        "relative", "actions are displacements; LIBERO's absolute ones do not exist", ("relative",)
-    )
+    control_mode: str = setting(RELATIVE, "actions are displacements; LIBERO's absolute ones do not exist")
     referent: str = setting(
         "fixed", "published goals, or goals drawn by the seed; strict tasks always draw", REFERENT_VALUES
     )
@@ -137,6 +136,7 @@ class EnvSettings:
     corrupt_step: int = setting(0, "execution step at which corrupt acts; 0: at the end of the prompt", least=0)
     reshow: bool = setting(False, "the prompt plays a second time, after corrupt has acted")
     interference: int = setting(0, "episodes of other tasks shown between prompt and execution", least=0)
+    robot_state: bool = setting(False, "add the nested robot_state of LeRobot's libero: hand, fingers and joints")
     expert_action: bool = setting(False, "add the scripted expert's action as observation.expert_action")
     blind_action: bool = setting(False, "add the blind published routine's action as observation.blind_action")
     videos: int = setting(0, "number of first episodes of each task recorded as videos; -1 for all", least=EVERY)
@@ -153,6 +153,11 @@ class EnvSettings:
             )
         if self.salt is not None and not SALT.fullmatch(str(self.salt)):
             raise MemobenchError(f"salt is {self.salt!r}; expected 32 hexadecimal digits in lower case")
+        if self.control_mode != RELATIVE:
+            raise MemobenchError(
+                f"control_mode is {self.control_mode!r}, and actions of this environment are displacements; leave "
+                f"control_mode out, and evaluate a policy of control_mode={RELATIVE}"
+            )
         self._check_pictures()
         if self.suite == STRICT:
             self._set(referent=DRAWN, horizon=self.degree.horizon if self.horizon == HORIZON else self.horizon)

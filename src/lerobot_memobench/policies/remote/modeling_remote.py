@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import OBS_STATE, OBS_STR
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -130,7 +130,7 @@ class RemotePolicy(UntrainedPolicy):
         Raises:
             MemobenchError: a server fails or does not return, or its memory cannot serve the batch.
         """
-        rows = _size(batch)
+        rows, batch = _size(batch), _flat(batch)
         limit = self.config.max_environments
         if limit is not None and rows > limit:
             raise MemobenchError(
@@ -145,6 +145,13 @@ class RemotePolicy(UntrainedPolicy):
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(MOST_THREADS, "policy-server")
+
+
+def _flat(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a batch whose parts of ``robot_state`` have names with dots, such as ``robot_state.joints.pos``."""
+    nested = f"{OBS_STR}.robot_state"
+    parts = {f"{nested}.{group}.{key}": one for group, of in batch.get(nested, {}).items() for key, one in of.items()}
+    return {name: value for name, value in batch.items() if name != nested} | parts
 
 
 def _size(batch: Mapping[str, Any]) -> int:
