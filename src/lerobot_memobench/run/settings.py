@@ -28,6 +28,7 @@ from lerobot_memobench.run.arguments import (
     read_config_file,
     translate,
     with_file,
+    without_none,
 )
 
 EXPERT = "memobench_expert"
@@ -144,7 +145,8 @@ def _typed(key: str, kind: Any, text: str) -> Any:
     named = [part for part in (typing.get_args(kind) or (kind,)) if part is not type(None)]
     if named == [str]:
         return checked
-    return yaml.safe_load(checked) if typing.get_origin(kind) is dict else draccus.decode(named[0], checked)
+    is_mapping = typing.get_origin(without_none(kind)) is dict
+    return yaml.safe_load(checked) if is_mapping else draccus.decode(named[0], checked)
 
 
 def with_policy(asked: EvaluationSettings) -> EvaluationSettings:
