@@ -230,7 +230,7 @@ class EnvSettings:
     @property
     def usual(self) -> dict[str, Any]:
         """Defaults that follow from other settings."""
-        limits: Mapping[str, int] = STEP_LIMITS
+        limits: dict[str, int] = {**STEP_LIMITS}
         mirrored = self.suite in limits and self.obs_type != OBJECTS
         return {
             "horizon": limits.get(self.suite, self.degree.horizon),
