@@ -97,7 +97,7 @@ class MemobenchEnvConfig(_WithSettings):
 
     def __post_init__(self) -> None:
         suites, self.tasks = lerobots_choice(self.task, self.task_ids, self.suite, self.tasks)
-        vars(self)["suite"] = suites[0]
+        self.__dict__.update(suite=suites[0])
         self.task, self.task_ids = None if len(suites) == 1 else ",".join(suites), None
         if self.fps != CONTROL_HZ:
             raise MemobenchError(f"env.fps is {self.fps}; the control rate is {CONTROL_HZ}, leave env.fps out")
@@ -202,7 +202,7 @@ class MemobenchEnvConfig(_WithSettings):
         if parser.parse_arg("env.seed_base") is None:
             from lerobot.configs.eval import EvalPipelineConfig
 
-            vars(self)["seed_base"] = int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0)
+            self.__dict__.update(seed_base=int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0))
         if (episodes := int(parser.parse_arg("eval.n_episodes") or 0)) > NUM_STATES:
             raise MemobenchError(
                 f"found eval.n_episodes={episodes}; tasks of {self.suite} have {NUM_STATES} initial states: ask for at "

@@ -231,7 +231,7 @@ class EnvSettings:
     @property
     def usual(self) -> dict[str, Any]:
         """Defaults that follow from other settings."""
-        limits: dict[str, int] = {**STEP_LIMITS}
+        limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
         return {
             "horizon": limits.get(self.suite, self.degree.horizon),
             "convention": MIRRORED if self.suite in limits else UPRIGHT,
