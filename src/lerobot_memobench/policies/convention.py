@@ -13,17 +13,22 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_info
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import TrainConfig, checkpoint_file, read_json, statistics_shapes
 from lerobot_memobench.policies.compatibility import cameras_read
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.lerobot_config import quiet, read_lerobots_config
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
 
 OF_LIBERO = ("lerobot/", "HuggingFaceVLA/", "physical-intelligence/")
 """Owners of LIBERO's data on the hub. Other datasets of that name may be of this package."""
+
+LEROBOTS_COMMANDS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalPipelineConfig}
+"""LeRobot's command -> its configuration."""
 
 
 def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
@@ -83,15 +88,19 @@ def check_convention(path: str | None, policy: Any, asked: str | None, usual: st
 
 
 def check_lerobots_command(environment: Any) -> PreTrainedConfig | None:
-    """Check the checkpoint that the command line of ``lerobot-eval`` names, and return its configuration.
+    """Return the configuration of the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, else None.
 
-    None for another command: a training may begin with any checkpoint.
+    The checkpoint of an evaluation is checked; a training may begin with any.
     """
-    path = parser.get_path_arg("policy")
-    if path is None or "eval" not in Path(sys.argv[0]).name:
+    command = Path(sys.argv[0]).name.replace("_", "-")
+    kind = next((kind for name, kind in LEROBOTS_COMMANDS.items() if command.startswith(name)), None)
+    if kind is None:
         return None
     with quiet():
-        policy = PreTrainedConfig.from_pretrained(path, cli_overrides=parser.get_cli_overrides("policy") or [])
+        policy = read_lerobots_config(kind, sys.argv[1:]).policy
+    path = parser.get_path_arg("policy")
+    if kind is TrainPipelineConfig or path is None:
+        return policy
     usual = environment.settings.usual["convention"]
     named = parser.parse_arg("env.convention") is not None or environment.convention != usual
     check_convention(path, policy, environment.convention if named else None, usual)
