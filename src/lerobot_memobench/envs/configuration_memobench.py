@@ -6,9 +6,10 @@ loads it at the first reset.
 
 from __future__ import annotations
 
+import sys
 import typing
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from datetime import datetime
 from functools import partial
 from itertools import count
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
-from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.configs import PipelineFeatureType, PolicyFeature, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 
@@ -35,7 +36,17 @@ from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import AUTO, INTACT, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
-from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.tasks.catalogue import (
+    find_tasks,
+    group_of,
+    lerobots_choice,
+    load_task,
+    resolve_tasks,
+    task_folder,
+    task_index,
+)
+from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
 """Called with a task's folder, the number of rows, and whether each row runs in its own process."""
@@ -60,13 +71,15 @@ _WithSettings: Any = make_dataclass(
 @EnvConfig.register_subclass("memobench")
 @dataclass
 class MemobenchEnvConfig(_WithSettings):
-    """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural.
+    """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural; or those of LIBERO.
 
     The fields are those of `EnvSettings` and:
 
     Args:
         tasks: `all`, memory types, task names, numbers and ranges of numbers (12, 3-7), separated by commas.
-        task: LeRobot's field of every environment; sets ``tasks``.
+        task: LeRobot's field of every environment; sets ``suite`` if it names suites of LIBERO, else ``tasks``.
+            Several suites are run with their own defaults and logs, in LeRobot's commands only.
+        task_ids: ids of LIBERO's tasks, from 0.
         task_dir: folder in the published format (one task, or a tree of tasks) that replaces the catalogue.
         log_dir: folder of the episode log; by default a dated folder in ``outputs/eval``. In a folder with a log, the
             log goes to a subfolder ``evaluation-2`` and so on, unless ``resume`` is set.
@@ -74,6 +87,7 @@ class MemobenchEnvConfig(_WithSettings):
     """
 
     task: str | None = None
+    task_ids: list[int] | None = None
     tasks: str = "all"
     task_dir: str | None = None
     log_dir: str | None = None
@@ -86,10 +100,9 @@ class MemobenchEnvConfig(_WithSettings):
     features_map: dict[str, str] = field(default_factory=policy_names)
 
     def __post_init__(self) -> None:
-        if self.task is not None:
-            if self.tasks != "all":
-                raise MemobenchError(f"env.task={self.task} and env.tasks={self.tasks} are both given; remove env.task")
-            self.tasks, self.task = self.task, None
+        suites, self.tasks = lerobots_choice(self.task, self.task_ids, self.suite, self.tasks)
+        self.__dict__.update(suite=suites[0])
+        self.task, self.task_ids = None if len(suites) == 1 else ",".join(suites), None
         if self.fps != CONTROL_HZ:
             raise MemobenchError(f"env.fps is {self.fps}; the control rate is {CONTROL_HZ}, leave env.fps out")
         for name, value in asdict(self.settings).items():  # some follow from the protocol and the suite
@@ -120,8 +133,6 @@ class MemobenchEnvConfig(_WithSettings):
         Raises:
             MemobenchError: a task is unknown or of another suite, or a control applies to no chosen task.
         """
-        from lerobot_memobench.tasks.catalogue import find_tasks, load_task, resolve_tasks, task_folder, task_index
-
         tasks: list[tuple[str, int, Path]]
         if self.task_dir is not None:
             loaded = [load_task(folder) for folder in find_tasks(self.task_dir)]
@@ -133,8 +144,8 @@ class MemobenchEnvConfig(_WithSettings):
                     )
             tasks = [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
         else:
-            folders = [task_folder(name) for name in resolve_tasks(self.tasks, self.suite)]
-            tasks = [(folder.parent.name, task_index(folder.name), folder) for folder in folders]
+            names = resolve_tasks(self.tasks, self.suite)
+            tasks = [(group_of(name), task_index(name), task_folder(name)) for name in names]
         if self.settings.needs_prompt:
             tasks = [task for task in tasks if load_task(task[2]).prompt is not None]
             if not tasks:
@@ -155,8 +166,12 @@ class MemobenchEnvConfig(_WithSettings):
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return ``{memory type: {task id: vector env}}``; the first reset of an env starts its simulation.
 
-        LeRobot's own commands call this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
+        A suite of LIBERO replaces the memory type, as in LeRobot's environment ``libero``. LeRobot's own commands call
+        this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
         """
+        if self.task is not None:
+            return self._envs_of_suites(self.task.split(","), n_envs, use_async_envs)
+        self._number_as_lerobot()
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
         self.declare_plans(type(self).check_policy(self))
@@ -165,6 +180,35 @@ class MemobenchEnvConfig(_WithSettings):
         for memory_type, task_id, folder in chosen:
             suites.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
         return suites
+
+    def _envs_of_suites(
+        self, suites: Sequence[str], n_envs: int, use_async_envs: bool
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """Return the environments of several suites of LIBERO, each with its own defaults and folder of its log."""
+        folder, found = self.resolved_log_dir(), dict[str, dict[int, gym.vector.VectorEnv]]()
+        for suite in suites:
+            own = asdict(self.settings.changed(suite=suite))
+            one = replace(self, task=None, log_dir=str(folder / suite), **own)
+            found |= one.create_envs(n_envs, use_async_envs)
+        return found
+
+    def _number_as_lerobot(self) -> None:
+        """Let the first episode of ``lerobot-eval`` in a suite of LIBERO have the first initial state.
+
+        Raises:
+            MemobenchError: there are more episodes than initial states.
+        """
+        if self.suite not in LIBERO_SUITES or "eval" not in Path(sys.argv[0]).name:
+            return
+        if parser.parse_arg("env.seed_base") is None:
+            from lerobot.configs.eval import EvalPipelineConfig
+
+            self.__dict__.update(seed_base=int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0))
+        if (episodes := int(parser.parse_arg("eval.n_episodes") or 0)) > NUM_STATES:
+            raise MemobenchError(
+                f"found eval.n_episodes={episodes}; tasks of {self.suite} have {NUM_STATES} initial states: ask for at "
+                f"most {NUM_STATES}"
+            )
 
     def declare_plans(self, policy: Any) -> None:
         """Set the actions and frames of a plan from a policy's configuration; the rest is the user's.

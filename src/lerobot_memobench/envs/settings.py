@@ -18,7 +18,6 @@ from lerobot_memobench.protocol import (
     BY_PAPER,
     EVALUATION_SEED,
     HOLD_MEAN,
-    HORIZON,
     IMAGE_SIZE,
     PROMPT_HORIZON,
     PROTOCOLS,
@@ -29,7 +28,8 @@ from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRROR
 from lerobot_memobench.sim.scene_hash import LIBERO, SCENE_HASH_VERSION, WORLD
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
-from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
+from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
+from lerobot_memobench.tasks.task import DRAWN, LIBERO_SUITES, PUBLISHED, REFERENTS, STRICT, SUITES
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
@@ -82,6 +82,13 @@ UPSTREAM_ONLY = {
     **MEMORY_CONTROLS,
 }
 """Settings with a fixed value in the authors' evaluation."""
+LIBERO_ONLY = {
+    **{"difficulty": STANDARD, "protocol": BY_PAPER, "referent": REFERENTS[0], "oracle_memory": False},
+    **{"evidence": False, "salt": None, "expert_action": False, "blind_action": False, "obs_type": PIXELS},
+    **MEMORY_CONTROLS,
+}
+"""Settings with a fixed value in LIBERO's suites. Their tasks have no checkpoints, prompts, variants and expert, and
+object slots lack their classes."""
 
 
 def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None) -> Any:
@@ -103,12 +110,20 @@ class EnvSettings:
         MemobenchError: a value is not accepted, or two settings are incompatible.
     """
 
-    suite: str = setting(PUBLISHED, "published tasks, or strict: 30 variants that need a memory", SUITES)
+    suite: str = setting(
+        PUBLISHED,
+        "published tasks, strict: 30 variants that need a memory, or a suite of LIBERO",
+        (*SUITES, *LIBERO_SUITES),
+    )
     difficulty: str = setting(STANDARD, "number of repetitions in strict tasks", DIFFICULTIES)
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
     obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
-    convention: str = setting(UPRIGHT, "pictures upright, or mirrored and named as in LIBERO's data", [*CONVENTIONS])
+    convention: str = setting(
+        None,
+        "pictures upright, or mirrored and named as in LIBERO's data; the default follows the suite",
+        [*CONVENTIONS],
+    )
     camera_name_mapping: dict[str, str] | None = setting(  # noqa: RUF009 - its default is None
         None, "with convention=libero: LIBERO's name of each camera -> name of its picture"
     )
@@ -120,7 +135,7 @@ class EnvSettings:
     )
     demonstration_prompt: bool = setting(True, "object and procedural tasks start with their demonstration prompt")
     prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or in reset", PROMPT_IN)
-    horizon: int = setting(HORIZON, "execution steps per episode; the default follows the difficulty", least=1)
+    horizon: int = setting(None, "execution steps per episode; the default follows suite and difficulty", least=1)
     replan_steps: int | None = setting(
         None, "actions executed per prediction; pauses start, and holds end, between chunks", least=1
     )
@@ -142,6 +157,7 @@ class EnvSettings:
     videos: int = setting(0, "number of first episodes of each task recorded as videos; -1 for all", least=EVERY)
 
     def __post_init__(self) -> None:
+        self._set(**{name: value for name, value in self.usual.items() if getattr(self, name) is None})
         for each in fields(self):
             self._check(each.name, str(each.type), each.metadata)
         if self.referent == DRAWN and self.suite != STRICT:
@@ -158,15 +174,18 @@ class EnvSettings:
                 f"control_mode is {self.control_mode!r}, and actions of this environment are displacements; leave "
                 f"control_mode out, and evaluate a policy of control_mode={RELATIVE}"
             )
+        if self.suite in LIBERO_SUITES:
+            self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
         self._check_pictures()
         if self.suite == STRICT:
-            self._set(referent=DRAWN, horizon=self.degree.horizon if self.horizon == HORIZON else self.horizon)
+            self._set(referent=DRAWN)
         elif self.difficulty != STANDARD:
             raise MemobenchError(
                 f"difficulty={self.difficulty} is for strict tasks; set suite={STRICT}, or leave it out"
             )
         if self.protocol == UPSTREAM:
-            self._follow_upstream()
+            self._require(UPSTREAM_ONLY, f"protocol={UPSTREAM}, the authors' evaluation,")
+            self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
         if self.evidence:
             check_referent(self.referent)
         self._check_memory_controls()
@@ -240,16 +259,15 @@ class EnvSettings:
         elif accepted["values"] and value not in accepted["values"]:
             check_choice(name, value, accepted["values"])
 
-    def _follow_upstream(self) -> None:
-        """Set the values of the authors' evaluation; raise for conflicting ones."""
-        for name, value in UPSTREAM_ONLY.items():
+    def _require(self, fixed: Mapping[str, Any], reason: str) -> None:
+        """Raise for a setting with another value than the fixed one."""
+        for name, value in fixed.items():
             asked = getattr(self, name)
             if asked != value:
                 raise MemobenchError(
-                    f"{name} is {str(asked).lower()}, but protocol={UPSTREAM}, the authors' evaluation, requires "
+                    f"{name} is {str(asked).lower()}, but {reason} requires "
                     f"{name}={str(value).lower()}; leave one of the two out"
                 )
-        self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
@@ -259,6 +277,15 @@ class EnvSettings:
     def degree(self) -> Degree:
         """Repetitions and horizon of the difficulty."""
         return degree_of(self.difficulty)
+
+    @property
+    def usual(self) -> dict[str, Any]:
+        """Defaults that follow from other settings."""
+        limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
+        return {
+            "horizon": limits.get(self.suite, self.degree.horizon),
+            "convention": MIRRORED if self.suite in limits else UPRIGHT,
+        }
 
     @property
     def longest_interference(self) -> int:
@@ -275,9 +302,8 @@ class EnvSettings:
         for name in changes:
             if name not in known:
                 raise MemobenchError(f"unknown environment setting {name!r}; {nearest(name, known)}")
-        if "difficulty" in changes and self.horizon == self.degree.horizon:
-            changes = {"horizon": HORIZON} | changes  # the new difficulty has its own
-        return replace(self, **changes)
+        following = {name: None for name, value in self.usual.items() if getattr(self, name) == value}
+        return replace(self, **following | changes)
 
     @property
     def protocol_block(self) -> dict[str, Any]:

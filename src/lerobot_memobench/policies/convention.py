@@ -54,17 +54,18 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
     return (UPRIGHT if has[UPRIGHT] else None), why
 
 
-def check_convention(path: str | None, policy: Any, asked: str | None) -> None:
-    """Refuse pictures of another convention than a policy's, and upright ones by default if its own is unclear.
+def check_convention(path: str | None, policy: Any, asked: str | None, usual: str = UPRIGHT) -> None:
+    """Refuse pictures of another convention than a policy's, and the suite's by default if its own is unclear.
 
     Args:
         path: folder or repository of its checkpoint, or None. policy: its configuration.
-        asked: the convention that was named; None: none was, and pictures are upright.
+        asked: the convention that was named; None: none was, and pictures are as is usual in the suite.
+        usual: convention of the suite.
 
     Raises:
         MemobenchError: naming the commands that run it.
     """
-    check_choice("convention", asked or UPRIGHT, [*WRIST])
+    check_choice("convention", asked or usual, [*WRIST])
     found: str | None = UPRIGHT
     if getattr(policy, "uses_detector", False):
         why = "its detector reads them"
@@ -79,9 +80,9 @@ def check_convention(path: str | None, policy: Any, asked: str | None) -> None:
             f"the policy {name} may expect upright pictures or mirrored ones as LIBERO's ({why}); run "
             f"`{command}{UPRIGHT}` or `{command}{MIRRORED}`, with lerobot-eval --env.convention="
         )
-    if found not in (None, asked or UPRIGHT):
+    if found not in (None, asked or usual):
         raise MemobenchError(
-            f"the policy {name} expects pictures of convention={found} ({why}), and found {asked or UPRIGHT}; run "
+            f"the policy {name} expects pictures of convention={found} ({why}), and found {asked or usual}; run "
             f"`{command}{found}`, or `lerobot-eval --env.type=memobench --policy.path={name} --env.convention={found}`"
         )
 
@@ -100,6 +101,7 @@ def check_lerobots_command(environment: Any) -> PreTrainedConfig | None:
     path = parser.get_path_arg("policy")
     if kind is TrainPipelineConfig or path is None:
         return policy
-    named = parser.parse_arg("env.convention") is not None or environment.convention != UPRIGHT
-    check_convention(path, policy, environment.convention if named else None)
+    usual = environment.settings.usual["convention"]
+    named = parser.parse_arg("env.convention") is not None or environment.convention != usual
+    check_convention(path, policy, environment.convention if named else None, usual)
     return policy
