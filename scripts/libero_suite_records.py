@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scripts.libero_records import (
-    FIELDS,
     NO_OP,
     STABILISATION_STEPS,
     fields,
@@ -47,14 +46,45 @@ HANDS = [*((suite, k) for suite in SUITES if suite != "libero_90" for k in (1, 3
 HANDS += [("libero_90", k) for k in (10, 30, 50, 70)]
 """Tasks of driven hands: 100 smooth random actions from initial state 0."""
 HAND_STEPS, SMOOTHNESS = 100, 0.9
-SCENES = [
-    (suite, k) for suite in ("libero_spatial", "libero_object", "libero_goal", "libero_10") for k in range(0, 10, 2)
-]
-SCENES += [("libero_90", k) for k in (0, 3, 10, 14, 18, 22, 26, 28, 32, 36, 38, 42, 47, 50, 55, 62, 65, 70, 77, 83)]
-"""Tasks of pictures, initial state k % 50 for entry k."""
+SCENES = [(suite, k) for suite in SUITES if suite != "libero_90" for k in range(0, 10, 2)]
+SCENES += [("libero_90", k) for k in (0, 6, 11, 18, 22, 28, 33, 35, 38, 40, 46, 50, 55, 60, 65, 69, 73, 77, 81, 86)]
+"""Tasks of pictures, all 20 scenes of libero_90 among them; entry k shows initial state k."""
 SIZE = 256
 OBSERVED = [("libero_spatial", 0), ("libero_object", 3), ("libero_10", 3)]
 """Tasks of observations by LeRobot's environment and processor, episode 0: after reset and after two steps."""
+
+OPEN, CLOSED = -1.0, 1.0
+Waypoint = tuple[str, tuple[float, float, float], float, int]
+"""Body or site, offset from it when the waypoint becomes the current one, m, gripper action, and fewest steps."""
+
+
+def carry(thing: str, place: str, grasp: tuple[float, float, float], drop: float) -> list[Waypoint]:
+    """Return the waypoints that grasp an object at an offset and drop it from a height over a place."""
+    x, y, z = grasp
+    return [
+        *((thing, (x, y, z + 0.12), OPEN, 0), (thing, grasp, OPEN, 0), (thing, grasp, CLOSED, 12)),
+        *((thing, (x, y, z + 0.22), CLOSED, 0), (place, (x, y, z + 0.25), CLOSED, 0)),
+        *((place, (x, y, z + drop), CLOSED, 0), (place, (x, y, z + drop), OPEN, 15), (place, (x, y, 0.25), OPEN, 0)),
+    ]
+
+
+SUCCESSES: dict[tuple[str, int], list[Waypoint]] = {
+    ("libero_spatial", 2): carry("akita_black_bowl_1", "plate_1", (0.0, 0.045, 0.04), 0.02),
+    ("libero_object", 1): carry("cream_cheese_1", "basket_1", (0.0, 0.0, 0.0), 0.15),
+    ("libero_goal", 6): carry("cream_cheese_1", "akita_black_bowl_1", (0.0, 0.0, 0.0), 0.1),
+    ("libero_10", 7): [
+        *carry("alphabet_soup_1", "basket_1", (0.0, 0.0, 0.02), 0.13),
+        *carry("cream_cheese_1", "basket_1", (0.0, 0.0, 0.0), 0.15),
+    ],
+    ("libero_90", 0): [
+        ("wooden_cabinet_1_top_region", (0.0, 0.2, 0.1), CLOSED, 0),
+        ("wooden_cabinet_1_top_region", (0.0, 0.2, 0.01), CLOSED, 0),
+        ("wooden_cabinet_1_top_region", (0.0, -0.1, 0.01), CLOSED, 0),
+    ],
+}
+"""Task -> waypoints of an execution from initial state 0 that succeeds."""
+WAYPOINT_STEPS, REACHED, STEP_LENGTH = 100, 0.006, 0.05
+"""Most steps to a waypoint, its tolerance and the displacement of a full action, m."""
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -63,12 +93,12 @@ class Place(NamedTuple):
     """A task of LIBERO."""
 
     suite: str
-    index: int
+    number: int
 
     @property
     def file(self) -> str:
         """Name of the task's records."""
-        return f"{self.suite}.{self.index:02}.npz"
+        return f"{self.suite}.{self.number:02}.npz"
 
 
 ALL = [Place(suite, index) for suite, count in SUITES.items() for index in range(count)]
@@ -111,7 +141,7 @@ def make(place: Place, images: bool = False) -> Any:
     from libero.libero.envs.env_wrapper import ControlEnv
 
     env = ControlEnv(
-        suite_of(place).get_task_bddl_file_path(place.index),
+        suite_of(place).get_task_bddl_file_path(place.number),
         use_camera_obs=images,
         has_offscreen_renderer=images,
         camera_heights=SIZE,
@@ -123,7 +153,7 @@ def make(place: Place, images: bool = False) -> Any:
 
 def initial_states(place: Place) -> NDArray[np.float64]:
     """Return LIBERO's initial states of a task: time, qpos, qvel, (50, 1 + nq + nv)."""
-    return np.asarray(suite_of(place).get_task_init_states(place.index))
+    return np.asarray(suite_of(place).get_task_init_states(place.number))
 
 
 def start(env: Any, states: NDArray[np.float64], episode: int) -> Any:
@@ -154,7 +184,7 @@ def models(place: Place, env: Any) -> Arrays:
     (model,) = COMPILED.values()
     cameras = [model.camera(name).id for name in ("agentview", "robot0_eye_in_hand")]
     seen = {name: np.array(getattr(model, name)[cameras]) for name in ("cam_pos", "cam_quat", "cam_fovy", "cam_bodyid")}
-    return {**fields(model), **seen, "name": np.array(suite_of(place).get_task(place.index).name)}
+    return {**fields(model), **seen, "name": np.array(suite_of(place).get_task(place.number).name)}
 
 
 def first_states(place: Place, env: Any) -> Arrays:
@@ -202,23 +232,23 @@ def perturbed_states(
         set_joints(env, rng)
         env.sim.forward()
         for atom in atoms:
-            word, thing, *place = atom.split()
+            _, thing, *place = atom.split()
             if place and rng.random() < 0.85:
                 put(env, thing, place[0], heights.setdefault(atom, []), k, rng)
         if k < SETTLED:
             data.qvel[:] = 0
             settle(model, data)
             for atom in atoms:
-                word, thing, *place = atom.split()
+                _, thing, *place = atom.split()
                 if place:
-                    heights[atom].append(float(data.qpos[address_of(model, thing) + 2]))
+                    heights.setdefault(atom, []).append(float(data.qpos[address_of(model, thing) + 2]))
         yield np.array(data.qpos)
 
 
 def set_joints(env: Any, rng: np.random.Generator) -> None:
     """Set random positions of drawers, doors and knobs, half of them near a threshold of their class."""
     model, data = env.sim.model._model, env.sim.data._data
-    for name, fixture in env.env.fixtures_dict.items():
+    for fixture in env.env.fixtures_dict.values():
         edges = {0.0}.union(*fixture.object_properties.get("articulation", {}).values())
         for joint in fixture.joints:
             low, high = model.joint(joint).range
@@ -254,7 +284,7 @@ def address_of(model: mujoco.MjModel, thing: str) -> int:
 def hands(place: Place, env: Any) -> Arrays:
     """Record qpos and grip site of a driven hand, and the observed hand, at each step."""
     start(env, initial_states(place), 0)
-    rng, action, found = np.random.default_rng(place.index), np.zeros(7), []
+    rng, action, found = np.random.default_rng(place.number), np.zeros(7), []
     played = []
     for _ in range(HAND_STEPS):
         action = SMOOTHNESS * action + (1 - SMOOTHNESS) * rng.uniform(-1, 1, 7) * 3
@@ -266,9 +296,33 @@ def hands(place: Place, env: Any) -> Arrays:
     return {"actions": np.array(played), "qpos": qpos, "eef": site, "observed_eef": observed}
 
 
+def successes(place: Place, env: Any) -> Arrays:
+    """Record the actions of a scripted execution up to its success, and qpos at each step."""
+    start(env, initial_states(place), 0)
+    actions, qpos = [], []
+    for name, offset, gripper, fewest in SUCCESSES[place.suite, place.number]:
+        target = position_of(env, name) + offset
+        for step in range(WAYPOINT_STEPS):
+            away = target - env.sim.data.get_site_xpos("gripper0_grip_site")
+            if step >= fewest and np.abs(away).max() < REACHED:
+                break
+            actions.append(np.array([*np.clip(away / STEP_LENGTH, -1, 1), 0, 0, 0, gripper]))
+            env.step(actions[-1])
+            qpos.append(np.array(env.sim.data.qpos))
+            if env.check_success():
+                return {"actions": np.array(actions), "qpos": np.array(qpos), "success": np.array(len(actions))}
+    raise AssertionError(f"no success in {place}")
+
+
+def position_of(env: Any, name: str) -> NDArray[np.float64]:
+    """Return the position of an object, fixture or site."""
+    bodies = env.env.obj_body_id
+    return np.array(env.sim.data.body_xpos[bodies[name]] if name in bodies else env.sim.data.get_site_xpos(name))
+
+
 def pictures(place: Place, env: Any) -> Arrays:
     """Record both pictures of an episode's start, upright, and its state."""
-    episode = SCENES.index(tuple(place)) % STATES
+    episode = SCENES.index((place.suite, place.number))
     start(env, initial_states(place), episode)
     env.env._update_observables(force=True)
     observation = env.env._get_observations(force_update=True)
@@ -286,7 +340,7 @@ def observations(place: Place, env: Any) -> Arrays:
 
     found: Arrays = {}
     for mode in ("relative", "absolute"):
-        raw = LiberoEnv(suite_of(place), place.index, place.suite, obs_type="pixels_agent_pos", control_mode=mode)
+        raw = LiberoEnv(suite_of(place), place.number, place.suite, obs_type="pixels_agent_pos", control_mode=mode)
         observation, _ = raw.reset(seed=FIRST_SEED)
         eef = observation["robot_state"]["eef"]["pos"]
         for step in range(3):
@@ -298,7 +352,7 @@ def observations(place: Place, env: Any) -> Arrays:
             found[f"{mode}.{step}.qpos"] = np.array(raw._env.sim.data.qpos)
             action = np.array([0.3, -0.4, 0.2, 0.1, -0.2, 0.3, 1.0])
             if mode == "absolute":
-                action = np.array([*(eef + [0.02, -0.03, 0.01]), 3.1, 0.05, -0.1, 1.0])
+                action = np.array([*(eef + np.array([0.02, -0.03, 0.01])), 3.1, 0.05, -0.1, 1.0])
             found[f"{mode}.{step}.action"] = action
             observation = raw.step(action)[0]
         found[f"{mode}.fixtures"] = fixture_poses(raw._env.env)
@@ -326,6 +380,7 @@ KINDS: dict[str, tuple[Callable[[Place, Any], Arrays], list[Place]]] = {
     "states": (states, ALL),
     "predicates": (predicates, ALL),
     "hands": (hands, [Place(*place) for place in HANDS]),
+    "successes": (successes, [Place(*place) for place in SUCCESSES]),
     "pictures": (pictures, [Place(*place) for place in SCENES]),
     "observations": (observations, [Place(*place) for place in OBSERVED]),
 }
