@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -323,13 +323,20 @@ def position_of(env: Any, name: str) -> NDArray[np.float64]:
 def pictures(place: Place, env: Any) -> Arrays:
     """Record both pictures of an episode's start, upright, and its state."""
     episode = SCENES.index((place.suite, place.number))
-    start(env, initial_states(place), episode)
-    env.env._update_observables(force=True)
-    observation = env.env._get_observations(force_update=True)
     names = ("agentview_image", "robot0_eye_in_hand_image")
+    show(env, names, False)  # the steps before need no pictures
+    start(env, initial_states(place), episode)
+    show(env, names, True)
+    observation = env.env._get_observations(force_update=True)
     images = np.array([observation[name][::-1] for name in names])
     state = {"qpos": np.array(env.sim.data.qpos), "fixtures": fixture_poses(env.env)}
     return {"images": images, "episode": np.array(episode), **state}
+
+
+def show(env: Any, names: Iterable[str], enabled: bool) -> None:
+    """Switch the pictures of an observation on or off."""
+    for name in names:
+        env.env.modify_observable(name, "enabled", enabled)
 
 
 def observations(place: Place, env: Any) -> Arrays:
@@ -339,8 +346,9 @@ def observations(place: Place, env: Any) -> Arrays:
     from lerobot.processor.env_processor import LiberoProcessorStep
 
     found: Arrays = {}
+    raw = LiberoEnv(suite_of(place), place.number, place.suite, obs_type="pixels_agent_pos")
     for mode in ("relative", "absolute"):
-        raw = LiberoEnv(suite_of(place), place.number, place.suite, obs_type="pixels_agent_pos", control_mode=mode)
+        raw.control_mode, raw.init_state_id = mode, 0
         observation, _ = raw.reset(seed=FIRST_SEED)
         eef = observation["robot_state"]["eef"]["pos"]
         for step in range(3):
@@ -356,7 +364,7 @@ def observations(place: Place, env: Any) -> Arrays:
             found[f"{mode}.{step}.action"] = action
             observation = raw.step(action)[0]
         found[f"{mode}.fixtures"] = fixture_poses(raw._env.env)
-        raw.close()
+    raw.close()
     return found
 
 
