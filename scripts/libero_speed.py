@@ -153,13 +153,17 @@ def suite(python: str) -> None:
         for camera in MJCF_CAMERAS:
             sim.render(camera)
 
+    def step(sim: Simulation) -> None:
+        sim.step(ACTION)
+        render(sim)
+
     ours: dict[str, list[float]] = {name: [] for name in BLOCKS}
     stock: dict[str, list[float]] = {name: [] for name in BLOCKS}
     construction, sim = cpu_seconds(start)
     constructions = construction, stock_seconds()
     operations: dict[str, Callable[[], Any]] = {
         "reset": lambda: reset(sim),
-        "step with two pictures": lambda: (sim.step(ACTION), render(sim)),
+        "step with two pictures": lambda: step(sim),
         "step without": lambda: sim.step(ACTION),
     }
     for _ in range(TURNS):

@@ -287,8 +287,8 @@ def address_of(model: mujoco.MjModel, thing: str) -> int:
 def hands(place: Place, env: Any) -> Arrays:
     """Record qpos and grip site of a driven hand, and the observed hand, at each step."""
     start(env, initial_states(place), 0)
-    rng, action, found = np.random.default_rng(place.number), np.zeros(7), []
-    played = []
+    rng, found, played = np.random.default_rng(place.number), [], []
+    action: NDArray[np.float64] = np.zeros(7)
     for _ in range(HAND_STEPS):
         action = SMOOTHNESS * action + (1 - SMOOTHNESS) * rng.uniform(-1, 1, 7) * 3
         played.append(np.clip(action, -1, 1))
@@ -410,7 +410,7 @@ def record(kinds: list[str], out: Path) -> None:
             path = out / kind / place.file
             path.parent.mkdir(parents=True, exist_ok=True)
             draft = path.with_suffix(".draft.npz")
-            np.savez_compressed(draft, **KINDS[kind][0](place, env))
+            np.savez_compressed(draft, allow_pickle=False, **KINDS[kind][0](place, env))
             os.replace(draft, path)
             print(kind, path.name, flush=True)
         if env is not None:
