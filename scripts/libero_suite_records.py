@@ -419,21 +419,14 @@ def record(kinds: list[str], out: Path) -> None:
 
 
 def pack(records: Path, path: Path) -> None:
-    """Write the part of the records that the tests use: fingerprints of all models, and some of each suite."""
-    kept: Arrays = {}
-    known = {place: dict(np.load(records / "models" / place.file)) for place in ALL}
-    names = [name for name in known[ALL[0]] if not name.startswith(("cam_", "name"))]
-    kept["tasks"] = np.array([str(stored["name"]) for stored in known.values()])
-    kept["fields"] = np.array(names)
-    kept["fingerprints"] = np.array([[fingerprint(stored[name]) for name in names] for stored in known.values()])
-    for place in (Place(*key) for key in SUCCESSES):
-        for kind, count in (("first_states", 2), ("predicates", 60), ("successes", None)):
-            stored = dict(np.load(records / kind / place.file))
-            for name, values in stored.items():
-                every = kind == "successes" or name == "atoms" or (kind, name) == ("predicates", "fixtures")
-                part = values if every else values[::8] if kind == "predicates" else values[:count]
-                kept[f"{place.suite}:{kind}:{name}"] = part
-        del kept[f"{place.suite}:successes:qpos"]
+    """Write the part of the records that the tests use: fingerprints of all models, and the successes' actions."""
+    known = [dict(np.load(records / "models" / place.file)) for place in ALL]
+    names = [name for name in known[0] if not name.startswith(("cam_", "name"))]
+    kept: Arrays = {"tasks": np.array([str(stored["name"]) for stored in known]), "fields": np.array(names)}
+    kept["fingerprints"] = np.array([[fingerprint(stored[name]) for name in names] for stored in known])
+    for suite, number in SUCCESSES:
+        kept[f"{suite}:task_id"] = np.array(number)
+        kept[f"{suite}:actions"] = np.load(records / "successes" / Place(suite, number).file)["actions"]
     np.savez_compressed(path, allow_pickle=False, **kept)
 
 
@@ -444,7 +437,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     if args.kinds == ["pack"]:
-        pack(args.out, RECORDS / "suites.npz")
+        pack(args.out, RECORDS / "executions.npz")
     else:
         record(args.kinds, args.out)
 
