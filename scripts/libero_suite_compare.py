@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.sim.libero.scene import get_scene
+from lerobot_memobench.sim.scene import SUBSTEPS
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.libero_suites import get_libero_task, initial_states, libero_tasks
@@ -143,7 +144,37 @@ def pictures(place: Place, kept: Arrays) -> Differences:
         yield camera, 1, float(np.abs(ours - theirs).mean())
 
 
+def observations(place: Place, kept: Arrays) -> Differences:
+    """Compare LeRobot's observations after the reset and after two steps of relative actions.
+
+    Stock LIBERO takes fingers and joints from 2 ms before the end of the control step, and the hand from 4 ms before.
+    """
+    sim = simulate(place)
+    start(sim, 0)
+    yield "fixtures (LeRobot loads the model once more)", 1, apart(poses(sim), kept["relative.fixtures"])
+    shown, hand, fingers = simulate(place), sim.proprio(), sim.proprio()
+    for step in range(3):
+        theirs = kept[f"relative.{step}.processed.observation.state"][0]
+        yield f"state at the end of step {step}", 1, apart(sim.proprio(), theirs)
+        if step:
+            yield f"earlier_state of step {step}", 1, apart([*hand[:6], *fingers[6:]], theirs)
+        for camera, name in zip(CAMERAS, ("image", "image2"), strict=True):
+            image = 255 * kept[f"relative.{step}.processed.observation.images.{name}"][0].transpose(1, 2, 0)
+            set_recorded(shown, kept[f"relative.{step}.qpos"], kept["relative.fixtures"])
+            ours = shown.render(camera).astype(float)
+            yield f"mirrored_{camera} at step {step}", 1, float(np.abs(ours[:, ::-1] - image).mean())
+            yield f"unmirrored_{camera} at step {step}", 1, float(np.abs(ours - image).mean())
+        action = kept[f"relative.{step}.action"]
+        sim._controller.set_goal(sim.data, action)
+        sim._controller.advance(sim.data, float(action[6]), SUBSTEPS - 2)
+        hand = sim.proprio()
+        sim._controller.advance(sim.data, float(action[6]), 1)
+        fingers = sim.proprio()
+        sim._controller.advance(sim.data, float(action[6]), 1)
+
+
 KINDS: dict[str, tuple[Callable[[Place, Arrays], Differences], str, float]] = {
+    "observations": (observations, "observations", 1e-5),
     "models": (models, "models", 0.0),
     "first_states": (states, "first_states", 1e-9),
     "states": (states, "states", 1e-9),
@@ -180,7 +211,7 @@ def compare(kind: str, records: Path, suites: list[str]) -> None:
             if not difference <= bound:
                 outside += 1
                 shown += 1
-                if shown <= 4:
+                if shown <= (4 if kind != "observations" else 99):
                     print(f"{kind} | {path.stem} | {name} | {difference:.3g}", flush=True)
     summary = ", ".join(f"{name} {difference:.2g}" for name, difference in sorted(largest.items()))
     print(f"{kind}: {tasks} tasks, {values} values, {outside} outside {bound:g}; largest {summary}", flush=True)
