@@ -35,10 +35,10 @@ def settling_step(controller: OSCController, model: mujoco.MjModel, data: mujoco
             _halve_depth_of_boxes(model, data)
         if first and substep == 0:
             controller.apply_gravity(data, -1.0)
+            mujoco.mj_step2(model, data)
+            mujoco.mj_step1(model, data)
         else:
-            controller.apply(data, -1.0)
-        mujoco.mj_step2(model, data)
-        mujoco.mj_step1(model, data)
+            controller.advance(data, -1.0, 1)
 
 
 def _halve_depth_of_boxes(model: mujoco.MjModel, data: mujoco.MjData) -> None:
