@@ -95,7 +95,7 @@ SUITE, TASK_ID = "libero_spatial", 0
 TASK_COUNT, EPISODES, LIMIT = 10, 50, 280
 BLOCKS = {"reset": 1, "step with two pictures": 10, "step without": 30}
 """Operation -> its repetitions in a turn."""
-TURNS = 5
+TURNS = 3
 
 
 def serve() -> None:
@@ -115,8 +115,12 @@ def serve() -> None:
         simulator = env._env.env
         for camera in ("agentview", "robot0_eye_in_hand"):
             simulator.modify_observable(f"{camera}_image", "enabled", name != "step without")
-        operation = (lambda: env.reset(seed=7)) if name == "reset" else (lambda: env.step(np.array(ACTION)))
-        print("seconds", repeated(operation, BLOCKS[name]), flush=True)
+        operations: dict[str, Callable[[], Any]] = {
+            "reset": lambda: env.reset(seed=7),
+            "step with two pictures": lambda: env.step(np.array(ACTION)),
+            "step without": lambda: (env._env.step(ACTION), env._env.check_success()),
+        }
+        print("seconds", repeated(operations[name], BLOCKS[name]), flush=True)
 
 
 def repeated(operation: Callable[[], Any], count: int) -> float:
