@@ -9,6 +9,7 @@ difference. Run it under MuJoCo 3.3.7, the version of the records.
 from __future__ import annotations
 
 import argparse
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -186,11 +187,15 @@ KINDS: dict[str, tuple[Callable[[Place, Arrays], Differences], str, float]] = {
 """Kind -> its comparison, the folder of its records and the largest difference."""
 
 
+SHOWN = 4
+"""Most differences of a task that are printed."""
+
+
 def compare(kind: str, records: Path, suites: list[str]) -> None:
     """Print the differences of a kind."""
     function, folder, bound = KINDS[kind]
     tasks = values = outside = 0
-    largest: dict[str, float] = {}
+    differences: dict[str, list[float]] = defaultdict(list)
     for place in ALL:
         path = records / folder / place.file
         if place.suite not in suites or not path.exists():
@@ -207,14 +212,14 @@ def compare(kind: str, records: Path, suites: list[str]) -> None:
         for name, count, difference in found:
             values += count
             group = name.split()[0] if kind != "models" else kind
-            largest[group] = max(largest.get(group, 0.0), difference)
+            differences[group].append(difference)
             if not difference <= bound:
                 outside += 1
                 shown += 1
-                if shown <= (4 if kind != "observations" else 99):
+                if shown <= SHOWN:
                     print(f"{kind} | {path.stem} | {name} | {difference:.3g}", flush=True)
-    summary = ", ".join(f"{name} {difference:.2g}" for name, difference in sorted(largest.items()))
-    print(f"{kind}: {tasks} tasks, {values} values, {outside} outside {bound:g}; largest {summary}", flush=True)
+    summary = ", ".join(f"{name} {max(found):.2g} ({np.mean(found):.2g})" for name, found in differences.items())
+    print(f"{kind}: {tasks} tasks, {values} values, {outside} outside {bound:g}; largest (mean) {summary}", flush=True)
 
 
 def main() -> None:
