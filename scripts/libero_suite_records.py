@@ -427,7 +427,15 @@ def pack(records: Path, path: Path) -> None:
     for suite, number in SUCCESSES:
         kept[f"{suite}:task_id"] = np.array(number)
         kept[f"{suite}:actions"] = np.load(records / "successes" / Place(suite, number).file)["actions"]
-    np.savez_compressed(path, allow_pickle=False, **kept)
+    np.savez_compressed(path / "executions.npz", allow_pickle=False, **kept)
+    seen: Arrays = {}
+    for place in (Place(*key) for key in OBSERVED[:2]):
+        for name, values in np.load(records / "observations" / place.file).items():
+            if name.startswith("relative.") and "processed.observation.images" not in name:
+                thinned = values[::4, ::4] if "raw.pixels" in name else values
+                if "raw.pixels" not in name or ".0." in name:
+                    seen[f"{place.suite}:{name.removeprefix('relative.')}"] = thinned
+    np.savez_compressed(path / "observations.npz", allow_pickle=False, **seen)
 
 
 def main() -> None:
@@ -437,7 +445,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     if args.kinds == ["pack"]:
-        pack(args.out, RECORDS / "executions.npz")
+        pack(args.out, RECORDS)
     else:
         record(args.kinds, args.out)
 
