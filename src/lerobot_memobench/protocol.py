@@ -18,13 +18,13 @@ PROMPT_HORIZON = 1500
 """Maximum number of control steps of a demonstration prompt. Hiding two objects takes some 750, and more than 1000 if
 one of them is grasped at the fifth attempt."""
 HOLD_SHAPE, HOLD_MEAN, LONGEST_HOLD = 0.5, 600, 6000
-"""Holds of strict tasks: at the start of the execution and at each return home, actions have no effect for a number of
-control steps that the seed draws. Holds at a return have a gamma distribution with this shape and mean, cut at the
-longest hold. The first hold of a task without a prompt is uniform up to the longest one, because these tasks ask for
-events that a clock could time; of a task with a prompt it has the gamma distribution too. `research.necessity.clock`
-computes what a policy that knows the elapsed time alone can reach."""
+"""Holds of strict tasks: at the start of the execution and at home after each event, actions have no effect for a
+number of control steps that the seed draws. Holds after an event have a gamma distribution with this shape and mean,
+cut at the longest hold. The first hold of a task without a prompt is uniform up to the longest one, because these tasks
+ask for events that a clock could time; of a task with a prompt it has the gamma distribution too.
+`research.necessity.clock` computes what a policy that knows the elapsed time alone can reach."""
 MOST_HOLDS = 30
-"""Number of drawn holds per episode; later ones have the shortest length. No task needs more than 10 returns."""
+"""Number of drawn holds per episode; later ones have the shortest length. No task needs more than 10."""
 PROMPT, EXECUTION = 0, 1
 """Values of ``phase``. In `PROMPT` the prompt plays, and actions have no effect."""
 OBS_PHASE, OBS_STEP = CLOCK = ("observation.phase", "observation.step")

@@ -1,4 +1,4 @@
-"""Holds at home are longer than a plan, are not observable, and do not depend on the variant."""
+"""Holds at home follow events alone, are longer than a plan and not observable, and do not depend on the variant."""
 
 from __future__ import annotations
 
@@ -12,8 +12,13 @@ from lerobot_memobench.envs.pacing import Pacing, shortest_hold
 from lerobot_memobench.envs.settings import BOTH, EnvSettings
 from lerobot_memobench.protocol import HOLD_MEAN, LONGEST_HOLD, MOST_HOLDS
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.formula import Atom
 
 COUNTING = "check_the_top_drawer_a_given_number_of_times"
+THREE_DRAWERS = "check_all_three_drawers_once_each_in_the_given_order"
+TOP, MIDDLE = "wooden_cabinet_1_top_region", "wooden_cabinet_1_middle_region"
+OPEN = -0.15
+"""Position of an open drawer, m."""
 REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 UP = np.array([0, 0, 1, 0, 0, 0, -1], np.float32)
 
@@ -61,7 +66,7 @@ def test_holds_are_heavy_tailed_and_do_not_depend_on_the_variant() -> None:
     assert len(set(lengths)) == 1
 
 
-def test_holds_at_the_start_and_after_each_return_are_not_observable() -> None:
+def test_holds_at_the_start_and_after_an_event_are_not_observable() -> None:
     env = MemobenchEnv(COUNTING, obs_type=BOTH, replan_steps=5)
     first, _ = env.reset(seed=20_001)
     episode = env.episode
@@ -73,9 +78,10 @@ def test_holds_at_the_start_and_after_each_return_are_not_observable() -> None:
         _assert_equal(seen, first)
     assert started % 5 == 0
     assert episode.exec_steps == 0
-    for _ in range(12):  # away, more than 5 cm
-        seen, *_ = env.step(UP)
-    assert episode.sim.is_away
+    for position in (0.0, OPEN, 0.0):
+        _put(episode, {TOP: position})
+        for _ in range(5):
+            env.step(UP)
     for _ in range(200):
         if not episode.action_has_effect:
             break
@@ -91,57 +97,60 @@ def test_holds_at_the_start_and_after_each_return_are_not_observable() -> None:
     env.close()
 
 
-def test_a_hand_that_stays_near_home_is_not_held_again() -> None:
-    episode = Episode(get_task(COUNTING))
-    episode.reset(20_001)
-    _held(episode)
-    for action in (0.5 * UP - 0.5 * REST, REST, REST, -0.5 * UP + 1.5 * REST, REST, REST, REST, REST):
-        episode.step(action)
-        assert episode.action_has_effect
+@pytest.mark.parametrize(("name", "variants"), [(COUNTING, range(3)), (THREE_DRAWERS, range(6))])
+def test_a_hold_follows_an_event_and_the_return_to_the_scene_as_it_began(name: str, variants: range) -> None:
+    """The same motion in each variant: an idle trip, a drawer opened, shut as another opens, and all shut."""
+    episode, found = Episode(get_task(name)), set()
+    for variant in variants:
+        episode.reset(20_001, variant=variant)
+        drawn = list(episode._draw_holds())
+        lengths = [_held(episode)]
+        for joints in ({}, {TOP: OPEN}, {TOP: 0.0, MIDDLE: OPEN}, {MIDDLE: 0.0}, {}):
+            lengths.append(_trip(episode, joints))
+        assert lengths == [drawn[0], 0, 0, 0, drawn[1], 0]
+        found.add((episode.exec_steps, *lengths))
+    assert len(found) == 1
 
 
-def test_a_turned_hand_is_away() -> None:
-    episode = Episode(get_task(COUNTING))
-    episode.reset(20_001)
-    _held(episode)
-    for _ in range(20):
-        episode.step(_home(episode, turn=1.0))
-        assert np.linalg.norm(episode.sim.eef_pose()[0] - episode.sim.home[0]) < 0.05
-    assert episode.sim.is_away
-    for _ in range(60):
-        if not episode.action_has_effect:
-            break
-        episode.step(_home(episode, turn=-_turned(episode) / 0.5))
-    assert not episode.action_has_effect
-
-
-def test_a_mark_that_disappears_at_home_is_held() -> None:
+def test_a_scene_that_becomes_as_it_began_at_home_is_held_after_an_event() -> None:
     episode = Episode(get_task(COUNTING))
     episode.reset(20_001)
     _held(episode)
     place = episode.sim.data.joint("akita_black_bowl_1_joint0").qpos
-    place[0] += 0.003
-    for _ in range(3):
+    for event in (False, True):
+        place[0] += 0.003
+        for joints in ({TOP: OPEN}, {TOP: 0.0}) if event else ({},):
+            assert _trip(episode, joints) == 0
+        place[0] -= 0.0025
         episode.step(REST)
-        assert episode.sim.caught_at_home
-        assert episode.action_has_effect
-    place[0] -= 0.0025
-    episode.step(REST)
-    assert not episode.action_has_effect
+        assert episode.sim.holds(Atom("asbegun", ()))
+        assert episode.action_has_effect != event
 
 
-def _home(episode: Episode, turn: float = 0.0) -> NDArray[np.float32]:
-    """Return the action (7,) that moves the open hand home, and turns it about the vertical."""
+def _trip(episode: Episode, joints: dict[str, float]) -> int:
+    """Leave home, put joints to positions, return and wait; return the length of the hold."""
+    for _ in range(8):
+        episode.step(UP)
+    _put(episode, joints)
+    for _ in range(60):
+        episode.step(_home(episode))
+        if episode.sim.caught_at_home:
+            break
+    assert episode.sim.caught_at_home
+    return _held(episode)
+
+
+def _put(episode: Episode, joints: dict[str, float]) -> None:
+    for name, position in joints.items():
+        episode.sim.data.qpos[episode.sim.world.joints[name][1]] = position
+    episode.step(UP)
+
+
+def _home(episode: Episode) -> NDArray[np.float32]:
+    """Return the action (7,) that moves the open hand home."""
     action = REST.copy()
     action[:3] = (episode.sim.home[0] - episode.sim.eef_pose()[0]) / 0.05
-    action[5] = turn
     return np.clip(action, -1, 1)
-
-
-def _turned(episode: Episode) -> float:
-    """Return the rotation of the hand from home about the vertical, rad."""
-    turn = episode.sim.eef_pose()[1] @ episode.sim.home[1].T
-    return float(np.arctan2(turn[1, 0], turn[0, 0]))
 
 
 def _held(episode: Episode) -> int:

@@ -94,7 +94,7 @@ def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
 @pytest.mark.parametrize(
     ("asked", "found"),
     [
-        ({"suite": STRICT, "referent": "fixed"}, {"referent": "drawn", HOLD: HOLD_MEAN, GOALS: 3}),
+        ({"suite": STRICT, "referent": "fixed"}, {"referent": "drawn", HOLD: HOLD_MEAN, GOALS: 4}),
         ({"protocol": "upstream"}, {"demonstration_prompt": False, "horizon": UPSTREAM_HORIZON}),
         ({"protocol": "upstream", "horizon": 5}, {"horizon": 5}),
         ({}, {"horizon": HORIZON, "seed_base": EVALUATION_SEED, WORLD: LIBERO}),

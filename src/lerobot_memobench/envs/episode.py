@@ -47,10 +47,8 @@ from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.libero_suites import initial_states
 from lerobot_memobench.tasks.memory_text import subtask_texts
-from lerobot_memobench.tasks.progress import Progress
+from lerobot_memobench.tasks.progress import AS_BEGUN, Progress
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task, referent_text
-
-AS_BEGUN = Atom("asbegun", ())
 
 
 class Fault(NamedTuple):
@@ -131,7 +129,7 @@ class Episode:
         self.exec_start: int | None = None
         self.pacing = Pacing(self.settings, self._rng(4))
         self.rested = False
-        self._away, self._as_begun, self._holds = False, True, self._draw_holds()
+        self._event, self._holds = False, self._draw_holds()
         self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
         self.prompt_shown: bool | None = None
         self.drifted = False
@@ -318,26 +316,22 @@ class Episode:
         self.step_index += 1
         if self.rested:
             return
-        self._hold_at_home()
         self.progress.step(self.sim.holds)
+        self._hold_after_event()
         self._corrupt_at(self.exec_steps)
         if self.choice is not None:
             self.choice.step(self.sim.holds)
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong_atoms)
 
-    def _hold_at_home(self) -> None:
-        """Begin a hold when the hand of a strict task has come home from somewhere else.
+    def _hold_after_event(self) -> None:
+        """Begin a hold when the scene is as it began, with the hand at home, and a strict task's event has passed.
 
-        Also when it waits there until the scene is as it began: a mark that disappears by itself must not be
-        remembered across a hold.
+        Other returns are not held: a policy with a clock could use them to choose the time of its next event.
         """
-        if self.sim.caught_at_home:
-            as_begun = self.sim.holds(AS_BEGUN)
-            if self._away or (as_begun and not self._as_begun):
-                self.pacing.hold(next(self._holds, 0))
-            self._away, self._as_begun = False, as_begun
-        elif self.sim.is_away:
-            self._away = True
+        self._event = self._event or self.progress.event
+        if self._event and self.sim.caught_at_home and self.sim.holds(AS_BEGUN):
+            self.pacing.hold(next(self._holds, 0))
+            self._event = False
 
     def _act(self, action: ArrayLike) -> Fault | None:
         """Execute the policy's action; return the fault, if any."""

@@ -6,9 +6,9 @@ same; only their times change.
 A pause starts and ends between two chunks of ``replan_steps`` actions, because losing part of a chunk would disturb the
 motion, not the sense of time. A lower speed stretches a chunk as a whole; actions received meanwhile have no effect.
 
-A hold begins when a strict task's hand comes home, and ends between two chunks. It is longer than a plan: the first
-plan that has an effect after it has observed home alone. So neither a chunk of actions nor a window of observations
-carries a fact past home.
+A hold begins when a strict task's hand comes home after an event, and ends between two chunks. It is longer than a
+plan: the first plan that has an effect after it has observed home alone. So neither a chunk of actions nor a window of
+observations carries the event past home.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lerobot_memobench.tasks.task import STRICT
 STEPS_BETWEEN_PAUSES = (20, 120)
 """Smallest and largest number of execution steps between two pauses, drawn uniformly."""
 FEWEST_STEPS_AWAY = 2
-"""Smallest number of execution steps between two holds: an action moves the hand by at most 5 cm."""
+"""Smallest number of execution steps between two holds: the hand leaves home and returns."""
 
 
 class Pacing:

@@ -70,10 +70,10 @@ PICTURES: Mapping[str, Any] = {
 MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0}
 """Settings of corruption and interference, with their values in the protocol."""
 
-HOLD, GOALS, STRICT_GOALS = "hold", "goals", 3
+HOLD, GOALS, STRICT_GOALS = "hold", "goals", 4
 """Protocol keys of strict tasks: mean control steps of a hold, and revision of the goals. Goals of revision 1 could be
 reached without memory by marks in the scene and a clock, goals of revision 2 by a camera inside a drawer and by a plan
-that passes home."""
+that passes home, goals of revision 3 by a clock, because returns without an event were held."""
 SCENE_HASHES = "scene_hash_version"
 """Protocol key: version of the hash of scenes (`sim.scene_hash`)."""
 UPSTREAM_ONLY = {

@@ -427,11 +427,6 @@ class Simulation:
         return self._start.home
 
     @property
-    def is_away(self) -> bool:
-        """Whether the hand is so far from home that it may have moved something."""
-        return self._start.is_away()
-
-    @property
     def at_detent(self) -> bool:
         """Whether the hand is within the detent at home, which catches it at rest; strict scenes only."""
         return self._at_home is not None and self._start.at_detent()

@@ -32,9 +32,6 @@ ON_SITE_BELOW, ON_SITE_ABOVE = 0.005, 0.10
 
 DETENT_DISTANCE = 0.02
 """Largest distance of the grip site from home for the detent, m; twice the error of learned policies."""
-AWAY_DISTANCE, AWAY_ANGLE = 0.05, 0.5
-"""Distance (m) and rotation (rad) of the hand from home beyond which it is away. Within both the arm is 2 cm or more
-from all fixtures and objects; within the distance alone a turned hand's wrist reaches knobs and drawers."""
 DETENT_ANGLE = 0.1
 """Largest rotation of the hand from home for the detent, rad."""
 DETENT_OPENING = 0.01
@@ -334,11 +331,6 @@ class StartState:
     def in_detent(self) -> bool:
         """Return whether the open hand is near home and at rest, so that the detent catches it."""
         return self.at_detent() and bool(np.all(self._speed() <= DETENT_SPEED))
-
-    def is_away(self) -> bool:
-        """Return whether the hand is so far from home that it may have moved something."""
-        distance, angle = self._from_home()
-        return distance > AWAY_DISTANCE or angle > AWAY_ANGLE
 
     def at_detent(self) -> bool:
         """Return whether the open hand is close enough to home for the detent, at any speed."""

@@ -6,15 +6,16 @@ Semantics: the benchmark's task files (BDDL goals and metadata goals), paper sec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
-from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, When, atoms, children
+from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, Round, When, atoms, children
 from lerobot_memobench.tasks.nodes import build
 from lerobot_memobench.tasks.task import Task
 
 #: Consecutive evaluations for which a child of ``Then`` must hold before it is done. There is one evaluation per
 #: control step; the authors' code makes two.
 HOLD_STEPS = 10
+AS_BEGUN = Atom("asbegun", ())
 
 
 class Evaluator:
@@ -92,6 +93,7 @@ class Progress:
     Attributes (steps count from 1, None before the event; K checkpoints):
         steps: control steps taken since ``reset``.
         success: whether the goal holds now.
+        event: whether an event was completed in this step: a `Round` from any scene, of any variant's goal.
         satisfied: (K,) whether the checkpoint's predicate holds now.
         first_step: (K,) first step at which the predicate held.
         ordered_step: (K,) first step at which it held after all earlier checkpoints were completed in order; several
@@ -101,7 +103,9 @@ class Progress:
 
     def __init__(self, task: Task, evaluations: int = 1) -> None:
         self.task, self._evaluations = task, evaluations
-        self._evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
+        goals = [task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)]
+        events = {event for k in range(task.num_variants) for event in _events(task.variant(k).goal)}
+        self._evaluator = Evaluator([*goals, *events])
         self.reset()
 
     def reset(self) -> None:
@@ -109,7 +113,7 @@ class Progress:
         self._evaluator.reset()
         count = len(self.task.checkpoints)
         self.steps = 0
-        self.success = False
+        self.success = self.event = False
         self.satisfied: tuple[bool, ...] = (False,) * count
         self.first_step: list[int | None] = [None] * count
         self.ordered_step: list[int | None] = [None] * count
@@ -140,8 +144,9 @@ class Progress:
         """Evaluate the state after one control step; ``holds`` evaluates atoms. Return ``success``."""
         self.steps += 1
         for _ in range(self._evaluations):
-            self.success, *satisfied = self._evaluator.step(holds)
-        self.satisfied = tuple(satisfied)
+            self.success, *values = self._evaluator.step(holds)
+        satisfied, events = values[: len(self.satisfied)], values[len(self.satisfied) :]
+        self.satisfied, self.event = tuple(satisfied), any(events)
         for k, now in enumerate(satisfied):
             if now and self.first_step[k] is None:
                 self.first_step[k] = self.steps
@@ -149,3 +154,11 @@ class Progress:
             self.ordered_step[self.index] = self.steps
             self.index += 1
         return self.success
+
+
+def _events(formula: Formula) -> Iterator[Round]:
+    """Yield the rounds of a goal that may begin in any scene."""
+    if isinstance(formula, Round) and AS_BEGUN not in formula.children:
+        yield formula
+    for child in children(formula):
+        yield from _events(child)
