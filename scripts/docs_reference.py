@@ -515,8 +515,8 @@ def cards_page(suite: str, memory_type: str) -> str:
     ]
     if suite == "strict":
         parts.append(
-            "The scene is [held](protocol.md#holds) at the start of each execution and at each return of the hand "
-            "home. [Limitations of this suite](suites.md#limits-of-the-strict-suite)."
+            "The scene is [held](protocol.md#holds) at the start of each execution and after each event. "
+            "[Limitations of this suite](suites.md#limits-of-the-strict-suite)."
         )
     for name in task_names(memory_type, suite):
         parts += task_parts(task_number(name), get_task(name))

@@ -2,14 +2,14 @@
 
     python -m research.necessity.clock
 
-After each release from home such a policy chooses from the elapsed steps what to begin next, or to wait, because the
-observation is always the same. It waits within 5 cm of home, where no hold begins and no rest is counted, as long as
-the horizon allows. Holds of random length (`protocol.HOLD_MEAN`) blur the steps, but elapsed time grows with each
-event, so no law makes it worthless. The steps are divided into bins; each has one choice or the wait. A random choice
-could not be better: a bin is shorter than an event, so an episode uses it once. Changes of random intervals of bins are
-kept unless the rate falls. The best plan of several starts is rated on other sampled episodes: on its own sample its
-rate is up to six points higher. The rate is a lower bound of what such a policy can reach. Idle trips, each of which
-draws a hold, and open fixtures as marks are not among the choices; with them a clock reaches more.
+After each hold such a policy chooses from the elapsed steps what to begin next, or to wait, because the observation
+is always the same. It waits near home, where no rest is counted, as long as the horizon allows. Holds of random
+length (`protocol.HOLD_MEAN`) blur the steps, but elapsed time grows with each event, so no law makes it worthless.
+The steps are divided into bins; each has one choice or the wait. A random choice could not be better: a bin is
+shorter than an event, so an episode uses it once. Changes of random intervals of bins are kept unless the rate falls.
+The best plan of several starts is rated on other sampled episodes: on its own sample its rate is up to six points
+higher. The rate is a lower bound of what such a policy can reach. Idle trips are not held, so they are waits; waits
+at an open fixture are not among the choices.
 """
 
 from __future__ import annotations

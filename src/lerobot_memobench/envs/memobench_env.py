@@ -68,7 +68,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and actions have no effect, 1 in
     execution; ``step`` (1,): control steps since the phase began, in the execution of a strict task `NO_CLOCK` or
     `ENDED`; optionally ``robot_state`` (`ROBOT_STATE`), ``expert_action`` (7,) and ``blind_action`` (7,). A strict task
-    is held at the start of the execution and after each return home (`Pacing.hold`); observations do not show it.
+    is held at the start of the execution and after each event (`Pacing.hold`); observations do not show it.
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
