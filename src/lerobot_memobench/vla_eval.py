@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig, check_loop
+from lerobot_memobench.envs.configuration_memobench import UNKNOWN_PLAN, MemobenchEnvConfig, check_loop
 from lerobot_memobench.envs.episode_log import Acting
 from lerobot_memobench.envs.evaluation_file import check_protocol
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
@@ -25,8 +25,9 @@ from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
-from lerobot_memobench.sim.convention import CONVENTIONS
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
+from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 try:
     from vla_eval.benchmarks.base import StepBenchmark, StepResult
@@ -52,7 +53,6 @@ STATES, STATE_HISTORY, STEP = "states", "state_history", "step"
 SUCCESS, STEPS_KEY = "success", "n_action_steps"
 DECIDED = {
     "seed_base": "seed",
-    "replan_steps": STEPS_KEY,
     "prompt_in": "send_video_history",
     "obs_type": "send_state and send_wrist_image",
     "mirror": "convention to libero",  # an argument of earlier versions
@@ -63,11 +63,12 @@ DECIDED = {
 class MEMOBench(StepBenchmark):
     """The tasks of one suite; episode i of each task has the scene of seed ``seed`` + i.
 
-    Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3); ``states`` float32 (8,):
-    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) of
-    `MemobenchEnv`. The first observation of an episode with a demonstration prompt also contains ``video_history`` and
-    ``wrist_video_history``, lists of pictures, ``state_history``, a list of states, and ``episode_restart``. Frames
-    of the rest between prompt and execution are omitted, because they equal the first observation.
+    Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (H, W, 3); ``states`` float32 (8,): end-effector
+    position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) and, with
+    ``robot_state=True``, ``robot_state`` of `MemobenchEnv`. The first observation of an episode with a demonstration
+    prompt also contains ``video_history`` and ``wrist_video_history``, lists of pictures, ``state_history``, a list of
+    states, and ``episode_restart``. Frames of the rest between prompt and execution are omitted, because they equal the
+    first observation.
 
     Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`.
 
@@ -78,7 +79,9 @@ class MEMOBench(StepBenchmark):
         tasks: `all`, memory types, task names or numbers, separated by commas or as a list.
         seed: seed of episode 0.
         history_every: interval of the sent frames of the prompt, control steps.
-        n_action_steps: actions executed per answer, open-loop. A pause starts and ends between two answers.
+        n_action_steps: actions executed per answer, open-loop.
+        replan_steps: actions per plan of the server, which may answer one action and queue the rest (its
+            ``chunk_size``); default ``n_action_steps``. Strict tasks need it, because holds are longer than a plan.
         send_wrist_image: whether the wrist camera is sent. The harness sets this and the next two arguments from the
             hello message of a model server.
         send_state: whether the arm's state is sent.
@@ -105,6 +108,7 @@ class MEMOBench(StepBenchmark):
         seed: int = EVALUATION_SEED,
         history_every: int = 1,
         n_action_steps: int = 1,
+        replan_steps: int | None = None,
         send_wrist_image: bool = True,
         send_state: bool = True,
         send_video_history: bool = True,
@@ -125,12 +129,14 @@ class MEMOBench(StepBenchmark):
                 f"seed {seed} belongs to the sealed test; run it by `memobench test-sealed policy=memobench_remote "
                 "dialect=vla_eval`, which counts its runs"
             )
-        prompt_in = STEPS if send_video_history else RESET
+        planned, prompt_in = replan_steps or n_action_steps, STEPS if send_video_history else RESET
         for name in DECIDED.keys() & settings.keys():
             raise MemobenchError(f"{name} is {settings[name]!r}, but follows from other arguments; set {DECIDED[name]}")
-        self._settings = EnvSettings().changed(
-            **settings, seed_base=seed, replan_steps=n_action_steps, prompt_in=prompt_in
-        )
+        self._settings = EnvSettings().changed(**settings, seed_base=seed, replan_steps=planned, prompt_in=prompt_in)
+        if self._settings.suite == STRICT and replan_steps is None and n_action_steps == 1:
+            raise MemobenchError(UNKNOWN_PLAN.format("replan_steps"))
+        if planned % n_action_steps:
+            raise MemobenchError(f"replan_steps is {planned}; expected a multiple of {STEPS_KEY}={n_action_steps}")
         check_loop(self._settings)
         chosen = str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks))
         selected = MemobenchEnvConfig(tasks=chosen, **asdict(self._settings)).selected()
@@ -147,7 +153,7 @@ class MEMOBench(StepBenchmark):
         self._history: dict[str, list[NDArray[Any]]] = {}
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """Return the chosen tasks; a suite of the harness is a memory type, as in LeRobot."""
+        """Return the chosen tasks; a suite of the harness is a memory type, or one of LIBERO's, as in LeRobot."""
         return [{"name": name, "suite": memory_type} for name, (memory_type, _) in self._tasks.items()]
 
     def reset(self, task: dict[str, Any]) -> dict[str, Any]:
@@ -159,7 +165,12 @@ class MEMOBench(StepBenchmark):
         if self._env is None or self._env.task != task["name"]:
             self.cleanup()
             self._env = self._make(self._tasks[task["name"]][1])
-        observation, info = self._env.reset(seed=self._settings.seed_base + int(task.get("episode_idx", 0)))
+        number = int(task.get("episode_idx", 0))
+        if self._settings.suite in LIBERO_SUITES and number >= NUM_STATES:
+            raise MemobenchError(
+                f"{task['name']} has no initial state {number}; set episodes_per_task to {NUM_STATES} or less"
+            )
+        observation, info = self._env.reset(seed=self._settings.seed_base + number)
         self._history = {}
         while "fault" not in info and observation["phase"][0] == PROMPT:
             step, shows = int(observation[STEP][0]), not self._env.episode.idling
@@ -220,13 +231,15 @@ class MEMOBench(StepBenchmark):
         }
         if self._send_state:
             found[STATES] = raw_obs["agent_pos"]
+        if self._settings.robot_state:
+            found["robot_state"] = raw_obs["robot_state"]
         if self._history:
             found |= {**self._history, "episode_restart": True}
             self._history = {}
         return found
 
     def _picture(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
-        picture: NDArray[np.uint8] = observation["pixels"][CONVENTIONS[self._settings.convention][name]]
+        picture: NDArray[np.uint8] = observation["pixels"][self._settings.pictures[name]]
         return picture
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
@@ -247,7 +260,8 @@ class MEMOBench(StepBenchmark):
 
     def get_metric_keys(self) -> dict[str, str]:
         """Return the metrics that the harness averages over episodes."""
-        return dict.fromkeys((SUCCESS, *PROCESS_METRICS), "mean")
+        process = () if self._settings.suite in LIBERO_SUITES else PROCESS_METRICS
+        return dict.fromkeys((SUCCESS, *process), "mean")
 
     def get_metadata(self) -> dict[str, Any]:
         """Return the maximum number of steps (horizon and pauses), suite, source of the scenes, and protocol."""

@@ -54,7 +54,7 @@ def test_trained_example_conforms(example: Path, objects: Path, tmp_path: Path) 
 def test_commands_of_the_pages_run_in_their_order(
     page: str, example: Path, traces: None, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Fixtures install the packages of `pip install`, the demonstrations are short; other tests run pytest's command."""
+    """Fixtures install the packages, the demonstrations are short; another test runs the command of pytest."""
     programs = {"lerobot": main, "memobench": memobench.main}
     shutil.copytree(pictures, tmp_path / "outputs" / "demonstrations")
     monkeypatch.chdir(tmp_path)

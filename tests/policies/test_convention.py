@@ -120,6 +120,21 @@ def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:
     assert plan.environment.features_map["pixels/image2"] == "observation.images.image2"
 
 
+def test_camera_name_mapping_of_a_command(tmp_path: Path) -> None:
+    """A checkpoint with the names of a LIBERO model card needs no ``rename_map``."""
+    names = {"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}
+    path = saved(tmp_path, NUMBERED, rename_map=RENAMED_LIBERO)
+    line = ["env=memobench", f"tasks={STOVE}", "episodes=1", f"policy={path}", "convention=libero"]
+    plan = plan_line([*line, f"camera_name_mapping={json.dumps(names)}"])
+    assert plan.settings.portable["env"]["camera_name_mapping"] == names
+    assert plan.environment.features_map["pixels/camera2"] == "observation.images.camera2"
+    for bad in ("camera1", "[camera1]", "{"):
+        with pytest.raises(MemobenchError, match="expected a mapping"):
+            plan_line([*line, f"camera_name_mapping={bad}"])
+    with pytest.raises(MemobenchError, match=r"camera_name_mapping is .*; expected different names"):
+        plan_line([*line, 'camera_name_mapping={"agentview": "camera1"}'])
+
+
 def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     theirs, unclear = saved(tmp_path, THEIRS), saved(tmp_path / "unclear", NUMBERED)
 
@@ -133,7 +148,23 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
         envs(unclear)
     assert _executed(envs(theirs, "--env.convention=libero", convention="libero")) == 100
     assert envs(unclear, "--env.convention=upright")
-    assert _executed(envs(theirs, command="lerobot-train")) is None, "a training may continue from any checkpoint"
+
+
+@pytest.mark.parametrize(("policy", "executed"), [("--policy.type=act", 100), ("--policy.type=vqbet", 5), ("", 100)])
+def test_lerobots_commands_evaluate_with_the_plans_of_their_policies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str, executed: int
+) -> None:
+    """A training may continue from any checkpoint."""
+    flags = ["--dataset.repo_id=local/demos", policy or f"--policy.path={saved(tmp_path, THEIRS)}"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags, "--env.type=memobench"])
+    strict = MemobenchEnvConfig(tasks="10", suite="strict", log_dir=str(tmp_path / "log"))
+    assert _executed(strict.create_envs(1)) == executed
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--policy.type=memobench_expert", "--env.type=memobench"])
+    assert _executed(MemobenchEnvConfig(suite="strict", tasks="10").create_envs(1)) == 1
+    file = tmp_path / "train_config.json"
+    file.write_text(json.dumps({"dataset": {"repo_id": "local/demos"}, "policy": {"type": "vqbet"}}))
+    monkeypatch.setattr(sys, "argv", ["lerobot_train.py", f"--config_path={file}"])
+    assert _executed(MemobenchEnvConfig(suite="strict", tasks="10").create_envs(1)) == 5
 
 
 def _executed(suites: Any) -> int | None:

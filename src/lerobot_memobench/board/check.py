@@ -22,7 +22,7 @@ from lerobot_memobench.datasets.generation import task_hash
 from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, OMITTED, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
 from lerobot_memobench.envs.pacing import paused
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PIXELS, SCENE_HASHES, EnvSettings
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PICTURES, PIXELS, SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.metrics import failure_of, operations, seed_base
@@ -41,7 +41,7 @@ from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS
 from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
-from lerobot_memobench.tasks.task import STRICT, Task
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task
 
 FEWEST, MOST = 10, EVALUATION_EPISODES
 """Episodes of each task, without evidence."""
@@ -177,6 +177,8 @@ def check_submission(submission: Submission, others: Sequence[Submission] = (), 
 
 def _fixed_settings(protocol: Mapping[str, Any], **control: Any) -> dict[str, Any]:
     """Return the settings that the board, and a control, require with the free ones of a protocol."""
+    if protocol.get("suite") in LIBERO_SUITES:
+        raise MemobenchError(f"found suite={protocol['suite']}; the board is of memory tasks, published or strict")
     board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
     return {key: value for key, value in board.protocol_block.items() if key not in MAY_DIFFER}
 
@@ -287,8 +289,8 @@ def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
     """Check one line: settings as on the card, seed, and an outcome that this task can have."""
     protocol, named = run.protocol, (run.records[0].get(POLICY), str(run.card[POLICY].get("type")))
     where = f"{run.place}: {record['task']}, episode {record['episode']}"
-    settings = ("suite", "world", "difficulty", "protocol", "convention", "referent", "salt", "replan_steps", INPUTS)
-    for key in (*settings, *MEMORY_CONTROLS):
+    settings = ("suite", "world", "difficulty", "protocol", "referent", "salt", "replan_steps", INPUTS)
+    for key in (*settings, *PICTURES, "camera_name_mapping", *MEMORY_CONTROLS):
         value = record.get(key, OMITTED.get(key))
         expected = protocol.get(key)
         if value != expected:

@@ -37,17 +37,22 @@ SPEED_PERIOD = 600.0
 
 
 class Suite(StrEnum):
-    """The suite: one set of thirty tasks."""
+    """The suite: one set of tasks."""
 
     PUBLISHED = PUBLISHED
     STRICT = STRICT
+    LIBERO_SPATIAL = "libero_spatial"
+    LIBERO_OBJECT = "libero_object"
+    LIBERO_GOAL = "libero_goal"
+    LIBERO_10 = "libero_10"
+    LIBERO_90 = "libero_90"
 
 
 WhichSuite = Annotated[
     Suite,
     typer.Option(
         help="published: the thirty tasks as published; strict: their memory-necessary variants, whose answer no "
-        "picture shows."
+        "picture shows; libero_…: LIBERO's own."
     ),
 ]
 OfSuite = Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -12,12 +13,13 @@ from rich.table import Table
 
 from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting, say
 from lerobot_memobench.envs.settings import OBS_TYPES
-from lerobot_memobench.errors import check_choice
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.slurm import read_options
-from lerobot_memobench.sim.convention import UPRIGHT
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
+from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.generation import GenerationSummary
@@ -65,6 +67,11 @@ def generate(
     ] = None,
 ) -> int:
     """Make a LeRobotDataset of expert demonstrations. The same command continues a killed run."""
+    if suite in LIBERO_SUITES:
+        raise MemobenchError(
+            f"--suite {suite}: LIBERO's tasks have no scripted expert, so no demonstrations can be made; its own are "
+            "the dataset lerobot/libero"
+        )
     options = None if slurm is None else read_options(slurm)
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
@@ -230,6 +237,9 @@ def view(
         str | None, typer.Option(help=f"Inputs: {', '.join(OBS_TYPES)}; pictures if there are some by default.")
     ] = None,
     prompts: Annotated[bool, typer.Option(help="Keep the frames of demonstration prompts and holds.")] = False,
+    convention: Annotated[
+        str | None, typer.Option(help="Pictures upright, or libero: mirrored. Those of the dataset by default.")
+    ] = None,
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
     from lerobot_memobench.datasets.lerobot_format.layout import read_info
@@ -237,7 +247,10 @@ def view(
 
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)
-    write_view(dataset, out, choice_for(None, read_info(dataset)["features"], prompts, obs_type))
+    if convention is not None:
+        check_choice("convention", convention, [*CONVENTIONS])
+    choice = choice_for(None, read_info(dataset)["features"], prompts, obs_type)
+    write_view(dataset, out, replace(choice, convention=convention))
     say(f"view: {out}")
 
 

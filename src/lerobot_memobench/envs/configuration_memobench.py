@@ -6,9 +6,10 @@ loads it at the first reset.
 
 from __future__ import annotations
 
+import sys
 import typing
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from datetime import datetime
 from functools import partial
 from itertools import count
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
-from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.configs import PipelineFeatureType, PolicyFeature, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 
@@ -32,17 +33,31 @@ from lerobot_memobench.envs.observations import (
     prompt_in,
 )
 from lerobot_memobench.envs.pacing import longest
-from lerobot_memobench.envs.settings import AUTO, INTACT, PIXELS, STEPS, EnvSettings
+from lerobot_memobench.envs.settings import AUTO, INTACT, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
-from lerobot_memobench.sim.convention import UPRIGHT
-from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.tasks.catalogue import (
+    find_tasks,
+    group_of,
+    lerobots_choice,
+    load_task,
+    resolve_tasks,
+    task_folder,
+    task_index,
+)
+from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
 """Called with a task's folder, the number of rows, and whether each row runs in its own process."""
 
 EXECUTED = ("n_action_steps", "n_action_repeats", "action_chunk_size")
 """Fields of LeRobot's policies with the actions executed per plan: of most, of TD-MPC (its larger one), of VQ-BeT."""
+UNKNOWN_PLAN = (
+    "a strict task holds the scene for longer than a plan, and the number of actions that the policy executes per plan "
+    "is unknown here; set {}, to 1 for a policy that plans at every step"
+)
+"""Message of a refusal, without the setting's name."""
 
 _TYPES = typing.get_type_hints(EnvSettings)
 # LeRobot reads `--env.<name>` into fields of the configuration itself.
@@ -56,13 +71,15 @@ _WithSettings: Any = make_dataclass(
 @EnvConfig.register_subclass("memobench")
 @dataclass
 class MemobenchEnvConfig(_WithSettings):
-    """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural.
+    """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural; or those of LIBERO.
 
     The fields are those of `EnvSettings` and:
 
     Args:
         tasks: `all`, memory types, task names, numbers and ranges of numbers (12, 3-7), separated by commas.
-        task: LeRobot's field of every environment; sets ``tasks``.
+        task: LeRobot's field of every environment; sets ``suite`` if it names suites of LIBERO, else ``tasks``.
+            Several suites are run with their own defaults and logs, in LeRobot's commands only.
+        task_ids: ids of LIBERO's tasks, from 0.
         task_dir: folder in the published format (one task, or a tree of tasks) that replaces the catalogue.
         log_dir: folder of the episode log; by default a dated folder in ``outputs/eval``. In a folder with a log, the
             log goes to a subfolder ``evaluation-2`` and so on, unless ``resume`` is set.
@@ -70,6 +87,7 @@ class MemobenchEnvConfig(_WithSettings):
     """
 
     task: str | None = None
+    task_ids: list[int] | None = None
     tasks: str = "all"
     task_dir: str | None = None
     log_dir: str | None = None
@@ -82,10 +100,9 @@ class MemobenchEnvConfig(_WithSettings):
     features_map: dict[str, str] = field(default_factory=policy_names)
 
     def __post_init__(self) -> None:
-        if self.task is not None:
-            if self.tasks != "all":
-                raise MemobenchError(f"env.task={self.task} and env.tasks={self.tasks} are both given; remove env.task")
-            self.tasks, self.task = self.task, None
+        suites, self.tasks = lerobots_choice(self.task, self.task_ids, self.suite, self.tasks)
+        self.__dict__.update(suite=suites[0])
+        self.task, self.task_ids = None if len(suites) == 1 else ",".join(suites), None
         if self.fps != CONTROL_HZ:
             raise MemobenchError(f"env.fps is {self.fps}; the control rate is {CONTROL_HZ}, leave env.fps out")
         for name, value in asdict(self.settings).items():  # some follow from the protocol and the suite
@@ -95,8 +112,8 @@ class MemobenchEnvConfig(_WithSettings):
                 f"env.task_dir={self.task_dir} runs every task of that folder and excludes tasks={self.tasks}; remove "
                 "tasks=, or set env.task_dir= to the folder of one task"
             )
-        if (pictures := (self.obs_type, self.convention)) != (PIXELS, UPRIGHT):
-            self.features, self.features_map = policy_features(*pictures), policy_names(*pictures)
+        if (features := policy_features(self.settings)) != policy_features():
+            self.features, self.features_map = features, policy_names(self.settings)
 
     @property
     def settings(self) -> EnvSettings:
@@ -116,8 +133,6 @@ class MemobenchEnvConfig(_WithSettings):
         Raises:
             MemobenchError: a task is unknown or of another suite, or a control applies to no chosen task.
         """
-        from lerobot_memobench.tasks.catalogue import find_tasks, load_task, resolve_tasks, task_folder, task_index
-
         tasks: list[tuple[str, int, Path]]
         if self.task_dir is not None:
             loaded = [load_task(folder) for folder in find_tasks(self.task_dir)]
@@ -129,8 +144,8 @@ class MemobenchEnvConfig(_WithSettings):
                     )
             tasks = [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
         else:
-            folders = [task_folder(name) for name in resolve_tasks(self.tasks, self.suite)]
-            tasks = [(folder.parent.name, task_index(folder.name), folder) for folder in folders]
+            names = resolve_tasks(self.tasks, self.suite)
+            tasks = [(group_of(name), task_index(name), task_folder(name)) for name in names]
         if self.settings.needs_prompt:
             tasks = [task for task in tasks if load_task(task[2]).prompt is not None]
             if not tasks:
@@ -151,36 +166,78 @@ class MemobenchEnvConfig(_WithSettings):
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return ``{memory type: {task id: vector env}}``; the first reset of an env starts its simulation.
 
-        LeRobot's own commands call this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
+        A suite of LIBERO replaces the memory type, as in LeRobot's environment ``libero``. LeRobot's own commands call
+        this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
         """
+        if self.task is not None:
+            return self._envs_of_suites(self.task.split(","), n_envs, use_async_envs)
+        self._number_as_lerobot()
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
-        policy = type(self).check_policy(self)
-        if policy is not None:  # its plans; the rest is the user's
-            planned = self.settings_for(policy)
-            self.replan_steps, self.window_steps = planned.replan_steps, planned.window_steps
+        self.declare_plans(type(self).check_policy(self))
         opened = self.opener(None, UNKNOWN_POLICY, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
             suites.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
         return suites
 
+    def _envs_of_suites(
+        self, suites: Sequence[str], n_envs: int, use_async_envs: bool
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """Return the environments of several suites of LIBERO, each with its own defaults and folder of its log."""
+        folder, found = self.resolved_log_dir(), dict[str, dict[int, gym.vector.VectorEnv]]()
+        for suite in suites:
+            own = asdict(self.settings.changed(suite=suite))
+            one = replace(self, task=None, log_dir=str(folder / suite), **own)
+            found |= one.create_envs(n_envs, use_async_envs)
+        return found
+
+    def _number_as_lerobot(self) -> None:
+        """Let the first episode of ``lerobot-eval`` in a suite of LIBERO have the first initial state.
+
+        Raises:
+            MemobenchError: there are more episodes than initial states.
+        """
+        if self.suite not in LIBERO_SUITES or "eval" not in Path(sys.argv[0]).name:
+            return
+        if parser.parse_arg("env.seed_base") is None:
+            from lerobot.configs.eval import EvalPipelineConfig
+
+            self.__dict__.update(seed_base=int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0))
+        if (episodes := int(parser.parse_arg("eval.n_episodes") or 0)) > NUM_STATES:
+            raise MemobenchError(
+                f"found eval.n_episodes={episodes}; tasks of {self.suite} have {NUM_STATES} initial states: ask for at "
+                f"most {NUM_STATES}"
+            )
+
+    def declare_plans(self, policy: Any) -> None:
+        """Set the actions and frames of a plan from a policy's configuration; the rest is the user's.
+
+        LeRobot's trainer opens environments without the policy. Errors as of `settings_for`.
+        """
+        planned = self.settings_for(policy)
+        known = 1 if policy is not None and self.suite == STRICT else None  # it plans at every step
+        self.replan_steps, self.window_steps = planned.replan_steps or known, planned.window_steps
+
     def settings_for(self, policy: Any) -> EnvSettings:
         """Return the settings with defaults that follow from a policy's configuration (None if unknown).
 
         Raises:
-            MemobenchError: ``replan_steps`` is no multiple of the actions that the policy executes per plan.
+            MemobenchError: ``replan_steps`` is no multiple of the actions that the policy executes per plan, or these
+                are unknown in strict tasks.
         """
         settings = self.settings
         if settings.prompt_in == AUTO:
             settings = settings.changed(prompt_in=STEPS if policy is None else prompt_in(policy))
-        executed = max(getattr(policy, name, None) or 0 for name in EXECUTED)
+        executed = executed_actions(policy)
         if settings.replan_steps is None:
+            if self.suite == STRICT and (policy is None or getattr(policy, "plans_unseen", False)):
+                raise MemobenchError(UNKNOWN_PLAN.format("env.replan_steps"))
             settings = settings.changed(replan_steps=executed or None)
         elif executed and settings.replan_steps % executed:  # a hold must be longer than a plan, and end with one
             raise MemobenchError(
                 f"env.replan_steps is {settings.replan_steps}, but the policy executes {executed} actions per plan; "
-                f"leave env.replan_steps out, or change the policy by replan={settings.replan_steps}"
+                f"leave env.replan_steps out, or set both by replan={settings.replan_steps}"
             )
         observed = getattr(policy, "n_obs_steps", 1)  # a hold must be longer than the policy's input
         if getattr(policy, "temporal_ensemble_coeff", None) is not None:  # ACT averages the plans of so many steps
@@ -225,6 +282,19 @@ class MemobenchEnvConfig(_WithSettings):
         if self.resume or not has_log(folder):
             return folder
         return next(place for k in count(2) if not (place := folder / f"evaluation-{k}").exists())
+
+
+def executed_actions(policy: Any) -> int:
+    """Return the number of actions that a policy of this configuration executes per plan; 0 if it states none."""
+    stated = max(getattr(policy, name, None) or 0 for name in EXECUTED)
+    if getattr(policy, "type", None) != "groot":
+        return stated
+    from lerobot.policies.groot.configuration_groot import infer_groot_n1_7_action_execution_horizon
+
+    # GR00T executes no more actions than its base model was made for.
+    return min(
+        stated, infer_groot_n1_7_action_execution_horizon(policy.base_model_path, policy.embodiment_tag) or stated
+    )
 
 
 def check_loop(settings: EnvSettings) -> None:

@@ -26,7 +26,6 @@ from lerobot_memobench.protocol import (
     EXECUTION,
     HOLD_MEAN,
     HOLD_SHAPE,
-    IMAGE_SIZE,
     LONGEST_HOLD,
     MOST_HOLDS,
     NO_CLOCK,
@@ -46,9 +45,10 @@ from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import Choice
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
+from lerobot_memobench.tasks.libero_suites import initial_states
 from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import STRICT, Task, referent_text
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task, referent_text
 
 AS_BEGUN = Atom("asbegun", ())
 
@@ -66,8 +66,8 @@ class Episode:
     Args:
         task: the task of the catalogue.
         settings: settings of the environment. An episode uses ``referent``, ``demonstration_prompt``, ``horizon``,
-            ``protocol``, ``render``, ``corrupt_step``, ``reshow``, ``interference`` and those of `Pacing`. Without the
-            demonstration prompt, objects that it hides are hidden before the first frame.
+            ``protocol``, ``render``, sizes of pictures, ``corrupt_step``, ``reshow``, ``interference`` and those of
+            `Pacing`. Without the demonstration prompt, objects that it hides are hidden before the first frame.
         render: size and quality of frames; None for those of ``settings``.
         changes: settings by name that replace those of ``settings``.
 
@@ -89,7 +89,7 @@ class Episode:
         self, task: Task, settings: EnvSettings = DEFAULTS, *, render: RenderSettings | None = None, **changes: Any
     ) -> None:
         self.settings = settings = settings.changed(**changes)
-        render = render or RenderSettings(IMAGE_SIZE, IMAGE_SIZE, settings.render)
+        render = render or RenderSettings(settings.observation_height, settings.observation_width, settings.render)
         self.published = task = task.at(cast("Difficulty", settings.difficulty))
         self.referent = referent_text(settings.referent, task.drawn)
         self._limit = settings.horizon * steps_per_action(settings.speed)
@@ -124,7 +124,7 @@ class Episode:
             self.sim.reset(self.seed, self.progress.settle)
         else:
             self.progress = Progress(task)
-            self.sim.reset(self.seed)
+            self.sim.reset(self.seed, state=self._initial_state())
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
         self.step_index = 0
@@ -149,6 +149,17 @@ class Episode:
             self._hide_objects()
         self._execution_step = (self.published.prompt_steps or 0) if self.demonstration_prompt else 0
         self._begin_if_due()
+
+    def _initial_state(self) -> NDArray[np.float64] | None:
+        """Return LIBERO's initial state of the episode, None in other suites, which draw it by the seed.
+
+        Episodes beyond their number begin with the first one again, as in LeRobot.
+        """
+        if self.published.suite not in LIBERO_SUITES:
+            return None
+        states = initial_states(self.published.name)
+        found: NDArray[np.float64] = states[(self.seed - self.settings.seed_base) % len(states)]
+        return found
 
     def _draw_holds(self) -> Iterator[int]:
         """Return the lengths of the episode's holds, which do not depend on the variant."""
@@ -273,7 +284,7 @@ class Episode:
     @property
     def cut_off(self) -> bool:
         """Whether a horizon below the protocol's ended the episode."""
-        whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else self.settings.degree.horizon
+        whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else self.settings.usual["horizon"]
         return self.settings.horizon < whole and self.exec_steps >= self._limit and not (self.success or self.lost)
 
     @property
@@ -375,7 +386,7 @@ class Episode:
         return self._slots.observe()
 
     def images(self) -> dict[str, Image]:
-        """Render both cameras, (256, 256, 3) uint8 each, upright."""
+        """Render both cameras, (height, width, 3) uint8 each, upright."""
         return {key: self.sim.render(camera) for key, camera in CAMERAS.items()}
 
     def subgoal(self) -> str:

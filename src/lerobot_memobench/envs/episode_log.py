@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDic
 
 from annotated_types import Ge, Le
 
-from lerobot_memobench.envs.settings import GOALS, HOLD, MEMORY_CONTROLS, SCENE_HASHES
+from lerobot_memobench.envs.settings import GOALS, HOLD, MEMORY_CONTROLS, PICTURES, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -36,12 +36,11 @@ from lerobot_memobench.io import (
     write_file,
 )
 from lerobot_memobench.protocol import BY_PAPER
-from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
 from lerobot_memobench.tasks.difficulty import STANDARD, Difficulty
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import PUBLISHED, Task
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
@@ -136,12 +135,15 @@ class Outcome(TypedDict, total=False):
         variants: evidence episodes: number of variants of the task.
         chance: evidence episodes: rate of correct choices without memory; None if the instruction names the variant.
         failure: failure class; None for a success.
-        suite: ``strict``; absent for published tasks.
+        suite: ``strict``, or a suite of LIBERO; absent for published tasks.
         difficulty: absent for the standard one.
         world: ``libero``; absent for the scenes that version 0.2 modelled in code.
         stand_ins: classes whose missing scans this package's objects replaced.
         protocol: ``upstream``, the authors' evaluation; absent for the paper's.
         convention: of the pictures; absent for upright ones.
+        observation_height: of the pictures, pixels; absent for 256.
+        observation_width: of the pictures, pixels; absent for 256.
+        camera_name_mapping: LIBERO's names of cameras -> names of pictures; absent without.
         lost: strict tasks: whether the goal became unreachable.
         fault: reason why the episode was aborted: an invalid action or unstable physics.
         scene_hash: hash of the initial scene.
@@ -173,6 +175,9 @@ class Outcome(TypedDict, total=False):
     stand_ins: list[Name]
     protocol: Name
     convention: Name
+    observation_height: Count
+    observation_width: Count
+    camera_name_mapping: dict[Name, Name]
     lost: bool
     fault: str
     scene_hash: Name | None
@@ -184,7 +189,7 @@ class EpisodeRecord(Outcome):
 
     Attributes:
         task: name in the catalogue.
-        memory_type: temporal, spatial, object or procedural.
+        memory_type: temporal, spatial, object or procedural; the suite of a task of LIBERO.
         episode: number of the episode in its evaluation, from 0.
         success: whether the goal held at the end.
         checkpoints: memory checkpoints in the task's order.
@@ -248,8 +253,8 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         ],
         "failure": failure if fault is None else fault.failure,
         **({} if fault is None else {"fault": fault.why}),
-        **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
-        **({} if task.suite == PUBLISHED else {"held_steps": episode.pacing.held_steps}),
+        **({} if task.suite == PUBLISHED else {"suite": task.suite}),
+        **({"lost": episode.lost, "held_steps": episode.pacing.held_steps} if task.suite == STRICT else {}),
         **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
         **{WORLD: LIBERO, "stand_ins": list(episode.stand_ins)},
         **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),
@@ -507,14 +512,15 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 
 OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, WORLD: FORMER, "difficulty": STANDARD, "protocol": BY_PAPER},
-    "convention": UPRIGHT,
+    **PICTURES,
+    **{"camera_name_mapping": None, "robot_state": False},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, HOLD: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
     **{"window_steps": 1, "delay_steps": 0, "salt": None},
     **MEMORY_CONTROLS,
 }
 """Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
 steps per rendered picture, exists in earlier versions only."""
-OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", INPUTS, "salt")
+OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", "camera_name_mapping", "robot_state", INPUTS, "salt")
 """Settings that follow from the policy, and the salt, which the start of a sealed evaluation draws. They may differ
 between compared evaluations, not between parts of one."""
 EXTENT = ("tasks", "episodes")

@@ -18,17 +18,18 @@ from lerobot_memobench.protocol import (
     BY_PAPER,
     EVALUATION_SEED,
     HOLD_MEAN,
-    HORIZON,
+    IMAGE_SIZE,
     PROMPT_HORIZON,
     PROTOCOLS,
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
-from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
+from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
 from lerobot_memobench.sim.scene_hash import LIBERO, SCENE_HASH_VERSION, WORLD
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
-from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
+from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
+from lerobot_memobench.tasks.task import DRAWN, LIBERO_SUITES, PUBLISHED, REFERENTS, STRICT, SUITES
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
@@ -42,11 +43,19 @@ policies the prompt plays in `reset`. ``auto`` chooses by the policy; without a 
 
 REFERENT_VALUES = (*REFERENTS, DRAWN)
 """Values of ``referent``; strict tasks always use the last one."""
+RELATIVE = "relative"
 QUALITIES = ("default", "high")
 EVERY = -1
 """Value of ``videos``: record every episode."""
 SLOWEST = 10
 """Maximum number of control steps per action, see ``speed``."""
+
+SMALLEST, LARGEST = 16, 2048
+"""Least and greatest height and width of pictures, pixels."""
+
+EXAMPLE = '{"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}'
+"""A value of ``camera_name_mapping``."""
+PICTURE_NAME = re.compile("[A-Za-z0-9_]+")
 
 SALT = re.compile("[0-9a-f]{32}")
 """Form of a ``salt``."""
@@ -54,6 +63,10 @@ INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 """Values of ``corrupt``: what happens to the memory of the policy."""
 
+PICTURES: Mapping[str, Any] = {
+    **{"convention": UPRIGHT, "observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE},
+}
+"""Settings of pictures, with the values that a log omits."""
 MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0}
 """Settings of corruption and interference, with their values in the protocol."""
 
@@ -69,6 +82,13 @@ UPSTREAM_ONLY = {
     **MEMORY_CONTROLS,
 }
 """Settings with a fixed value in the authors' evaluation."""
+LIBERO_ONLY = {
+    **{"difficulty": STANDARD, "protocol": BY_PAPER, "referent": REFERENTS[0], "oracle_memory": False},
+    **{"evidence": False, "salt": None, "expert_action": False, "blind_action": False, "obs_type": PIXELS},
+    **MEMORY_CONTROLS,
+}
+"""Settings with a fixed value in LIBERO's suites. Their tasks have no checkpoints, prompts, variants and expert, and
+object slots lack their classes."""
 
 
 def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None) -> Any:
@@ -90,21 +110,32 @@ class EnvSettings:
         MemobenchError: a value is not accepted, or two settings are incompatible.
     """
 
-    suite: str = setting(PUBLISHED, "published tasks, or strict: 30 variants that need a memory", SUITES)
+    suite: str = setting(
+        PUBLISHED,
+        "published tasks, strict: 30 variants that need a memory, or a suite of LIBERO",
+        (*SUITES, *LIBERO_SUITES),
+    )
     difficulty: str = setting(STANDARD, "number of repetitions in strict tasks", DIFFICULTIES)
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
     obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
-    convention: str = setting(UPRIGHT, "pictures upright, or mirrored and named as in LIBERO's data", [*CONVENTIONS])
-    control_mode: str = setting(
-        "relative", "actions are displacements; LIBERO's absolute ones do not exist", ("relative",)
+    convention: str = setting(
+        None,
+        "pictures upright, or mirrored and named as in LIBERO's data; the default follows the suite",
+        [*CONVENTIONS],
     )
+    camera_name_mapping: dict[str, str] | None = setting(  # noqa: RUF009 - its default is None
+        None, "with convention=libero: LIBERO's name of each camera -> name of its picture"
+    )
+    observation_height: int = setting(IMAGE_SIZE, "height of pictures, pixels", least=SMALLEST)
+    observation_width: int = setting(IMAGE_SIZE, "width of pictures, pixels", least=SMALLEST)
+    control_mode: str = setting(RELATIVE, "actions are displacements; LIBERO's absolute ones do not exist")
     referent: str = setting(
         "fixed", "published goals, or goals drawn by the seed; strict tasks always draw", REFERENT_VALUES
     )
     demonstration_prompt: bool = setting(True, "object and procedural tasks start with their demonstration prompt")
     prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or in reset", PROMPT_IN)
-    horizon: int = setting(HORIZON, "execution steps per episode; the default follows the difficulty", least=1)
+    horizon: int = setting(None, "execution steps per episode; the default follows suite and difficulty", least=1)
     replan_steps: int | None = setting(
         None, "actions executed per prediction; pauses start, and holds end, between chunks", least=1
     )
@@ -120,11 +151,13 @@ class EnvSettings:
     corrupt_step: int = setting(0, "execution step at which corrupt acts; 0: at the end of the prompt", least=0)
     reshow: bool = setting(False, "the prompt plays a second time, after corrupt has acted")
     interference: int = setting(0, "episodes of other tasks shown between prompt and execution", least=0)
+    robot_state: bool = setting(False, "add the nested robot_state of LeRobot's libero: hand, fingers and joints")
     expert_action: bool = setting(False, "add the scripted expert's action as observation.expert_action")
     blind_action: bool = setting(False, "add the blind published routine's action as observation.blind_action")
     videos: int = setting(0, "number of first episodes of each task recorded as videos; -1 for all", least=EVERY)
 
     def __post_init__(self) -> None:
+        self._set(**{name: value for name, value in self.usual.items() if getattr(self, name) is None})
         for each in fields(self):
             self._check(each.name, str(each.type), each.metadata)
         if self.referent == DRAWN and self.suite != STRICT:
@@ -136,19 +169,55 @@ class EnvSettings:
             )
         if self.salt is not None and not SALT.fullmatch(str(self.salt)):
             raise MemobenchError(f"salt is {self.salt!r}; expected 32 hexadecimal digits in lower case")
-        if self.convention != UPRIGHT and self.obs_type == OBJECTS:
-            raise MemobenchError(f"convention={self.convention} is of pictures, and obs_type={OBJECTS} has none")
+        if self.control_mode != RELATIVE:
+            raise MemobenchError(
+                f"control_mode is {self.control_mode!r}, and actions of this environment are displacements; leave "
+                f"control_mode out, and evaluate a policy of control_mode={RELATIVE}"
+            )
+        if self.suite in LIBERO_SUITES:
+            self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
+        self._check_pictures()
         if self.suite == STRICT:
-            self._set(referent=DRAWN, horizon=self.degree.horizon if self.horizon == HORIZON else self.horizon)
+            self._set(referent=DRAWN)
         elif self.difficulty != STANDARD:
             raise MemobenchError(
                 f"difficulty={self.difficulty} is for strict tasks; set suite={STRICT}, or leave it out"
             )
         if self.protocol == UPSTREAM:
-            self._follow_upstream()
+            self._require(UPSTREAM_ONLY, f"protocol={UPSTREAM}, the authors' evaluation,")
+            self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
         if self.evidence:
             check_referent(self.referent)
         self._check_memory_controls()
+
+    def _check_pictures(self) -> None:
+        """Check that the settings of pictures fit each other and the observations."""
+        height, width = self.observation_height, self.observation_width
+        if height % 2 or width % 2 or max(height, width) > LARGEST:
+            raise MemobenchError(
+                f"observation_height and observation_width are {height} and {width}; expected even numbers up to "
+                f"{LARGEST}"
+            )
+        for name, value in PICTURES.items():
+            if self.obs_type == OBJECTS and (given := getattr(self, name)) != value:
+                raise MemobenchError(f"{name}={given} is of pictures, and obs_type={OBJECTS} has none; leave it out")
+
+        mapping = self.camera_name_mapping
+        if mapping is not None and self.convention != MIRRORED:
+            raise MemobenchError(
+                f"camera_name_mapping= names LIBERO's pictures, and convention is {self.convention}; set "
+                f"convention={MIRRORED}, or leave camera_name_mapping out"
+            )
+        if mapping is not None and not _names_pictures(mapping):
+            raise MemobenchError(
+                f"camera_name_mapping is {mapping!r}; expected different names of letters, digits and _ for "
+                f"{' and '.join(LIBERO_CAMERAS.values())}, as in {EXAMPLE}"
+            )
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Camera -> name of its picture."""
+        return picture_names(self.convention, self.camera_name_mapping)
 
     def _check_memory_controls(self) -> None:
         """Check that the settings of corruption and interference do not exclude each other."""
@@ -190,16 +259,15 @@ class EnvSettings:
         elif accepted["values"] and value not in accepted["values"]:
             check_choice(name, value, accepted["values"])
 
-    def _follow_upstream(self) -> None:
-        """Set the values of the authors' evaluation; raise for conflicting ones."""
-        for name, value in UPSTREAM_ONLY.items():
+    def _require(self, fixed: Mapping[str, Any], reason: str) -> None:
+        """Raise for a setting with another value than the fixed one."""
+        for name, value in fixed.items():
             asked = getattr(self, name)
             if asked != value:
                 raise MemobenchError(
-                    f"{name} is {str(asked).lower()}, but protocol={UPSTREAM}, the authors' evaluation, requires "
+                    f"{name} is {str(asked).lower()}, but {reason} requires "
                     f"{name}={str(value).lower()}; leave one of the two out"
                 )
-        self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
@@ -209,6 +277,15 @@ class EnvSettings:
     def degree(self) -> Degree:
         """Repetitions and horizon of the difficulty."""
         return degree_of(self.difficulty)
+
+    @property
+    def usual(self) -> dict[str, Any]:
+        """Defaults that follow from other settings."""
+        limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
+        return {
+            "horizon": limits.get(self.suite, self.degree.horizon),
+            "convention": MIRRORED if self.suite in limits else UPRIGHT,
+        }
 
     @property
     def longest_interference(self) -> int:
@@ -225,9 +302,8 @@ class EnvSettings:
         for name in changes:
             if name not in known:
                 raise MemobenchError(f"unknown environment setting {name!r}; {nearest(name, known)}")
-        if "difficulty" in changes and self.horizon == self.degree.horizon:
-            changes = {"horizon": HORIZON} | changes  # the new difficulty has its own
-        return replace(self, **changes)
+        following = {name: None for name, value in self.usual.items() if getattr(self, name) == value}
+        return replace(self, **following | changes)
 
     @property
     def protocol_block(self) -> dict[str, Any]:
@@ -250,6 +326,14 @@ def revision(suite: str, difficulty: str) -> dict[str, int]:
 def steps_per_action(speed: float) -> int:
     """Return the number of control steps per action."""
     return round(1 / speed)
+
+
+def _names_pictures(mapping: Any) -> bool:
+    """Return whether a ``camera_name_mapping`` gives LIBERO's cameras names that a picture can have."""
+    if not isinstance(mapping, Mapping) or not {*mapping} <= {*LIBERO_CAMERAS.values()}:
+        return False
+    names = [*picture_names(MIRRORED, mapping).values()]
+    return all(isinstance(name, str) and PICTURE_NAME.fullmatch(name) for name in names) and len({*names}) == len(names)
 
 
 DEFAULTS = EnvSettings()

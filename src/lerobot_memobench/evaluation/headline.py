@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import OMITTED, POLICY
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS, PICTURES
 from lerobot_memobench.evaluation.metrics import Record, policy_inputs, stand_ins_of
 from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
 from lerobot_memobench.sim.scene_hash import FORMER, WORLD
+from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 CONTROLLED = ("pause_steps", "speed", *MEMORY_CONTROLS)
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
@@ -54,11 +55,11 @@ def protocol_phrases(run: Run) -> list[str]:
         *(["scenes that version 0.2 modelled in code"] if of_all(records, WORLD) == FORMER else []),
         *(
             f"{key} {value}"
-            for key in ("difficulty", "protocol", "convention")
+            for key in ("difficulty", "protocol", *PICTURES)
             if (value := of_all(records, key)) != OMITTED[key]
         ),
         *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),
-        f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
+        *([] if suite in LIBERO_SUITES else [_referent(records)]),
         *_seeds(run),
         extent_phrase(records),
         *([] if run.missing is None else ["incomplete"]),
@@ -71,6 +72,10 @@ def protocol_phrases(run: Run) -> list[str]:
         *([f"salt {salt}"] if (salt := run.protocol.get("salt")) else []),
         *(["each scene with each variant"] if run.protocol.get("evidence") else []),
     ]
+
+
+def _referent(records: Sequence[Record]) -> str:
+    return f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}"
 
 
 def _seeds(run: Run) -> list[str]:

@@ -160,10 +160,12 @@ def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, Policy
     for name, feature in policy.image_features.items():
         if name in there and tuple(there[name].shape) != tuple(feature.shape):
             here, seen = (" x ".join(map(str, shape[1:])) for shape in (there[name].shape, feature.shape))
+            height, width = feature.shape[1:]
             also = "" if resizes is None else f", or with --policy.{resizes} for both"
             raise MemobenchError(
                 f"the policy {path} was trained on {name} of {seen} pixels and does not resize it, and the environment "
-                f"has {here}; train it on pictures of that size{also}"
+                f"has {here}; set env.observation_height={height} and env.observation_width={width}, or train it on "
+                f"pictures of that size{also}"
             )
 
 

@@ -13,17 +13,22 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_info
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import TrainConfig, checkpoint_file, read_json, statistics_shapes
 from lerobot_memobench.policies.compatibility import cameras_read
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.lerobot_config import quiet, read_lerobots_config
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
 
 OF_LIBERO = ("lerobot/", "HuggingFaceVLA/", "physical-intelligence/")
 """Owners of LIBERO's data on the hub. Other datasets of that name may be of this package."""
+
+LEROBOTS_COMMANDS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalPipelineConfig}
+"""LeRobot's command -> its configuration."""
 
 
 def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
@@ -49,17 +54,18 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
     return (UPRIGHT if has[UPRIGHT] else None), why
 
 
-def check_convention(path: str | None, policy: Any, asked: str | None) -> None:
-    """Refuse pictures of another convention than a policy's, and upright ones by default if its own is unclear.
+def check_convention(path: str | None, policy: Any, asked: str | None, usual: str = UPRIGHT) -> None:
+    """Refuse pictures of another convention than a policy's, and the suite's by default if its own is unclear.
 
     Args:
         path: folder or repository of its checkpoint, or None. policy: its configuration.
-        asked: the convention that was named; None: none was, and pictures are upright.
+        asked: the convention that was named; None: none was, and pictures are as is usual in the suite.
+        usual: convention of the suite.
 
     Raises:
         MemobenchError: naming the commands that run it.
     """
-    check_choice("convention", asked or UPRIGHT, [*WRIST])
+    check_choice("convention", asked or usual, [*WRIST])
     found: str | None = UPRIGHT
     if getattr(policy, "uses_detector", False):
         why = "its detector reads them"
@@ -74,23 +80,28 @@ def check_convention(path: str | None, policy: Any, asked: str | None) -> None:
             f"the policy {name} may expect upright pictures or mirrored ones as LIBERO's ({why}); run "
             f"`{command}{UPRIGHT}` or `{command}{MIRRORED}`, with lerobot-eval --env.convention="
         )
-    if found not in (None, asked or UPRIGHT):
+    if found not in (None, asked or usual):
         raise MemobenchError(
-            f"the policy {name} expects pictures of convention={found} ({why}), and found {asked or UPRIGHT}; run "
+            f"the policy {name} expects pictures of convention={found} ({why}), and found {asked or usual}; run "
             f"`{command}{found}`, or `lerobot-eval --env.type=memobench --policy.path={name} --env.convention={found}`"
         )
 
 
 def check_lerobots_command(environment: Any) -> PreTrainedConfig | None:
-    """Check the checkpoint that the command line of ``lerobot-eval`` names, and return its configuration.
+    """Return the configuration of the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, else None.
 
-    None for another command: a training may begin with any checkpoint.
+    The checkpoint of an evaluation is checked; a training may begin with any.
     """
-    path = parser.get_path_arg("policy")
-    if path is None or "eval" not in Path(sys.argv[0]).name:
+    command = Path(sys.argv[0]).name.replace("_", "-")
+    kind = next((kind for name, kind in LEROBOTS_COMMANDS.items() if command.startswith(name)), None)
+    if kind is None:
         return None
     with quiet():
-        policy = PreTrainedConfig.from_pretrained(path, cli_overrides=parser.get_cli_overrides("policy") or [])
-    named = parser.parse_arg("env.convention") is not None or environment.convention != UPRIGHT
-    check_convention(path, policy, environment.convention if named else None)
+        policy = read_lerobots_config(kind, sys.argv[1:]).policy
+    path = parser.get_path_arg("policy")
+    if kind is TrainPipelineConfig or path is None:
+        return policy
+    usual = environment.settings.usual["convention"]
+    named = parser.parse_arg("env.convention") is not None or environment.convention != usual
+    check_convention(path, policy, environment.convention if named else None, usual)
     return policy
