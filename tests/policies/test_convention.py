@@ -14,7 +14,7 @@ from lerobot.policies.factory import make_policy_config
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.convention import check_convention
+from lerobot_memobench.policies.convention import chosen_convention
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.sim.convention import CONVENTIONS
 from tests.support.fake_loop import make_checkpoint
@@ -41,7 +41,7 @@ def saved(folder: Path, cameras: tuple[str, ...], **training: Any) -> Path:
 def outcome(path: Path, asked: str | None) -> str:
     """Return "" if a checkpoint may run, else the message."""
     try:
-        check_convention(str(path), PreTrainedConfig.from_pretrained(path), asked)
+        chosen_convention(str(path), PreTrainedConfig.from_pretrained(path), asked)
     except MemobenchError as error:
         return str(error)
     return ""
@@ -100,7 +100,7 @@ def test_no_pictures_no_convention(tmp_path: Path) -> None:
     assert not outcome(path, None)
     policy = make_policy_config("memobench_mem", perception="objects", detector="package", device="cpu")
     with pytest.raises(MemobenchError, match="its detector reads them"):
-        check_convention(None, policy, "libero")
+        chosen_convention(None, policy, "libero")
 
 
 def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:

@@ -49,6 +49,20 @@ def cure(missing: str, observed: Collection[str]) -> str:
     return f"it has {cameras or 'none'}. Map its names with --rename_map."
 
 
+def check_actions(path: str, policy: Any) -> None:
+    """Refuse a policy whose actions are not those of the environment whatever their number.
+
+    Raises:
+        MemobenchError: it is an XVLA of absolute poses.
+    """
+    if policy.type == "xvla" and policy.action_mode == "ee6d":
+        raise MemobenchError(
+            f"the policy {path} predicts absolute poses of two hands (action_mode=ee6d, as LIBERO's XVLA), and the "
+            "environment takes relative motions of one; train it with policy.action_mode=auto on a dataset of this "
+            "environment"
+        )
+
+
 def check_features(
     path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
 ) -> None:
@@ -66,12 +80,7 @@ def check_features(
     Raises:
         MemobenchError: an input differs.
     """
-    if policy.type == "xvla" and policy.action_mode == "ee6d":
-        raise MemobenchError(
-            f"the policy {path} predicts absolute poses of two hands (action_mode=ee6d, as LIBERO's XVLA), and the "
-            "environment takes relative motions of one; train it with policy.action_mode=auto on a dataset of this "
-            "environment"
-        )
+    check_actions(path, policy)
     if getattr(policy, "perception", None) == "any" or not policy.input_features:
         return
     trained = statistics_shapes(path)

@@ -16,6 +16,8 @@ UPRIGHT, MIRRORED = "upright", "libero"
 WRIST = {UPRIGHT: "wrist_image", MIRRORED: "image2"}
 CONVENTIONS = {convention: {"image": "image", "wrist_image": wrist} for convention, wrist in WRIST.items()}
 """Convention -> camera -> name of its picture."""
+STATED = "trained_convention"
+"""Key by which a policy server states the convention of its policy's training."""
 
 
 def shown(pictures: Mapping[str, NDArray[np.uint8]], convention: str) -> dict[str, NDArray[np.uint8]]:
