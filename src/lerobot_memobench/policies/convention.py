@@ -20,6 +20,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_info
+from lerobot_memobench.envs.observations import policy_features, policy_names
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import statistics_shapes, trained_names, training_of
 from lerobot_memobench.policies.compatibility import cameras_read, check_actions
@@ -53,8 +54,10 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
 
 def chosen_convention(
     path: str | None, policy: Any, asked: str | None, rename_map: Mapping[str, str] | None = None
-) -> str:
+) -> str | None:
     """Return the convention of the pictures for a policy: the one that was asked for, else that of its training.
+
+    None if none was and the policy reads no pictures, or has no checkpoint.
 
     Args:
         path: folder or repository of its checkpoint, or None. policy: its configuration.
@@ -65,12 +68,13 @@ def chosen_convention(
         MemobenchError: another one than the policy's was asked for, or none was and the policy's is unclear; it names
             the commands that run it.
     """
-    check_choice("convention", asked or UPRIGHT, [*WRIST])
+    if asked is not None:
+        check_choice("convention", asked, [*WRIST])
     found: str | None = UPRIGHT
     if getattr(policy, "uses_detector", False):
         why = "its detector reads them"
     elif path is None or not policy.image_features:
-        return asked or UPRIGHT
+        return asked
     else:
         found, why = trained_convention(path, policy)
     name = path or policy.type
@@ -91,7 +95,7 @@ def chosen_convention(
             )
     if asked is None and found != UPRIGHT:
         logger.warning("pictures have convention=%s, as in the training of %s (%s)", found, name, why)
-    return asked or found or UPRIGHT
+    return asked or found
 
 
 def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
@@ -113,10 +117,10 @@ def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
             "lerobot-eval runs every XVLA with the processors of LIBERO, which mirror a picture and convert actions; "
             f"run `lerobot eval env=memobench policy={path}`"
         )
-    asked = _named("env.convention") or (environment.convention if environment.convention != UPRIGHT else None)
-    found = chosen_convention(path, policy, asked, _named("rename_map"))
-    if found != environment.convention:  # with the names of its pictures
-        vars(environment).update(vars(replace(environment, convention=found)))
+    found = chosen_convention(path, policy, _named("env.convention"), _named("rename_map"))
+    if found not in (None, environment.convention):  # with the names of its pictures
+        named = {"features": policy_features(), "features_map": policy_names(), "convention": found}
+        vars(environment).update(vars(replace(environment, **named)))
     return policy
 
 

@@ -157,7 +157,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     asked = with_device(with_policy(asked), options)
     policy = policy_of(asked)
     convention = chosen_convention(asked.policy_path, policy, asked.env.get("convention"), asked.rename_map)
-    asked = replace(asked, env={**asked.env, "convention": convention})
+    asked = asked if convention is None else replace(asked, env={**asked.env, "convention": convention})
     output = _output(asked, options, policy)
     log = Path(asked.env.get("log_dir") or output)
     asked = with_salt(with_batch_size(with_protocol(asked, options, policy), options, log, policy), options, log)
