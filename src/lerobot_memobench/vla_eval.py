@@ -27,6 +27,8 @@ from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
+from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 try:
     from vla_eval.benchmarks.base import StepBenchmark, StepResult
@@ -156,7 +158,7 @@ class MEMOBench(StepBenchmark):
         self._history: dict[str, list[NDArray[Any]]] = {}
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """Return the chosen tasks; a suite of the harness is a memory type, as in LeRobot."""
+        """Return the chosen tasks; a suite of the harness is a memory type, or one of LIBERO's, as in LeRobot."""
         return [{"name": name, "suite": memory_type} for name, (memory_type, _) in self._tasks.items()]
 
     def reset(self, task: dict[str, Any]) -> dict[str, Any]:
@@ -168,7 +170,12 @@ class MEMOBench(StepBenchmark):
         if self._env is None or self._env.task != task["name"]:
             self.cleanup()
             self._env = self._make(self._tasks[task["name"]][1])
-        observation, info = self._env.reset(seed=self._settings.seed_base + int(task.get("episode_idx", 0)))
+        number = int(task.get("episode_idx", 0))
+        if self._settings.suite in LIBERO_SUITES and number >= NUM_STATES:
+            raise MemobenchError(
+                f"{task['name']} has no initial state {number}; set episodes_per_task to {NUM_STATES} or less"
+            )
+        observation, info = self._env.reset(seed=self._settings.seed_base + number)
         self._history = {}
         while "fault" not in info and observation["phase"][0] == PROMPT:
             step, shows = int(observation[STEP][0]), not self._env.episode.idling
@@ -256,7 +263,8 @@ class MEMOBench(StepBenchmark):
 
     def get_metric_keys(self) -> dict[str, str]:
         """Return the metrics that the harness averages over episodes."""
-        return dict.fromkeys((SUCCESS, *PROCESS_METRICS), "mean")
+        process = () if self._settings.suite in LIBERO_SUITES else PROCESS_METRICS
+        return dict.fromkeys((SUCCESS, *process), "mean")
 
     def get_metadata(self) -> dict[str, Any]:
         """Return the maximum number of steps (horizon and pauses), suite, source of the scenes, and protocol."""

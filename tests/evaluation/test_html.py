@@ -71,7 +71,7 @@ def content(text: str) -> dict[str, Any]:
 
 def test_figures_are_those_of_the_report(tmp_path: Path) -> None:
     evaluation(tmp_path, [record(episode=k, success=k > 0, prompt_steps=5) for k in range(4)])
-    run = page_data(read_runs([tmp_path]), [{0: "videos/a.mp4"}], task_source(None))["runs"][0]
+    run = page_data(read_runs([tmp_path]), [{0: "videos/a.mp4"}], task_source([STOVE]))["runs"][0]
     episode = run["episodes"][0]
     assert (episode["prompt"], episode["steps"], episode["outcome"]) == (5, 20, "storage_failure")
     assert (episode["checkpoints"], episode["video"]) == ([["S", None, None], ["U", 9, None]], "videos/a.mp4")
@@ -109,10 +109,10 @@ def test_a_result_card_tells_policy_horizon_and_command(tmp_path: Path) -> None:
 
 def test_texts_are_the_tasks_own(tmp_path: Path) -> None:
     shutil.copytree(get_task(STOVE).folder, tmp_path / "tasks" / "my_task")
-    assert task_source(tmp_path / "tasks")["my_task"].language == get_task(STOVE).language
+    assert task_source([], tmp_path / "tasks")["my_task"].language == get_task(STOVE).language
     other_version = record("turn_on_the_stove", checkpoints=record()["checkpoints"] * 2)
     evaluation(tmp_path, [record(), record("task_of_mine"), other_version])
-    data = page_data(read_runs([tmp_path]), [{}], {**task_source(None), "turn_on_the_stove": get_task(STOVE)})
+    data = page_data(read_runs([tmp_path]), [{}], {**task_source([STOVE]), "turn_on_the_stove": get_task(STOVE)})
     assert data["tasks"]["turn_on_the_stove"]["variants"] == {}, "its texts are of another version"
     stove = data["tasks"][STOVE]
     assert stove["language"] == get_task(STOVE).language
@@ -124,7 +124,7 @@ def test_texts_are_the_tasks_own(tmp_path: Path) -> None:
 def test_a_random_referent_has_its_own_texts(tmp_path: Path) -> None:
     changes = {"memory_type": "object", "referent": "random", "checkpoints": record()["checkpoints"][:1]}
     evaluation(tmp_path, [record(BUTTER, 0, variant=2, **changes)])
-    data = page_data(read_runs([tmp_path]), [{}], task_source(None))
+    data = page_data(read_runs([tmp_path]), [{}], task_source([BUTTER]))
     assert list(data["tasks"][BUTTER]["variants"]) == ["2"]
     texts = data["tasks"][BUTTER]["variants"]["2"]["checkpoints"][0]["texts"]
     assert texts == list(get_task(BUTTER).variant(2).checkpoints[0].language)

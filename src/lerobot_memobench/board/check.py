@@ -41,7 +41,7 @@ from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS
 from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
-from lerobot_memobench.tasks.task import STRICT, Task
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task
 
 FEWEST, MOST = 10, EVALUATION_EPISODES
 """Episodes of each task, without evidence."""
@@ -177,6 +177,8 @@ def check_submission(submission: Submission, others: Sequence[Submission] = (), 
 
 def _fixed_settings(protocol: Mapping[str, Any], **control: Any) -> dict[str, Any]:
     """Return the settings that the board, and a control, require with the free ones of a protocol."""
+    if protocol.get("suite") in LIBERO_SUITES:
+        raise MemobenchError(f"found suite={protocol['suite']}; the board is of memory tasks, published or strict")
     board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
     return {key: value for key, value in board.protocol_block.items() if key not in MAY_DIFFER}
 

@@ -22,7 +22,7 @@ from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
 from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal
 from lerobot_memobench.jobs.start import prepare_process, reader_has_left
-from lerobot_memobench.tasks.task import PUBLISHED, STRICT
+from lerobot_memobench.tasks.catalogue import ALL_SUITES
 
 USAGE_ERROR = 2
 
@@ -36,18 +36,14 @@ WIDTH_OF_A_FILE = 140
 SPEED_PERIOD = 600.0
 
 
-class Suite(StrEnum):
-    """The suite: one set of thirty tasks."""
-
-    PUBLISHED = PUBLISHED
-    STRICT = STRICT
-
+Suite = StrEnum("Suite", [(name.upper(), name) for name in ALL_SUITES])
+"""The suite: one set of tasks."""
 
 WhichSuite = Annotated[
     Suite,
     typer.Option(
         help="published: the thirty tasks as published; strict: their memory-necessary variants, whose answer no "
-        "picture shows."
+        "picture shows; libero_…: LIBERO's own."
     ),
 ]
 OfSuite = Annotated[

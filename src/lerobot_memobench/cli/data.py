@@ -12,12 +12,13 @@ from rich.table import Table
 
 from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting, say
 from lerobot_memobench.envs.settings import OBS_TYPES
-from lerobot_memobench.errors import check_choice
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
+from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 if TYPE_CHECKING:
     from lerobot_memobench.datasets.generation import GenerationSummary
@@ -65,6 +66,11 @@ def generate(
     ] = None,
 ) -> int:
     """Make a LeRobotDataset of expert demonstrations. The same command continues a killed run."""
+    if suite in LIBERO_SUITES:
+        raise MemobenchError(
+            f"--suite {suite}: LIBERO's tasks have no scripted expert, so no demonstrations can be made; its own are "
+            "the dataset lerobot/libero"
+        )
     options = None if slurm is None else read_options(slurm)
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]

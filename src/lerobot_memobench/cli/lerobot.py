@@ -11,6 +11,7 @@ import shlex
 import sys
 import threading
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,7 +34,7 @@ from lerobot_memobench.run.arguments import (
     read_arguments,
     split_arguments,
 )
-from lerobot_memobench.tasks.catalogue import resolve_tasks
+from lerobot_memobench.tasks.catalogue import lerobots_choice, resolve_tasks
 from lerobot_memobench.tasks.task import PUBLISHED
 
 if TYPE_CHECKING:
@@ -109,7 +110,9 @@ def evaluate(given: Arguments, command: Sequence[str]) -> int:
     Args:
         command: the whole command line, for the card.
     """
-    check_tasks(given)
+    suites = check_tasks(given)
+    if len(suites) > 1:
+        return evaluate_suites(suites, given, command)
     from lerobot_memobench.run.plan import make_plan, take_run_options
     from lerobot_memobench.run.settings import read_settings
 
@@ -123,13 +126,40 @@ def evaluate(given: Arguments, command: Sequence[str]) -> int:
         return evaluate_in_parts(plan) if options.shards else evaluate_here(plan)
 
 
-def check_tasks(given: Arguments) -> None:
-    """Refuse unknown tasks before LeRobot is imported, which takes ten seconds."""
+def evaluate_suites(suites: Sequence[str], given: Arguments, command: Sequence[str]) -> int:
+    """Run an evaluation of each of several suites of LIBERO, in a folder of its name; return the highest status."""
+    from lerobot_memobench.envs.episode_log import has_log
+    from lerobot_memobench.evaluation.records import read_run
+    from lerobot_memobench.evaluation.tables import figure
+    from lerobot_memobench.run.plan import with_changes
+
+    named = given.value("output_dir")
+    if named is None and given.value("resume") is None:
+        named = f"outputs/eval/{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
+    status, rates = 0, dict[str, float]()
+    for suite in suites:
+        folder = None if named is None else Path(named) / suite
+        line = with_changes(command[2:], **{"env.task": None}, task=suite, output_dir=folder)
+        status = max(status, evaluate(split_arguments(line), ("lerobot", "eval", *line)))
+        if folder is not None and has_log(folder):
+            rates[suite] = read_run(folder).summary.average["SR"].value or 0.0
+    if len(rates) > 1:
+        each = ", ".join(f"{suite} {figure(rate)}" for suite, rate in rates.items())
+        say(f"SR: {each}; mean of {len(rates)} suites {figure(sum(rates.values()) / len(rates))}")
+    return status
+
+
+def check_tasks(given: Arguments) -> tuple[str, ...]:
+    """Refuse unknown tasks before LeRobot is imported, which takes ten seconds; return the suites."""
     tasks = given.value("tasks") or given.value("env.tasks")
+    task = given.value("task") or given.value("env.task")
     suite = given.value("suite") or given.value("env.suite") or PUBLISHED
     elsewhere = any(given.value(key) for key in ("config_path", "task_dir", "env.task_dir"))
-    if tasks is not None and not elsewhere:
-        resolve_tasks(tasks, suite)
+    suites, tasks = lerobots_choice(task, None, suite, "all" if tasks is None else tasks)
+    if not elsewhere:
+        for each in suites:
+            resolve_tasks(tasks, each)
+    return suites
 
 
 def read_other(given: Arguments) -> LerobotArguments:

@@ -30,16 +30,17 @@ from lerobot_memobench.io import as_path, count_of, in_words
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.tasks.catalogue import (
-    CATALOGUE_DIR,
     find_tasks,
     get_task,
     load_task,
+    suite_of,
+    task_folder,
     task_names,
     task_number,
     task_record,
 )
 from lerobot_memobench.tasks.gap import longest_gap
-from lerobot_memobench.tasks.task import PUBLISHED, Task
+from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.doctor.examination import Finding
@@ -105,9 +106,15 @@ def task_table(found: Sequence[Task]) -> Table:
 
     ``gap``: the longest of the task's checkpoints, control steps.
     """
-    suites = {task.suite if CATALOGUE_DIR in task.folder.parents else "" for task in found}
-    title = count_of(len(found), "task") + (f" of the {suites.pop()} suite" if len(suites) == 1 and all(suites) else "")
+    suites = {task.suite if _is_known(task) else "" for task in found}
+    title = count_of(len(found), "task") + (f" of the {min(suites)} suite" if len(suites) == 1 and all(suites) else "")
     table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
+    if suites <= {*LIBERO_SUITES}:  # without checkpoints and prompts
+        for name in ("id", "task", "instruction"):
+            table.add_column(name, justify="right" if name == "id" else "left")
+        for task in found:
+            table.add_row(str(task_number(task.name)), task.name, task.language)
+        return table
     for name in ("no.", "task", "memory type", "checkpoints", "gap", "demonstration prompt", "instruction"):
         table.add_column(name, justify="right" if name in ("no.", "gap") else "left")
     for k, task in enumerate(found):
@@ -115,9 +122,14 @@ def task_table(found: Sequence[Task]) -> Table:
             table.add_section()
         prompt = task.prompt.kind if task.prompt else ""
         gap = str(longest_gap(task) or "")
-        number = str(task_number(task.name)) if CATALOGUE_DIR in task.folder.parents else ""
+        number = str(task_number(task.name)) if _is_known(task) else ""
         table.add_row(number, task.name, task.memory_type, task.operations, gap, prompt, task.title)
     return table
+
+
+def _is_known(task: Task) -> bool:
+    """Return whether a task is of the catalogue, not of a user's folder."""
+    return suite_of(task.name) is not None and task.folder == task_folder(task.name)
 
 
 def objects(

@@ -7,8 +7,8 @@ loads it at the first reset.
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, make_dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from datetime import datetime
 from functools import partial
 from itertools import count
@@ -36,6 +36,15 @@ from lerobot_memobench.envs.settings import AUTO, INTACT, PIXELS, STEPS, EnvSett
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
 from lerobot_memobench.sim.convention import UPRIGHT
+from lerobot_memobench.tasks.catalogue import (
+    find_tasks,
+    group_of,
+    lerobots_choice,
+    load_task,
+    resolve_tasks,
+    task_folder,
+    task_index,
+)
 from lerobot_memobench.tasks.task import STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
@@ -56,13 +65,15 @@ _WithSettings: Any = make_dataclass(
 @EnvConfig.register_subclass("memobench")
 @dataclass
 class MemobenchEnvConfig(_WithSettings):
-    """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural.
+    """The benchmark's 30 tasks, as LeRobot's suites: temporal, spatial, object, procedural; or those of LIBERO.
 
     The fields are those of `EnvSettings` and:
 
     Args:
         tasks: `all`, memory types, task names, numbers and ranges of numbers (12, 3-7), separated by commas.
-        task: LeRobot's field of every environment; sets ``tasks``.
+        task: LeRobot's field of every environment; sets ``suite`` if it names suites of LIBERO, else ``tasks``.
+            Several suites are run with their own defaults and logs, in LeRobot's commands only.
+        task_ids: ids of LIBERO's tasks, from 0.
         task_dir: folder in the published format (one task, or a tree of tasks) that replaces the catalogue.
         log_dir: folder of the episode log; by default a dated folder in ``outputs/eval``. In a folder with a log, the
             log goes to a subfolder ``evaluation-2`` and so on, unless ``resume`` is set.
@@ -70,6 +81,7 @@ class MemobenchEnvConfig(_WithSettings):
     """
 
     task: str | None = None
+    task_ids: list[int] | None = None
     tasks: str = "all"
     task_dir: str | None = None
     log_dir: str | None = None
@@ -82,10 +94,9 @@ class MemobenchEnvConfig(_WithSettings):
     features_map: dict[str, str] = field(default_factory=policy_names)
 
     def __post_init__(self) -> None:
-        if self.task is not None:
-            if self.tasks != "all":
-                raise MemobenchError(f"env.task={self.task} and env.tasks={self.tasks} are both given; remove env.task")
-            self.tasks, self.task = self.task, None
+        suites, self.tasks = lerobots_choice(self.task, self.task_ids, self.suite, self.tasks)
+        self.suite, self.task_ids = suites[0], None
+        self.task = None if len(suites) == 1 else ",".join(suites)
         if self.fps != CONTROL_HZ:
             raise MemobenchError(f"env.fps is {self.fps}; the control rate is {CONTROL_HZ}, leave env.fps out")
         for name, value in asdict(self.settings).items():  # some follow from the protocol and the suite
@@ -116,8 +127,6 @@ class MemobenchEnvConfig(_WithSettings):
         Raises:
             MemobenchError: a task is unknown or of another suite, or a control applies to no chosen task.
         """
-        from lerobot_memobench.tasks.catalogue import find_tasks, load_task, resolve_tasks, task_folder, task_index
-
         tasks: list[tuple[str, int, Path]]
         if self.task_dir is not None:
             loaded = [load_task(folder) for folder in find_tasks(self.task_dir)]
@@ -129,8 +138,8 @@ class MemobenchEnvConfig(_WithSettings):
                     )
             tasks = [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
         else:
-            folders = [task_folder(name) for name in resolve_tasks(self.tasks, self.suite)]
-            tasks = [(folder.parent.name, task_index(folder.name), folder) for folder in folders]
+            names = resolve_tasks(self.tasks, self.suite)
+            tasks = [(group_of(name), task_index(name), task_folder(name)) for name in names]
         if self.settings.needs_prompt:
             tasks = [task for task in tasks if load_task(task[2]).prompt is not None]
             if not tasks:
@@ -151,8 +160,11 @@ class MemobenchEnvConfig(_WithSettings):
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return ``{memory type: {task id: vector env}}``; the first reset of an env starts its simulation.
 
-        LeRobot's own commands call this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
+        A suite of LIBERO replaces the memory type, as in LeRobot's environment ``libero``. LeRobot's own commands call
+        this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
         """
+        if self.task is not None:
+            return self._envs_of_suites(self.task.split(","), n_envs, use_async_envs)
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
         policy = type(self).check_policy(self)
@@ -164,6 +176,17 @@ class MemobenchEnvConfig(_WithSettings):
         for memory_type, task_id, folder in chosen:
             suites.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
         return suites
+
+    def _envs_of_suites(
+        self, suites: Sequence[str], n_envs: int, use_async_envs: bool
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """Return the environments of several suites of LIBERO, each with its own defaults and folder of its log."""
+        folder, found = self.resolved_log_dir(), dict[str, dict[int, gym.vector.VectorEnv]]()
+        for suite in suites:
+            own = asdict(self.settings.changed(suite=suite))
+            one = replace(self, task=None, log_dir=str(folder / suite), **own)
+            found |= one.create_envs(n_envs, use_async_envs)
+        return found
 
     def settings_for(self, policy: Any) -> EnvSettings:
         """Return the settings with defaults that follow from a policy's configuration (None if unknown).

@@ -273,7 +273,7 @@ class Episode:
     @property
     def cut_off(self) -> bool:
         """Whether a horizon below the protocol's ended the episode."""
-        whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else self.settings.degree.horizon
+        whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else self.settings.usual["horizon"]
         return self.settings.horizon < whole and self.exec_steps >= self._limit and not (self.success or self.lost)
 
     @property

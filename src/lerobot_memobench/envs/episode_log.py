@@ -41,7 +41,7 @@ from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
 from lerobot_memobench.tasks.difficulty import STANDARD, Difficulty
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import PUBLISHED, Task
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
@@ -136,7 +136,7 @@ class Outcome(TypedDict, total=False):
         variants: evidence episodes: number of variants of the task.
         chance: evidence episodes: rate of correct choices without memory; None if the instruction names the variant.
         failure: failure class; None for a success.
-        suite: ``strict``; absent for published tasks.
+        suite: ``strict``, or a suite of LIBERO; absent for published tasks.
         difficulty: absent for the standard one.
         world: ``libero``; absent for the scenes that version 0.2 modelled in code.
         stand_ins: classes whose missing scans this package's objects replaced.
@@ -184,7 +184,7 @@ class EpisodeRecord(Outcome):
 
     Attributes:
         task: name in the catalogue.
-        memory_type: temporal, spatial, object or procedural.
+        memory_type: temporal, spatial, object or procedural; the suite of a task of LIBERO.
         episode: number of the episode in its evaluation, from 0.
         success: whether the goal held at the end.
         checkpoints: memory checkpoints in the task's order.
@@ -248,8 +248,8 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         ],
         "failure": failure if fault is None else fault.failure,
         **({} if fault is None else {"fault": fault.why}),
-        **({} if task.suite == PUBLISHED else {"suite": task.suite, "lost": episode.lost}),
-        **({} if task.suite == PUBLISHED else {"held_steps": episode.pacing.held_steps}),
+        **({} if task.suite == PUBLISHED else {"suite": task.suite}),
+        **({"lost": episode.lost, "held_steps": episode.pacing.held_steps} if task.suite == STRICT else {}),
         **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
         **{WORLD: LIBERO, "stand_ins": list(episode.stand_ins)},
         **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),

@@ -18,17 +18,17 @@ from lerobot_memobench.protocol import (
     BY_PAPER,
     EVALUATION_SEED,
     HOLD_MEAN,
-    HORIZON,
     PROMPT_HORIZON,
     PROTOCOLS,
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
-from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
+from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT
 from lerobot_memobench.sim.scene_hash import LIBERO, SCENE_HASH_VERSION, WORLD
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
-from lerobot_memobench.tasks.task import DRAWN, PUBLISHED, REFERENTS, STRICT, SUITES
+from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
+from lerobot_memobench.tasks.task import DRAWN, LIBERO_SUITES, PUBLISHED, REFERENTS, STRICT, SUITES
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
@@ -69,6 +69,12 @@ UPSTREAM_ONLY = {
     **MEMORY_CONTROLS,
 }
 """Settings with a fixed value in the authors' evaluation."""
+LIBERO_ONLY = {
+    **{"difficulty": STANDARD, "protocol": BY_PAPER, "referent": REFERENTS[0], "oracle_memory": False},
+    **{"evidence": False, "salt": None, "expert_action": False, "blind_action": False},
+    **MEMORY_CONTROLS,
+}
+"""Settings with a fixed value in LIBERO's suites, whose tasks have no checkpoints, prompts, variants and expert."""
 
 
 def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None) -> Any:
@@ -90,12 +96,20 @@ class EnvSettings:
         MemobenchError: a value is not accepted, or two settings are incompatible.
     """
 
-    suite: str = setting(PUBLISHED, "published tasks, or strict: 30 variants that need a memory", SUITES)
+    suite: str = setting(
+        PUBLISHED,
+        "published tasks, strict: 30 variants that need a memory, or a suite of LIBERO",
+        (*SUITES, *LIBERO_SUITES),
+    )
     difficulty: str = setting(STANDARD, "number of repetitions in strict tasks", DIFFICULTIES)
     protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
     obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
-    convention: str = setting(UPRIGHT, "pictures upright, or mirrored and named as in LIBERO's data", [*CONVENTIONS])
+    convention: str = setting(
+        None,
+        "pictures upright, or mirrored and named as in LIBERO's data; the default follows the suite",
+        [*CONVENTIONS],
+    )
     control_mode: str = setting(
         "relative", "actions are displacements; LIBERO's absolute ones do not exist", ("relative",)
     )
@@ -104,7 +118,7 @@ class EnvSettings:
     )
     demonstration_prompt: bool = setting(True, "object and procedural tasks start with their demonstration prompt")
     prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or in reset", PROMPT_IN)
-    horizon: int = setting(HORIZON, "execution steps per episode; the default follows the difficulty", least=1)
+    horizon: int = setting(None, "execution steps per episode; the default follows suite and difficulty", least=1)
     replan_steps: int | None = setting(
         None, "actions executed per prediction; pauses start, and holds end, between chunks", least=1
     )
@@ -125,6 +139,7 @@ class EnvSettings:
     videos: int = setting(0, "number of first episodes of each task recorded as videos; -1 for all", least=EVERY)
 
     def __post_init__(self) -> None:
+        self._set(**{name: value for name, value in self.usual.items() if getattr(self, name) is None})
         for each in fields(self):
             self._check(each.name, str(each.type), each.metadata)
         if self.referent == DRAWN and self.suite != STRICT:
@@ -139,13 +154,16 @@ class EnvSettings:
         if self.convention != UPRIGHT and self.obs_type == OBJECTS:
             raise MemobenchError(f"convention={self.convention} is of pictures, and obs_type={OBJECTS} has none")
         if self.suite == STRICT:
-            self._set(referent=DRAWN, horizon=self.degree.horizon if self.horizon == HORIZON else self.horizon)
+            self._set(referent=DRAWN)
         elif self.difficulty != STANDARD:
             raise MemobenchError(
                 f"difficulty={self.difficulty} is for strict tasks; set suite={STRICT}, or leave it out"
             )
+        if self.suite in LIBERO_SUITES:
+            self._require(LIBERO_ONLY, f"suite={self.suite}, whose tasks have no checkpoints, prompts and expert,")
         if self.protocol == UPSTREAM:
-            self._follow_upstream()
+            self._require(UPSTREAM_ONLY, f"protocol={UPSTREAM}, the authors' evaluation,")
+            self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
         if self.evidence:
             check_referent(self.referent)
         self._check_memory_controls()
@@ -190,16 +208,15 @@ class EnvSettings:
         elif accepted["values"] and value not in accepted["values"]:
             check_choice(name, value, accepted["values"])
 
-    def _follow_upstream(self) -> None:
-        """Set the values of the authors' evaluation; raise for conflicting ones."""
-        for name, value in UPSTREAM_ONLY.items():
+    def _require(self, fixed: Mapping[str, Any], reason: str) -> None:
+        """Raise for a setting with another value than the fixed one."""
+        for name, value in fixed.items():
             asked = getattr(self, name)
             if asked != value:
                 raise MemobenchError(
-                    f"{name} is {str(asked).lower()}, but protocol={UPSTREAM}, the authors' evaluation, requires "
+                    f"{name} is {str(asked).lower()}, but {reason} requires "
                     f"{name}={str(value).lower()}; leave one of the two out"
                 )
-        self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():
@@ -209,6 +226,16 @@ class EnvSettings:
     def degree(self) -> Degree:
         """Repetitions and horizon of the difficulty."""
         return degree_of(self.difficulty)
+
+    @property
+    def usual(self) -> dict[str, Any]:
+        """Defaults that follow from other settings."""
+        limits: Mapping[str, int] = STEP_LIMITS
+        mirrored = self.suite in limits and self.obs_type != OBJECTS
+        return {
+            "horizon": limits.get(self.suite, self.degree.horizon),
+            "convention": MIRRORED if mirrored else UPRIGHT,
+        }
 
     @property
     def longest_interference(self) -> int:
@@ -225,9 +252,8 @@ class EnvSettings:
         for name in changes:
             if name not in known:
                 raise MemobenchError(f"unknown environment setting {name!r}; {nearest(name, known)}")
-        if "difficulty" in changes and self.horizon == self.degree.horizon:
-            changes = {"horizon": HORIZON} | changes  # the new difficulty has its own
-        return replace(self, **changes)
+        following = {name: None for name, value in self.usual.items() if getattr(self, name) == value}
+        return replace(self, **following | changes)
 
     @property
     def protocol_block(self) -> dict[str, Any]:

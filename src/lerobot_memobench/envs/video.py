@@ -70,7 +70,8 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     prompt = episode.phase == PROMPT
     operations = tuple(checkpoint.operation for checkpoint in episode.task.checkpoints)
     done = 0 if prompt else episode.progress.index
-    now = "watch the prompt" if prompt else "done" if episode.success else f"next: {episode.subgoal()}"
+    following = f"next: {episode.subgoal()}" if operations else ""
+    now = "watch the prompt" if prompt else "done" if episode.success else following
     frame[:BAND] = _band(width, episode.task.language, operations, done, now, prompt)
     pieces = ("prompt ", *str(episode.step_index)) if prompt else ("step ", *str(episode.exec_steps))
     clock = np.concatenate([_piece(piece, prompt) for piece in pieces], axis=1)

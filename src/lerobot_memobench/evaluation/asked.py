@@ -16,7 +16,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, seed_base
 from lerobot_memobench.io import count_of
 from lerobot_memobench.sim.scene_hash import WORLD
-from lerobot_memobench.tasks.catalogue import task_folder, task_names
+from lerobot_memobench.tasks.catalogue import group_of, suite_of
 from lerobot_memobench.tasks.task import REFERENTS, STRICT
 
 # --- extent ---
@@ -114,8 +114,8 @@ def _contradictions(card: Mapping[str, Any], line: Record) -> Iterator[str]:
         yield f"steps: at most {most} and {line['steps']}"
     if line.get("referent") == REFERENTS[0] and line.get("variant") and not protocol["evidence"]:
         yield f"variant: 0 and {line['variant']}"
-    if line["task"] in task_names(suite=None) and not (card.get("settings") or {}).get("env", {}).get("task_dir"):
-        memory_type = task_folder(line["task"]).parent.name
+    if suite_of(line["task"]) is not None and not (card.get("settings") or {}).get("env", {}).get("task_dir"):
+        memory_type = group_of(line["task"])
         yield from differences({"memory_type": memory_type}, {"memory_type": line["memory_type"]})
 
 

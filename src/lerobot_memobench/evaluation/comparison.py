@@ -60,8 +60,8 @@ from lerobot_memobench.evaluation.tables import (
     figure,
 )
 from lerobot_memobench.io import count_of
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import MEMORY_TYPES
+from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
+from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES
 
 ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
 """Settings that may differ when `allow` names them."""
@@ -302,7 +302,7 @@ class _Task:
 
 def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
     partners = {id(mine): other for mine, other in pairs}
-    rng, known = np.random.default_rng(0), task_names(suite=None)
+    rng = np.random.default_rng(0)
     found = []
     for name, group in by_task(mine for mine, _ in pairs).items():
         both = [(mine, partners[id(mine)]) for mine in group]
@@ -312,7 +312,7 @@ def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
             values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
         scenes = _scenes(group)
         episodes = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
-        family = get_task(name).family if name in known else None
+        family = get_task(name).family if suite_of(name) in SUITES else None
         applicable = {metric: value for metric, value in values.items() if value is not None}
         drawn = {metric: value[episodes].mean(axis=1) for metric, value in applicable.items()}
         found.append(_Task(name, str(group[0]["memory_type"]), family, applicable, drawn))
@@ -339,12 +339,18 @@ Scope = tuple[Kind, str, list[list[_Task]]]
 
 
 def _scopes(tasks: Sequence[_Task]) -> list[Scope]:
-    """Return the average, each memory type, each task and each family, in the report's order."""
-    types = [[task for task in tasks if task.memory_type == name] for name in MEMORY_TYPES]
+    """Return the average, each memory type, each task and each family, in the report's order.
+
+    Of a suite of LIBERO, the average is that of the suite, and there are neither memory types nor families.
+    """
+    types = [[task for task in tasks if task.memory_type == name] for name in GROUPS]
     families = {task.family: [other for other in tasks if other.family == task.family] for task in tasks if task.family}
+    types = [group for group in types if group]
+    if (suite := tasks[0].memory_type) in LIBERO_SUITES:
+        return [("average", suite, types), *(("task", task.name, [[task]]) for task in tasks)]
     return [
-        ("average", AVERAGE, [group for group in types if group]),
-        *(("memory type", group[0].memory_type, [group]) for group in types if group),
+        ("average", AVERAGE, types),
+        *(("memory type", group[0].memory_type, [group]) for group in types),
         *(("task", task.name, [[task]]) for task in tasks),
         *(("family", str(name), [group]) for name, group in families.items()),
     ]
@@ -487,6 +493,8 @@ def comparison_section(found: Comparison, overall: bool = False) -> Section:
     """
     kinds = {row.kind for row in found.differences}
     tables = [_table(found, *each) for each in TABLES[: 1 if overall else None] if kinds & {*each[2]}]
+    if "memory type" not in kinds:
+        tables[0] = replace(tables[0], title="Suite")
     sentence = f"{count_of(found.pairs, 'episode')} in both, paired by task, episode and referent."
     meaning = [found.control.meaning] if found.control else []
     return Section(found.title, tuple(tables), (sentence, *meaning, NOTE), found.notes)

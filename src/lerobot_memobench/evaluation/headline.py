@@ -12,6 +12,7 @@ from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
 from lerobot_memobench.sim.scene_hash import FORMER, WORLD
+from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 CONTROLLED = ("pause_steps", "speed", *MEMORY_CONTROLS)
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
@@ -58,7 +59,7 @@ def protocol_phrases(run: Run) -> list[str]:
             if (value := of_all(records, key)) != OMITTED[key]
         ),
         *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),
-        f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}",
+        *([] if suite in LIBERO_SUITES else [_referent(records)]),
         *_seeds(run),
         extent_phrase(records),
         *([] if run.missing is None else ["incomplete"]),
@@ -71,6 +72,10 @@ def protocol_phrases(run: Run) -> list[str]:
         *([f"salt {salt}"] if (salt := run.protocol.get("salt")) else []),
         *(["each scene with each variant"] if run.protocol.get("evidence") else []),
     ]
+
+
+def _referent(records: Sequence[Record]) -> str:
+    return f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}"
 
 
 def _seeds(run: Run) -> list[str]:

@@ -15,9 +15,9 @@ from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
-from lerobot_memobench.tasks.catalogue import suite_of
+from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
-from lerobot_memobench.tasks.task import MEMORY_TYPES, OPERATIONS, PUBLISHED, STRICT_FAILURES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, MEMORY_TYPES, OPERATIONS, PUBLISHED, STRICT_FAILURES
 
 Record = Mapping[str, Any]
 """A rollout: one line of the episode log."""
@@ -47,7 +47,7 @@ def prefix(values: Sequence[bool]) -> list[bool]:
 
 
 def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Group records by task, in the order of memory types and then of names.
+    """Group records by task, in the order of memory types or suites of LIBERO, and then of names.
 
     Raises:
         MemobenchError: rollouts of one task differ in its memory type or operations.
@@ -65,12 +65,12 @@ def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
                     f"rollouts of {name!r} disagree on their {field} ({', '.join(sorted(found))}); "
                     "report logs of different versions of a task separately"
                 )
-        if group[0]["memory_type"] not in MEMORY_TYPES:
+        if group[0]["memory_type"] not in GROUPS:
             raise MemobenchError(
                 f"rollouts of {name!r} have the memory type {group[0]['memory_type']!r}; expected one of "
                 + ", ".join(MEMORY_TYPES)
             )
-    order = {memory_type: k for k, memory_type in enumerate(MEMORY_TYPES)}
+    order = {memory_type: k for k, memory_type in enumerate(GROUPS)}
     return dict(sorted(grouped.items(), key=lambda item: (order[item[1][0]["memory_type"]], item[0])))
 
 
@@ -225,7 +225,7 @@ class Rate:
 
 
 Row = dict[str, Rate]
-"""Metric -> rate."""
+"""Metric -> rate. LIBERO's suites, which have no checkpoints, have SR alone."""
 
 
 def wilson(rate: float, n: float) -> tuple[float, float]:
@@ -267,7 +267,7 @@ def _scenes(records: Sequence[Record]) -> int | None:
 def task_row(records: Sequence[Record]) -> Row:
     """Return the metrics of one task's rollouts: the mean over rollouts of the mean over an operation's checkpoints."""
     row = {"SR": success_rate(records)}
-    for metric, operation in PROCESS_METRICS.items():
+    for metric, operation in _process_metrics(records).items():
         found = checkpoint_rate(records, operation)
         row[metric] = Rate(found.value, len(records) if found.n else 0, _scenes(records))
     return row
@@ -282,8 +282,13 @@ def value_of(record: Record, metric: str) -> float | None:
 
 def pooled_row(records: Sequence[Record]) -> Row:
     """Return SR over all rollouts, and MSR, MUR, MCR over all checkpoint records of the operation."""
-    rates = {metric: checkpoint_rate(records, operation) for metric, operation in PROCESS_METRICS.items()}
+    rates = {metric: checkpoint_rate(records, operation) for metric, operation in _process_metrics(records).items()}
     return {"SR": success_rate(records), **rates}
+
+
+def _process_metrics(records: Sequence[Record]) -> dict[str, str]:
+    """Return `PROCESS_METRICS`, {} for tasks of LIBERO's suites."""
+    return {} if any(record.get("memory_type") in LIBERO_SUITES for record in records) else PROCESS_METRICS
 
 
 def checkpoint_rate(records: Iterable[Record], wanted: str) -> Rate:
@@ -308,7 +313,7 @@ def column_rates(rows: Sequence[Sequence[bool]]) -> list[Rate]:
 def mean_row(rows: Iterable[Row]) -> Row:
     """Return the mean of several rows, metric by metric, over those to which the metric applies."""
     rows = list(rows)
-    return {metric: mean_rate([row[metric] for row in rows]) for metric in METRICS}
+    return {metric: mean_rate([row[metric] for row in rows]) for metric in rows[0]}
 
 
 def mean_rate(rates: Iterable[Rate]) -> Rate:
@@ -362,9 +367,13 @@ def failure_of(record: Record) -> str | None:
 
 
 def failure_counts(records: Iterable[Record]) -> dict[str, int]:
-    """Return class -> number of failed rollouts, in the report's order: the paper's classes, others as found."""
-    found = Counter(failure_of(record) for record in records)
-    return {name: found[name] for name in _ALL if name in FAILURES or found[name]}
+    """Return class -> number of failed rollouts, in the report's order: the paper's classes, others as found.
+
+    Of LIBERO's suites, only those that are found.
+    """
+    records = list(records)
+    found, always = Counter(map(failure_of, records)), FAILURES if _process_metrics(records) else ()
+    return {name: found[name] for name in _ALL if name in always or found[name]}
 
 
 # --- every figure of a set of rollouts ---
@@ -376,7 +385,7 @@ class Summary:
 
     Attributes:
         tasks: name -> metrics.
-        memory_types: name -> metrics, each the mean over its applicable tasks.
+        memory_types: name -> metrics, each the mean over its applicable tasks; a suite of LIBERO is one of them.
         average: mean over the applicable memory types.
         pooled: MSR, MUR, MCR over all checkpoint records of the operation, of all tasks; n counts records.
         pooled_checkpoints: the same over all checkpoint records, of all operations.
@@ -404,6 +413,11 @@ class Summary:
     inputs: str
 
     @property
+    def of_libero(self) -> bool:
+        """Whether the rollouts are of a suite of LIBERO, whose tasks have no checkpoints."""
+        return bool({*self.memory_types} & {*LIBERO_SUITES})
+
+    @property
     def rollouts(self) -> int:
         """How many rollouts there are."""
         return self.pooled["SR"].n
@@ -419,7 +433,7 @@ def summarise(records: Iterable[Record]) -> Summary:
     memory_type_of = {name: str(group[0]["memory_type"]) for name, group in groups.items()}
     memory_types: dict[str, Row] = {
         memory_type: mean_row(tasks[name] for name in tasks if memory_type_of[name] == memory_type)
-        for memory_type in MEMORY_TYPES
+        for memory_type in GROUPS
         if memory_type in memory_type_of.values()
     }
     return Summary(
@@ -453,4 +467,4 @@ def report_values(summary: Summary) -> dict[str, Any]:
 
 
 def _percentages(row: Row) -> dict[str, Any]:
-    return {"n": row["SR"].n, **{metric: percent(row[metric].value) for metric in METRICS}}
+    return {"n": row["SR"].n, **{metric: percent(rate.value) for metric, rate in row.items()}}

@@ -21,7 +21,6 @@ from lerobot_memobench.evaluation.controls import granularity_data, granularity_
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
-    METRICS,
     Rate,
     Row,
     Summary,
@@ -126,7 +125,8 @@ def _section(run: Run) -> Section:
     """Return the section of one evaluation, without a title."""
     summary = run.summary
     inputs = inputs_sentence(summary.inputs)
-    made = (memory_types_table(summary), tasks_table(summary), prefix_table(summary), failures_table(summary))
+    prefixes = () if summary.of_libero else (prefix_table(summary),)
+    made = (memory_types_table(summary), tasks_table(summary), *prefixes, failures_table(summary))
     return Section(
         "",
         tuple(replace(each, note=f"{each.note} {inputs}".strip()) for each in made),
@@ -198,7 +198,7 @@ def run_data(run: Run) -> dict[str, Any]:
 
 
 def _intervals(row: Row) -> dict[str, list[float | None] | None]:
-    return {metric: _interval(row[metric]) for metric in METRICS}
+    return {metric: _interval(rate) for metric, rate in row.items()}
 
 
 def _interval(rate: Rate) -> list[float | None] | None:
@@ -211,9 +211,9 @@ def _pooled(rate: Rate) -> dict[str, Any]:
 
 def _sweep_data(runs: Sequence[Run]) -> dict[str, Any]:
     return {
-        "best": {metric: best_interval(runs, metric)[0] for metric in METRICS},
+        "best": {metric: best_interval(runs, metric)[0] for metric in runs[0].summary.average},
         "average": {
-            str(run.replan_steps): {metric: percent(run.summary.average[metric].value) for metric in METRICS}
+            str(run.replan_steps): {metric: percent(rate.value) for metric, rate in run.summary.average.items()}
             for run in runs
         },
     }

@@ -24,6 +24,7 @@ from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_ro
 from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
+from lerobot_memobench.tasks.catalogue import GROUPS
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 
@@ -45,6 +46,8 @@ def pooled_sentence(summary: Summary) -> str:
         if metric != "SR" and rate.value is not None
     ]
     overall = summary.pooled_checkpoints
+    if not overall.n:
+        return f"Pooled over all rollouts of all tasks: SR {figure(summary.pooled['SR'].value)}."
     return (
         f"Pooled over all rollouts of all tasks: SR {figure(summary.pooled['SR'].value)}, "
         f"checkpoints satisfied {figure(overall.value)} ({count_of(overall.n, 'record')}): {', '.join(parts)}."
@@ -67,10 +70,11 @@ HOW_TO_READ = (
     "SR is success, MSR, MUR and MCR the rates at which checkpoints of Storage, Update and Compression were satisfied "
     "at some step. Per cent, with the Wilson 95 % interval; n counts rollouts; – is not applicable."
 )
+SR_ALONE = "SR is success, per cent, with the Wilson 95 % interval; n counts rollouts."
 
 
 def rates_table(summary: Summary) -> Table:
-    """Return one table of all tasks, each memory type's after them, and the average."""
+    """Return one table of all tasks, each memory type's after them, and the average; LIBERO's suites have none."""
     rows: list[tuple[Cell, ...]] = []
     strong, rules = [], []
     for memory_type, row in summary.memory_types.items():
@@ -80,15 +84,19 @@ def rates_table(summary: Summary) -> Table:
         rows += [rate_row(Name(name), summary.tasks[name]) for name in names]
         strong.append(len(rows))
         rows.append(rate_row(f"{memory_type} ({count_of(len(names), 'task')})", row))
-    rules.append(len(rows))
-    strong.append(len(rows))
-    rows.append(rate_row(AVERAGE, summary.average))
-    return Table("rates", "", ("task", "n", *METRICS), tuple(rows), strong=frozenset(strong), rules=frozenset(rules))
+    if not summary.of_libero:
+        rules.append(len(rows))
+        strong.append(len(rows))
+        rows.append(rate_row(AVERAGE, summary.average))
+    header = ("task", "n", *summary.average)
+    return Table("rates", "", header, tuple(rows), strong=frozenset(strong), rules=frozenset(rules))
 
 
 def memory_types_table(summary: Summary) -> Table:
-    """Return one row per memory type, and the average."""
+    """Return one row per memory type, and the average; of LIBERO the row of its suite."""
     rows = [rate_row(name, row) for name, row in summary.memory_types.items()]
+    if summary.of_libero:
+        return Table("memory-types", "Rate of the suite", ("suite", "n", *summary.average), tuple(rows), note=SR_ALONE)
     return Table(
         "memory-types",
         "Rates by memory type",
@@ -107,7 +115,7 @@ def tasks_table(summary: Summary) -> Table:
     return Table(
         "tasks",
         "Rates by task",
-        ("task", "n", *METRICS),
+        ("task", "n", *summary.average),
         tuple(rate_row(Name(name), summary.tasks[name]) for name in names),
         rules=frozenset(k for k in range(1, len(types)) if types[k] != types[k - 1]),
     )
@@ -115,7 +123,7 @@ def tasks_table(summary: Summary) -> Table:
 
 def rate_row(name: Cell, row: Row) -> tuple[Cell, ...]:
     """Return a row of a table of rates: name, n, metrics."""
-    return (name, Count(row["SR"].n), *(row[metric] for metric in METRICS))
+    return (name, Count(row["SR"].n), *row.values())
 
 
 def prefix_table(summary: Summary) -> Table:
@@ -138,6 +146,11 @@ def prefix_table(summary: Summary) -> Table:
     )
 
 
+FAILURES_NOTE = (
+    "A failed rollout is named after the first checkpoint that was never satisfied: Storage, Update (stale memory) or "
+    "Compression; reference drift where another answer than the prompt's took the place; execution failure where all "
+    "checkpoints were satisfied."
+)
 FURTHER_NOTES = {
     "wrong_order": " Wrong order: steps or events were done in another order than asked for.",
     "cut_off": " Cut off: the horizon is shorter than the protocol's, so the memory may have worked.",
@@ -153,24 +166,20 @@ FURTHER_NOTES = {
 def failures_table(summary: Summary) -> Table:
     """Return how rollouts ended, in all and by memory type."""
     counts: dict[str, Mapping[str, int]] = {"all": outcomes(summary, summary.tasks)}
-    for memory_type in summary.memory_types:
+    for memory_type in () if summary.of_libero else summary.memory_types:
         counts[memory_type] = outcomes(summary, _tasks_of(summary, memory_type))
     total = summary.rollouts
     rows: list[tuple[Cell, ...]] = []
     for outcome in ("success", *summary.failures):
         found = [Count(column[outcome]) for column in counts.values()]
         rows.append((outcome.replace("_", " "), *found, Rate(found[0] / total, total)))
+    note = FAILURES_NOTE + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
     return Table(
         "failures",
         "Outcomes of rollouts",
         ("outcome", "rollouts", *list(counts)[1:], "of all"),
         tuple(rows),
-        note=(
-            "A failed rollout is named after the first checkpoint that was never satisfied: Storage, Update (stale "
-            "memory) or Compression; reference drift where another answer than the prompt's took the place; execution "
-            "failure where all checkpoints were satisfied."
-            + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
-        ),
+        note="" if summary.of_libero else note,
         rules=frozenset({1}),
     )
 
@@ -188,6 +197,8 @@ def _tasks_of(summary: Summary, memory_type: str) -> list[str]:
 
 # --- several evaluations, in the layout of the paper's main table: every memory type's rates in one row ---
 
+PAPER_COLUMNS = (*MEMORY_TYPES, "average")
+"""Groups of columns of the paper's main table."""
 LEADING = ("evaluation", "inputs", "k")
 """Columns before the rates."""
 NOTE = "inputs: of the policy; k: the replan interval."
@@ -196,7 +207,11 @@ NOTE = "inputs: of the policy; k: the replan interval."
 def overview(runs: Sequence[Run]) -> Table:
     """Return one row per evaluation; the note names the settings in which they differ."""
     rows = tuple(run_row(run) for run in runs)
-    return wide_table("overview", "Evaluations", rows, note=" ".join([NOTE, *unlike(runs)]), best=best_in_columns(rows))
+    note, first = " ".join([NOTE, *unlike(runs)]), runs[0].summary
+    columns, metrics = columns_of(first), first.average
+    return wide_table(
+        "overview", "Evaluations", rows, note=note, best=best_in_columns(rows), columns=columns, metrics=metrics
+    )
 
 
 def run_row(run: Run) -> tuple[Cell, ...]:
@@ -205,10 +220,15 @@ def run_row(run: Run) -> tuple[Cell, ...]:
 
 
 def all_rates(summary: Summary) -> list[Rate]:
-    """Return the metrics of every memory type and of the average, in the paper's order."""
-    absent = dict.fromkeys(METRICS, Rate(None, 0))
-    rows = [*(summary.memory_types.get(name, absent) for name in MEMORY_TYPES), summary.average]
-    return [row[metric] for row in rows for metric in METRICS]
+    """Return the metrics of every memory type and of the average, in the paper's order, or of LIBERO's suite."""
+    absent = dict.fromkeys(summary.average, Rate(None, 0))
+    found = {**summary.memory_types, "average": summary.average}
+    return [rate for name in columns_of(summary) for rate in found.get(name, absent).values()]
+
+
+def columns_of(summary: Summary) -> tuple[str, ...]:
+    """Return the groups of columns of a wide table."""
+    return tuple(summary.memory_types) if summary.of_libero else PAPER_COLUMNS
 
 
 def wide_table(
@@ -220,15 +240,18 @@ def wide_table(
     strong: Iterable[int] = (),
     rules: Iterable[int] = (),
     best: frozenset[tuple[int, int]] = frozenset(),
+    columns: Sequence[str] = PAPER_COLUMNS,
+    metrics: Iterable[str] = METRICS,
 ) -> Table:
-    """Return a table whose rows are some leading cells and then `all_rates`."""
+    """Return a table whose rows are some leading cells and then `all_rates`, under ``columns`` and ``metrics``."""
+    metrics = tuple(metrics)
     return Table(
         key,
         title,
-        (*leading, *(METRICS * (len(MEMORY_TYPES) + 1))),
+        (*leading, *(metrics * len(columns))),
         rows,
         note=note,
-        groups=(*(("", 1) for _ in leading), *((name, len(METRICS)) for name in (*MEMORY_TYPES, "average"))),
+        groups=(*(("", 1) for _ in leading), *((name, len(metrics)) for name in columns)),
         strong=frozenset(strong),
         rules=frozenset(rules),
         best=best,
@@ -238,15 +261,16 @@ def wide_table(
 
 def joined_table(runs: Sequence[Run]) -> Table:
     """Return one row per task, memory type and average, with the rates of all evaluations next to each other."""
-    absent: Row = dict.fromkeys(METRICS, Rate(None, 0))
+    metrics = tuple(runs[0].summary.average)
+    absent: Row = dict.fromkeys(metrics, Rate(None, 0))
     rows: list[tuple[Cell, ...]] = []
     strong, rules = [], []
 
     def add(name: Cell, found: Iterable[Row]) -> None:
         each = list(found)
-        rows.append((name, *(row[metric] for metric in METRICS for row in each)))
+        rows.append((name, *(row[metric] for metric in metrics for row in each)))
 
-    for memory_type in MEMORY_TYPES:
+    for memory_type in GROUPS:
         names = dict.fromkeys(name for run in runs for name in _tasks_of(run.summary, memory_type))
         if not names:
             continue
@@ -255,15 +279,16 @@ def joined_table(runs: Sequence[Run]) -> Table:
         strong.append(len(rows))
         add(memory_type, (run.summary.memory_types.get(memory_type, absent) for run in runs))
         rules.append(len(rows))
-    strong.append(len(rows))
-    add(AVERAGE, (run.summary.average for run in runs))
+    if not runs[0].summary.of_libero:
+        strong.append(len(rows))
+        add(AVERAGE, (run.summary.average for run in runs))
     return Table(
         "joined",
         "Rates by task",
-        ("task", *(run.name for _ in METRICS for run in runs)),
+        ("task", *(run.name for _ in metrics for run in runs)),
         tuple(rows),
         note="Per cent; – is not applicable. Intervals: in CSV, JSON and the report of each evaluation alone.",
-        groups=(("", 1), *((metric, len(runs)) for metric in METRICS)),
+        groups=(("", 1), *((metric, len(runs)) for metric in metrics)),
         strong=frozenset(strong),
         rules=frozenset(rules),
         intervals=False,
@@ -277,15 +302,16 @@ def sweep(method: str, runs: Sequence[Run]) -> Section:
     """Return the tables of one method at several replan intervals, and which interval is best for what."""
     averages = tuple((run.replan_steps, *rate_row(None, run.summary.average)[1:]) for run in runs)
     types = tuple((run.replan_steps, *all_rates(run.summary)) for run in runs)
+    first = runs[0].summary
     inputs = inputs_sentence(policy_inputs([record for run in runs for record in run.records]))
     slug = "-".join("".join(c if c.isalnum() and c.isascii() else " " for c in method).split()) or "policy"
     tables = (
         Table(
             f"replan-{slug}",
             f"Average by replan interval: {method}",
-            ("replan interval", "n", *METRICS),
+            ("replan interval", "n", *first.average),
             averages,
-            note=f"{HOW_TO_READ} {inputs}",
+            note=f"{SR_ALONE if first.of_libero else HOW_TO_READ} {inputs}",
             best=best_in_columns(averages),
         ),
         wide_table(
@@ -295,11 +321,13 @@ def sweep(method: str, runs: Sequence[Run]) -> Section:
             leading=("replan interval",),
             note=inputs,
             best=best_in_columns(types),
+            columns=columns_of(first),
+            metrics=first.average,
         ),
     )
     best = [
         f"{metric} {figure(rate.value)} at {' and '.join(map(str, steps))}"
-        for metric in METRICS
+        for metric in first.average
         for steps, rate in [best_interval(runs, metric)]
         if rate is not None
     ]

@@ -35,6 +35,8 @@ from lerobot_memobench.protocol import (
     VALIDATION,
 )
 from lerobot_memobench.run.arguments import RUN_OPTIONS, Arguments, is_true, joined, split_arguments
+from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -156,6 +158,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
         check_choice("split", options.split, EVALUATED)
     asked = with_device(with_policy(asked), options)
     policy = policy_of(asked)
+    check_expert(policy, asked.env.get("suite", PUBLISHED))
     convention = chosen_convention(asked.policy_path, policy, asked.env.get("convention"), asked.rename_map)
     asked = asked if convention is None else replace(asked, env={**asked.env, "convention": convention})
     output = _output(asked, options, policy)
@@ -260,6 +263,11 @@ def check_split(plan: EvaluationPlan) -> None:
         MemobenchError: they are refused.
     """
     asked, seeds, sealed = plan.options.split, plan.seeds, SPLITS[SEALED]
+    if plan.environment.suite in LIBERO_SUITES and asked not in (None, PAPER):
+        raise MemobenchError(
+            f"split={asked} is of memory tasks; tasks of {plan.environment.suite} have {NUM_STATES} initial states, of "
+            "which episode i has the i-th: leave split= out"
+        )
     if asked is not None and plan.split != asked:
         split = SPLITS[asked]
         raise MemobenchError(
@@ -275,12 +283,31 @@ def check_split(plan: EvaluationPlan) -> None:
         )
 
 
-def check_scenes(plan: EvaluationPlan) -> None:
-    """Refuse fewer episodes than a task has variants, with evidence: no scene would be complete.
+def check_expert(policy: PreTrainedConfig, suite: str) -> None:
+    """Refuse the scripted policies in LIBERO's suites.
 
     Raises:
-        MemobenchError: a task has more variants than episodes.
+        MemobenchError: it is refused.
     """
+    if policy.type in SCRIPTED and suite in LIBERO_SUITES:
+        raise MemobenchError(
+            f"found suite={suite} with policy={policy.type}; LIBERO's tasks have no scripted expert: name a policy, "
+            "policy=<checkpoint>"
+        )
+
+
+def check_scenes(plan: EvaluationPlan) -> None:
+    """Refuse fewer episodes than a task has variants, with evidence, and more than it has initial states in LIBERO.
+
+    Raises:
+        MemobenchError: no scene would be complete, or one would be run twice.
+    """
+    grid = plan.grid
+    if plan.environment.suite in LIBERO_SUITES and not 0 <= grid.first <= grid.first + grid.runs <= NUM_STATES:
+        raise MemobenchError(
+            f"found episodes {grid.first} to {grid.first + grid.runs - 1}; tasks of {plan.environment.suite} have "
+            f"{NUM_STATES} initial states: ask for at most episodes={NUM_STATES}, and leave seed_base out"
+        )
     if not plan.environment.evidence:
         return
     variants = plan.variants

@@ -28,10 +28,13 @@ from lerobot_memobench.run.arguments import (
     read_config_file,
     translate,
     with_file,
+    without_none,
 )
+from lerobot_memobench.tasks.catalogue import lerobots_choice
+from lerobot_memobench.tasks.task import PUBLISHED
 
 EXPERT = "memobench_expert"
-OWN = ("tasks", "task_dir", "log_dir", "resume")
+OWN = ("task", "task_ids", "tasks", "task_dir", "log_dir", "resume")
 """Fields of `MemobenchEnvConfig` that do not belong to `EnvSettings`."""
 ENVIRONMENT: dict[str, Any] = {
     name: kind
@@ -133,7 +136,23 @@ def typed_settings(values: Mapping[str, str | None]) -> EvaluationSettings:
         elif key not in WITHOUT_EFFECT:
             known = [*OTHERS, *(f"env.{name}" for name in ENVIRONMENT)]
             raise MemobenchError(f"an evaluation of the benchmark has no setting {key!r}, {nearest(key, known)}")
-    return EvaluationSettings(env, policy, **others)
+    return EvaluationSettings(_without_lerobots_names(env), policy, **others)
+
+
+def _without_lerobots_names(env: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with ``suite`` and ``tasks`` instead of LeRobot's ``task`` and ``task_ids``.
+
+    Raises:
+        MemobenchError: they contradict each other, or name several suites.
+    """
+    names = ("task", "task_ids")
+    if not {*names} & {*env}:
+        return {**env}
+    task, ids = (env.get(name) for name in names)
+    suites, tasks = lerobots_choice(task, ids, env.get("suite", PUBLISHED), env.get("tasks", "all"))
+    if len(suites) > 1:
+        raise MemobenchError(f"task={task} names {len(suites)} suites; an evaluation is of one: run each by itself")
+    return {name: value for name, value in env.items() if name not in names} | {"suite": suites[0], "tasks": tasks}
 
 
 def _typed(key: str, kind: Any, text: str) -> Any:
@@ -144,7 +163,9 @@ def _typed(key: str, kind: Any, text: str) -> Any:
     named = [part for part in (typing.get_args(kind) or (kind,)) if part is not type(None)]
     if named == [str]:
         return checked
-    return yaml.safe_load(checked) if typing.get_origin(kind) is dict else draccus.decode(named[0], checked)
+    if typing.get_origin(without_none(kind)) in (dict, list):
+        return yaml.safe_load(checked)
+    return draccus.decode(named[0], checked)
 
 
 def with_policy(asked: EvaluationSettings) -> EvaluationSettings:

@@ -1,4 +1,4 @@
-"""List and load the 30 published and 30 strict tasks, and task folders in the published format.
+"""List and load the 30 published and 30 strict tasks, LIBERO's 130, and task folders in the published format.
 
 A task folder holds ``task_config.bddl`` and ``task_config.meta.json``. Values missing from published metadata are
 inferred from the folder name and the instruction.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,12 @@ from lerobot_memobench.io import files_below, spelled
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
 from lerobot_memobench.tasks.gap import gaps
+from lerobot_memobench.tasks.libero_suites import FOLDER as LIBERO_FOLDER
+from lerobot_memobench.tasks.libero_suites import get_libero_task, libero_suite_of, libero_tasks
 from lerobot_memobench.tasks.metadata import Metadata, read_text
 from lerobot_memobench.tasks.task import (
     BDDL_FILE,
+    LIBERO_SUITES,
     MEMORY_TYPES,
     METADATA_FILE,
     PUBLISHED,
@@ -34,6 +37,10 @@ from lerobot_memobench.tasks.task import (
 
 #: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over both suites.
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"
+
+ALL_SUITES: tuple[str, ...] = (*SUITES, *LIBERO_SUITES)
+GROUPS: tuple[str, ...] = (*MEMORY_TYPES, *LIBERO_SUITES)
+"""Groups of tasks in reports, and LeRobot's suites: memory types, and the suites of LIBERO."""
 
 TASK_NUMBERS = re.compile(r"(\d+)(?:-(\d+))?")
 """A task number, or an inclusive range of numbers."""
@@ -69,44 +76,66 @@ def _folders() -> dict[str, Path]:
 
 def suite_of(name: str) -> str | None:
     """Return the suite of a catalogue task, None for an unknown name."""
-    return _folders()[name].parent.parent.name if name in _folders() else None
+    return _folders()[name].parent.parent.name if name in _folders() else libero_suite_of(name)
+
+
+def group_of(name: str) -> str:
+    """Return the memory type of a catalogue task, for a task of LIBERO its suite; raises as `task_folder`."""
+    return libero_suite_of(name) or task_folder(name).parent.name
 
 
 def check_suite(suite: str) -> str:
     """Return ``suite``; raise `MemobenchError` if it is unknown."""
-    check_choice("suite", suite, SUITES)
+    check_choice("suite", suite, ALL_SUITES)
     return suite
 
 
 def task_names(memory_types: str | Iterable[str] | None = None, suite: str | None = PUBLISHED) -> list[str]:
     """Return the names of a suite's tasks in catalogue order, optionally of some memory types only.
 
-    ``suite=None`` selects both suites, the published one first.
+    ``suite=None`` selects the published suite and the strict one.
     """
-    names = [name for name in _folders() if suite is None or suite_of(name) == check_suite(suite)]
+    if suite in LIBERO_SUITES:
+        names = [*libero_tasks(suite)]
+    else:
+        names = [name for name in _folders() if suite is None or suite_of(name) == check_suite(suite)]
     if memory_types is None:
         return names
     wanted = [memory_types] if isinstance(memory_types, str) else list(memory_types)
     for memory_type in wanted:
         if memory_type not in MEMORY_TYPES:
             raise MemobenchError(f"found the memory type {memory_type!r}, expected one of {', '.join(MEMORY_TYPES)}")
-    return [name for name in names if _folders()[name].parent.name in wanted]
+    return [name for name in names if group_of(name) in wanted]
 
 
 def task_index(name: str) -> int:
-    """Return the stable index of a task: its position in ``task_names(suite=None)``."""
-    return list(_folders()).index(task_folder(name).name)
+    """Return the stable index of a task: its position in ``task_names(suite=None)``, or LIBERO's id."""
+    suite = libero_suite_of(name)
+    return libero_tasks(suite).index(name) if suite else list(_folders()).index(task_folder(name).name)
+
+
+def first_number(suite: str) -> int:
+    """Return the number of a suite's first task: LIBERO's ids begin with 0."""
+    return 0 if suite in LIBERO_SUITES else 1
 
 
 def task_number(name: str) -> int:
-    """Return the number of a task within its suite, in catalogue order from 1."""
-    return task_names(suite=task_folder(name).parent.parent.name).index(name) + 1
+    """Return the number of a task within its suite, in catalogue order."""
+    suite = libero_suite_of(name) or task_folder(name).parent.parent.name
+    return task_names(suite=suite).index(name) + first_number(suite)
 
 
 def task_folder(name: str) -> Path:
-    """Return the folder of a catalogue task; an unknown name raises `MemobenchError` with the nearest names."""
+    """Return the folder of a catalogue task, for a task of LIBERO its place in an archive; `load_task` reads both.
+
+    Raises:
+        MemobenchError: the name is unknown; the nearest names are given.
+    """
+    if libero_suite_of(name) is not None:
+        return get_libero_task(name).folder
     if name not in _folders():
-        raise MemobenchError(f"found no task named {name!r} in the catalogue, {nearest(name, _folders())}")
+        known = [*_folders(), *(each for suite in LIBERO_SUITES for each in libero_tasks(suite))]
+        raise MemobenchError(f"found no task named {name!r} in the catalogue, {nearest(name, known)}")
     return _folders()[name]
 
 
@@ -119,8 +148,8 @@ def get_task(name: str) -> Task:
 def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str]:
     """Return the task names selected by "all", memory types, names, numbers, or a comma-separated list of these.
 
-    A number (`task_number`) or a range, such as ``12`` or ``3-7``, selects tasks of the suite. Names that contain
-    commas are recognised. The given order is kept; repetitions are dropped.
+    A number (`task_number`) or a range, such as ``12`` or ``3-7``, selects tasks of the suite. LIBERO's suites have no
+    memory types. Names that contain commas are recognised. The given order is kept; repetitions are dropped.
     """
     check_suite(suite)
     if not isinstance(spec, str):
@@ -147,12 +176,48 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
                     f"found {given} among the tasks; expected 'all', or names, numbers or memory types separated by "
                     "single commas"
                 )
-            hint = nearest(word, ["all", *MEMORY_TYPES, *task_names(suite=suite)])
+            types = MEMORY_TYPES if suite in SUITES else ()
+            hint = nearest(word, ["all", *types, *task_names(suite=suite), *LIBERO_SUITES])
             raise MemobenchError(
-                f"found {word!r} among the tasks, expected 'all', a memory type ({', '.join(MEMORY_TYPES)}), "
-                f"or a task's name or number (`memobench tasks` lists them), {hint}"
+                f"found {word!r} among the tasks, expected 'all', "
+                f"{f'a memory type ({", ".join(types)}), ' if types else ''}or a task's name or number "
+                f"(`memobench tasks{'' if suite == PUBLISHED else f' --suite {suite}'}` lists them), {hint}"
             )
     return list(dict.fromkeys(chosen))
+
+
+def lerobots_choice(
+    task: str | None, task_ids: Sequence[int] | None, suite: str, tasks: str
+) -> tuple[tuple[str, ...], str]:
+    """Return suites and ``tasks`` for LeRobot's settings ``task`` and ``task_ids``, next to ``suite`` and ``tasks``.
+
+    Args:
+        task: suites of LIBERO, separated by commas, or what ``tasks`` accepts.
+        task_ids: LIBERO's ids of tasks, from 0, in each of the suites.
+
+    Raises:
+        MemobenchError: both names of one setting are given, or ids with another suite than LIBERO's.
+    """
+    words = [] if task is None else [word.strip() for word in task.split(",")]
+    suites = tuple(dict.fromkeys(words)) if {*words} & {*LIBERO_SUITES} else (suite,)
+    if suites != (suite,):
+        for each in suites:
+            check_choice("task", each, LIBERO_SUITES)
+        if suite not in (PUBLISHED, suites[0]):
+            raise MemobenchError(f"task={task} and suite={suite} are both given; leave one of them out")
+    elif words and suite not in words:
+        if tasks != "all":
+            raise MemobenchError(f"task={task} and tasks={tasks} are both given; leave out task=")
+        tasks = str(task)
+    if task_ids is None:
+        return suites, tasks
+    if tasks != "all":
+        raise MemobenchError(f"task_ids={task_ids} and tasks={tasks} are both given; leave one of them out")
+    if not {*suites} <= {*LIBERO_SUITES}:
+        raise MemobenchError(f"task_ids={task_ids} are ids of LIBERO's suites, and suite={suite}; name tasks by tasks=")
+    if not isinstance(task_ids, list) or not all(type(each) is int for each in task_ids):
+        raise MemobenchError(f"task_ids is {task_ids!r}; expected ids of LIBERO's tasks in a list, such as [0,1]")
+    return suites, ",".join(map(str, task_ids))
 
 
 def _check_all_alone(entries: list[str]) -> None:
@@ -165,19 +230,22 @@ def _check_all_alone(entries: list[str]) -> None:
 
 def _expand(word: str, suite: str) -> list[str]:
     """Return the tasks selected by one entry, none for an unknown entry."""
-    if word == "all" or word in MEMORY_TYPES:
+    if word == "all" or (word in MEMORY_TYPES and suite in SUITES):
         return task_names(None if word == "all" else word, suite)
+    if word in ALL_SUITES:
+        raise MemobenchError(f"{word!r} is a suite, no task; set suite={word}, or --suite {word}")
     if NUMERIC_ENTRY.fullmatch(word) is not None:
         names, numbers = task_names(suite=suite), TASK_NUMBERS.fullmatch(word)
-        first, last = (0, 0) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
-        if not 1 <= first <= last <= len(names):
+        lowest = first_number(suite)
+        first, last = (-1, -1) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
+        if not lowest <= first <= last < lowest + len(names):
             reversed_range = "the range is reversed; " if first > last else ""
             problem = "this is not a complete range; " if numbers is None else reversed_range
             raise MemobenchError(
-                f"found {word} among the tasks; {problem}tasks of the {suite} suite are numbered 1 to {len(names)}, "
-                "an example of a range is 3-7 (`memobench tasks` lists them)"
+                f"found {word} among the tasks; {problem}tasks of the {suite} suite are numbered {lowest} to "
+                f"{lowest + len(names) - 1}, an example of a range is 3-7 (`memobench tasks` lists them)"
             )
-        return names[first - 1 : last]
+        return names[first - lowest : last - lowest + 1]
     own = suite_of(word)
     if own not in (None, suite):
         raise MemobenchError(f"{word!r} is a task of the {own} suite; set suite={own}, or --suite {own}")
@@ -189,7 +257,8 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
     return {
         "name": task.name,
         "memory_type": task.memory_type,
-        **({} if task.suite == PUBLISHED else {"suite": task.suite, "derived_from": task.derived_from}),
+        **({"suite": task.suite, "derived_from": task.derived_from} if task.suite in SUITES[1:] else {}),
+        **({"suite": task.suite, "id": task_index(task.name)} if task.suite in LIBERO_SUITES else {}),
         "family": task.family,
         "language": task.language,
         "objects": _by_class(task.objects),
@@ -253,6 +322,8 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         MemobenchError: with file, place, the value found and the value expected.
     """
     folder = Path(folder).resolve()
+    if folder.parent.parent == LIBERO_FOLDER.resolve():
+        return get_libero_task(folder.name)
     if not folder.is_dir():
         raise MemobenchError(f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}")
     bddl, path = spelled(folder / BDDL_FILE), spelled(folder / METADATA_FILE)

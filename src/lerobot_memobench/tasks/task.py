@@ -20,12 +20,15 @@ MemoryType = Literal["temporal", "spatial", "object", "procedural"]
 Operation = Literal["S", "U", "C"]
 PromptKind = Literal["routine", "pick", "point", "highlight", "hide"]
 Suite = Literal["published", "strict"]
+LiberoSuite = Literal["libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90"]
 Texts = tuple[str, str, str]
 
 MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
 OPERATIONS: tuple[Operation, ...] = get_args(Operation)
 SUITES: tuple[Suite, ...] = get_args(Suite)
 PUBLISHED, STRICT = SUITES
+#: LIBERO's own suites (`tasks.libero_suites`), whose tasks have no checkpoints.
+LIBERO_SUITES: tuple[LiberoSuite, ...] = get_args(LiberoSuite)
 REFERENTS = ("fixed", "random")
 #: Referent of strict episodes, which ignore the referent setting (`Task.drawn`).
 DRAWN = "drawn"
@@ -122,7 +125,8 @@ class Task:
 
     Attributes:
         name: name of the folder.
-        memory_type: temporal, spatial, object or procedural.
+        memory_type: temporal, spatial, object or procedural; the suite for a task of LIBERO's suites, which LeRobot
+            reports by suite.
         family: group of similar tasks.
         language: instruction.
         objects: instance -> class, in the file's order.
@@ -134,7 +138,7 @@ class Task:
         variant_index: index of this variant.
         bddl_text: content of the task file.
         metadata: content of the metadata file.
-        suite: published or strict; a strict episode ends when its goal can no longer be reached.
+        suite: published, strict or one of LIBERO's; a strict episode ends when its goal can no longer be reached.
         derived_from: published task with the same scene; None for a task with its own scene.
         drawn: whether each episode draws its variant by seed and ignores the referent setting; False for a variant.
         spoilt_as: failure class of an episode with an unreachable goal; None classifies by checkpoints.
@@ -142,7 +146,7 @@ class Task:
     """
 
     name: str
-    memory_type: MemoryType
+    memory_type: MemoryType | LiberoSuite
     family: str
     language: str
     objects: dict[str, str]
@@ -160,7 +164,7 @@ class Task:
     metadata: dict[str, Any] = field(repr=False)
     variant_index: int = 0
     published: Task | None = field(default=None, repr=False)
-    suite: Suite = "published"
+    suite: Suite | LiberoSuite = "published"
     derived_from: str | None = None
     drawn: bool = False
     spoilt_as: str | None = None

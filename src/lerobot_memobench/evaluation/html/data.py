@@ -32,15 +32,15 @@ from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
 from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.memory_reads import Chunk
 from lerobot_memobench.protocol import CONTROL_HZ
-from lerobot_memobench.tasks.catalogue import find_tasks, get_task, load_task, task_names
+from lerobot_memobench.tasks.catalogue import GROUPS, find_tasks, get_task, load_task, suite_of
 from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
-from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES, Task
+from lerobot_memobench.tasks.task import LEVELS, Task
 
 
-def task_source(task_dir: str | Path | None) -> dict[str, Task]:
-    """Return the tasks whose texts are known: the catalogue's, and those of a folder in the published format."""
-    known = {name: get_task(name) for name in task_names(suite=None)}
+def task_source(names: Iterable[str], task_dir: str | Path | None = None) -> dict[str, Task]:
+    """Return the tasks whose texts are known: the named ones of the catalogue, and those of a folder of tasks."""
+    known = {name: get_task(name) for name in names if suite_of(name) is not None}
     if task_dir is not None:
         known |= {folder.name: load_task(folder) for folder in find_tasks(task_dir)}
     return known
@@ -67,7 +67,9 @@ def page_data(
         "notices": unlike(runs),
         "fps": CONTROL_HZ,
         "levels": list(LEVELS),
-        "memory_types": list(MEMORY_TYPES),
+        "memory_types": list(GROUPS),
+        "suite": runs[0].summary.of_libero,
+        "metrics": list(runs[0].summary.average),
         "operations": {
             key: {"name": OPERATION_NAMES[key], "colour": "#" + bytes(colour).hex()}
             for key, colour in OPERATION_COLOURS.items()
@@ -86,7 +88,7 @@ def page_data(
 
 def tasks_data(records: Iterable[Record], known: Mapping[str, Task]) -> dict[str, Any]:
     """Return per task of the rollouts, by memory type and name, its language, and the texts of each variant."""
-    order = {memory_type: k for k, memory_type in enumerate(MEMORY_TYPES)}
+    order = {memory_type: k for k, memory_type in enumerate(GROUPS)}
     sample = {record["task"]: record for record in records}
     seen = {(record["task"], _variant(record)) for record in records}
     result: dict[str, Any] = {}

@@ -91,7 +91,8 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
         reads.append(read)
         runs.append(replace(run, notes=(*run.notes, *notes, *misfits)))
     refuse_links(out / VIDEOS, *(target.parent for target in chosen))
-    text = page(page_data(runs, addresses, task_source(task_dir), reads), title=", ".join(run.name for run in runs))
+    known = task_source({record["task"] for run in runs for record in run.records}, task_dir)
+    text = page(page_data(runs, addresses, known, reads), title=", ".join(run.name for run in runs))
     out.mkdir(parents=True, exist_ok=True)
     with locked(out, out):
         if not (out / PAGE).exists():

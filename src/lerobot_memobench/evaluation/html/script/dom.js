@@ -97,6 +97,8 @@ const outcomeMark = (outcome) =>
   );
 
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+/** A memory type as a title, or the name of a suite of LIBERO. */
+const groupName = (group) => (DATA.suite ? group : capital(group));
 const taskTitle = (task) => capital(DATA.tasks[task].language);
 const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 const seconds = (frames) => `${(frames / DATA.fps).toFixed(1)} s`;

@@ -1,6 +1,7 @@
 // The first view: rates with their intervals, outcomes, and every task.
 
-const METRICS = { SR: null, MSR: "S", MUR: "U", MCR: "C" };
+const OPERATION_OF = { SR: null, MSR: "S", MUR: "U", MCR: "C" };
+const METRICS = Object.fromEntries(DATA.metrics.map((metric) => [metric, OPERATION_OF[metric]]));
 const METRIC_WORDS = {
   SR: "success rate: the goal holds at the end",
   MSR: "memory storage rate: Storage checkpoints that held at some step",
@@ -32,10 +33,10 @@ function rateCell(rate, metric) {
 }
 
 function rateHead(...before) {
-  const metrics = Object.entries(METRIC_WORDS).map(([metric, words]) =>
+  const metrics = DATA.metrics.map((metric) =>
     el(
       "th",
-      { scope: "col", class: "rate", "data-tip": capital(words) },
+      { scope: "col", class: "rate", "data-tip": capital(METRIC_WORDS[metric]) },
       METRICS[metric] ? shape(METRICS[metric]) : null,
       metric,
     ),
@@ -43,12 +44,13 @@ function rateHead(...before) {
   return el("tr", {}, before, metrics);
 }
 
-const rateCells = (row) => Object.keys(METRICS).map((metric) => rateCell(row?.[metric], metric));
+const rateCells = (row) => DATA.metrics.map((metric) => rateCell(row?.[metric], metric));
 
 /** Rates per memory type; several runs stand under one another. */
 function summaryTable(run) {
   const several = DATA.runs.length > 1;
-  const groups = [["average", "Average"], ...DATA.memory_types.map((type) => [type, capital(type)])];
+  const average = DATA.suite ? [] : [["average", "Average"]];
+  const groups = [...average, ...DATA.memory_types.map((type) => [type, groupName(type)])];
   const rowOf = (it, key) => (key === "average" ? it.average : it.memory_types[key]);
   const bodies = groups.map(([key, words]) => {
     const runs = DATA.runs.filter((it) => rowOf(it, key));
@@ -67,7 +69,7 @@ function summaryTable(run) {
     return runs.length ? el("tbody", { class: key === "average" ? "average" : null }, rows) : null;
   });
   const head = [
-    el("th", { scope: "col" }, "Memory"),
+    el("th", { scope: "col" }, DATA.suite ? "Suite" : "Memory"),
     several ? el("th", { scope: "col" }, "Run") : null,
     el("th", { scope: "col", class: "number", "data-tip": "Rollouts" }, "n"),
   ];
@@ -107,7 +109,7 @@ function countOutcomes(run, keep) {
 function outcomeTable(run) {
   const row = (words, counts, where) =>
     el("tr", {}, el("th", { scope: "row" }, words), el("td", { class: "wide" }, outcomeBar(counts, where)));
-  const types = DATA.memory_types.filter((type) => run.memory_types[type]);
+  const types = DATA.suite ? [] : DATA.memory_types.filter((type) => run.memory_types[type]);
   return el(
     "table",
     { class: "endings" },
@@ -121,7 +123,7 @@ function outcomeTable(run) {
       ),
       types.map((type) =>
         row(
-          capital(type),
+          groupName(type),
           countOutcomes(run, (e) => DATA.tasks[e.task].memory_type === type),
           { type },
         ),
@@ -180,24 +182,26 @@ function tasksTable(run, type, level) {
       ),
       el("td", { class: "number" }, String(numbers.rates.SR[3])),
       rateCells(numbers.rates),
-      el("td", {}, prefixChips(name, numbers, level)),
+      DATA.suite ? null : el("td", {}, prefixChips(name, numbers, level)),
       el("td", { class: "ends" }, outcomeBar(numbers.outcomes, { task: name })),
     );
   });
   const head = rateHead(
-    el("th", { scope: "col", class: "task" }, `${capital(type)} · ${plural(names.length, "task")}`),
+    el("th", { scope: "col", class: "task" }, `${groupName(type)} · ${plural(names.length, "task")}`),
     el("th", { scope: "col", class: "number" }, "n"),
   );
   head.append(
-    el(
-      "th",
-      {
-        scope: "col",
-        class: "chipped",
-        "data-tip": "Per checkpoint: rollouts, in per cent, that completed it and all before it in order",
-      },
-      "Checkpoints",
-    ),
+    DATA.suite
+      ? ""
+      : el(
+          "th",
+          {
+            scope: "col",
+            class: "chipped",
+            "data-tip": "Per checkpoint: rollouts, in per cent, that completed it and all before it in order",
+          },
+          "Checkpoints",
+        ),
     el("th", { scope: "col", class: "ends" }, "Outcomes"),
   );
   return el(
@@ -210,6 +214,7 @@ function tasksTable(run, type, level) {
 /** A link that saves a table as CSV. */
 function csvLink(run, key, words, short = "CSV") {
   const file = `${run.name}-${key}.csv`.replace(/[^\w.-]+/g, "_");
+  if (!(key in run.csv)) return null;
   const href = `data:text/csv;charset=utf-8,${encodeURIComponent(run.csv[key])}`;
   return el("a", { class: "csv", href, download: file, "aria-label": `${words} as CSV` }, short);
 }

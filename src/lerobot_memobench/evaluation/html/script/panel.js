@@ -8,8 +8,12 @@ function taskPanel(run, episode, level) {
     { class: "panel" },
     el("h3", {}, `This task in ${run.name}`),
     el("div", { class: "scroll" }, taskRates(episode.task, numbers)),
-    checkpointTable(episode, numbers, level),
-    el("p", { class: "hint" }, "Rollouts that completed a checkpoint and all before it."),
+    ...(DATA.suite
+      ? []
+      : [
+          checkpointTable(episode, numbers, level),
+          el("p", { class: "hint" }, "Rollouts that completed a checkpoint and all before it."),
+        ]),
     goal ? el("details", { class: "goal" }, el("summary", {}, "Goal, as a formula"), el("code", {}, goal)) : null,
   );
 }
