@@ -28,6 +28,7 @@ from tests.support.logs import record
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"
 BUTTER = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
+SOUP = "pick_up_the_alphabet_soup_and_place_it_in_the_basket"
 NASTY = "</script><img src=x onerror=alert(1)><b>"
 FPS = 20
 
@@ -436,3 +437,23 @@ def test_the_page_cannot_reach_the_network(chrome: Any, report: Path) -> None:
     )
     assert blocked == "connect-src"
     chrome.errors.clear()
+
+
+# --- LIBERO's suites ---
+
+
+def test_a_suite_of_libero_shows_success_alone(browser: Any, tmp_path: Path) -> None:
+    own = {"memory_type": "libero_object", "suite": "libero_object", "convention": "libero"}
+    write_episodes(
+        tmp_path / "run",
+        [rollout(SOUP, 0, [], **own), rollout(SOUP, 1, [], **own, failure="execution_failure")],
+    )
+    write_html([tmp_path / "run"], tmp_path / "made")
+    show(browser, tmp_path / "made" / "index.html")
+    heads = browser.js("[...document.querySelectorAll('#overview table.rates')].map((it) => it.tHead.innerText)")
+    assert [" ".join(words.split()) for words in heads] == ["Suite n SR", "libero_object · 1 task n SR Outcomes"]
+    shown = browser.js("document.querySelector('#overview').innerText")
+    assert "50.0" in shown
+    assert not {word for word in ("MSR", "Average", "Checkpoints", "undefined") if word in shown}
+    show(browser, tmp_path / "made" / "index.html", f"view=episodes&ep={SOUP}.1")
+    assert "Checkpoint" not in browser.js("document.querySelector('#detail').innerText")

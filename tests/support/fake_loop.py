@@ -17,7 +17,7 @@ from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episode
 from lerobot_memobench.envs.evaluation_file import write_protocol
 from lerobot_memobench.run.plan import Cell, EvaluationPlan
 from lerobot_memobench.tasks.catalogue import load_task
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import LIBERO_SUITES, Task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"
@@ -80,7 +80,8 @@ class FakeLoop:
             "checkpoints": [
                 {"operation": c.operation, "first_step": seed, "ordered_step": seed} for c in task.checkpoints
             ],
-            "failure": None if seed % 2 else "storage_failure",
+            "failure": None if seed % 2 else "storage_failure" if task.checkpoints else "execution_failure",
+            **({"suite": task.suite, "convention": "libero"} if task.suite in LIBERO_SUITES else {}),
             "scene_hash": f"{task.name[:4]}{seed:012d}",
             "wall_s": 1.0,
             "world": "libero",

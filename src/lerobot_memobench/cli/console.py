@@ -22,7 +22,7 @@ from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
 from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal
 from lerobot_memobench.jobs.start import prepare_process, reader_has_left
-from lerobot_memobench.tasks.catalogue import ALL_SUITES
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 
 USAGE_ERROR = 2
 
@@ -36,8 +36,17 @@ WIDTH_OF_A_FILE = 140
 SPEED_PERIOD = 600.0
 
 
-Suite = StrEnum("Suite", [(name.upper(), name) for name in ALL_SUITES])
-"""The suite: one set of tasks."""
+class Suite(StrEnum):
+    """The suite: one set of tasks."""
+
+    PUBLISHED = PUBLISHED
+    STRICT = STRICT
+    LIBERO_SPATIAL = "libero_spatial"
+    LIBERO_OBJECT = "libero_object"
+    LIBERO_GOAL = "libero_goal"
+    LIBERO_10 = "libero_10"
+    LIBERO_90 = "libero_90"
+
 
 WhichSuite = Annotated[
     Suite,

@@ -6,6 +6,7 @@ loads it at the first reset.
 
 from __future__ import annotations
 
+import sys
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
-from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.configs import PipelineFeatureType, PolicyFeature, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 
@@ -45,7 +46,8 @@ from lerobot_memobench.tasks.catalogue import (
     task_folder,
     task_index,
 )
-from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
 """Called with a task's folder, the number of rows, and whether each row runs in its own process."""
@@ -95,8 +97,8 @@ class MemobenchEnvConfig(_WithSettings):
 
     def __post_init__(self) -> None:
         suites, self.tasks = lerobots_choice(self.task, self.task_ids, self.suite, self.tasks)
-        self.suite, self.task_ids = suites[0], None
-        self.task = None if len(suites) == 1 else ",".join(suites)
+        self.__dict__.update(suite=suites[0])
+        self.task, self.task_ids = None if len(suites) == 1 else ",".join(suites), None
         if self.fps != CONTROL_HZ:
             raise MemobenchError(f"env.fps is {self.fps}; the control rate is {CONTROL_HZ}, leave env.fps out")
         for name, value in asdict(self.settings).items():  # some follow from the protocol and the suite
@@ -165,6 +167,7 @@ class MemobenchEnvConfig(_WithSettings):
         """
         if self.task is not None:
             return self._envs_of_suites(self.task.split(","), n_envs, use_async_envs)
+        self._number_as_lerobot()
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
         policy = type(self).check_policy(self)
@@ -187,6 +190,24 @@ class MemobenchEnvConfig(_WithSettings):
             one = replace(self, task=None, log_dir=str(folder / suite), **own)
             found |= one.create_envs(n_envs, use_async_envs)
         return found
+
+    def _number_as_lerobot(self) -> None:
+        """Let the first episode of ``lerobot-eval`` in a suite of LIBERO have the first initial state.
+
+        Raises:
+            MemobenchError: there are more episodes than initial states.
+        """
+        if self.suite not in LIBERO_SUITES or "eval" not in Path(sys.argv[0]).name:
+            return
+        if parser.parse_arg("env.seed_base") is None:
+            from lerobot.configs.eval import EvalPipelineConfig
+
+            self.__dict__.update(seed_base=int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0))
+        if (episodes := int(parser.parse_arg("eval.n_episodes") or 0)) > NUM_STATES:
+            raise MemobenchError(
+                f"found eval.n_episodes={episodes}; tasks of {self.suite} have {NUM_STATES} initial states: ask for at "
+                f"most {NUM_STATES}"
+            )
 
     def settings_for(self, policy: Any) -> EnvSettings:
         """Return the settings with defaults that follow from a policy's configuration (None if unknown).

@@ -46,9 +46,10 @@ from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import Choice
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
+from lerobot_memobench.tasks.libero_suites import initial_states
 from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import Progress
-from lerobot_memobench.tasks.task import STRICT, Task, referent_text
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task, referent_text
 
 AS_BEGUN = Atom("asbegun", ())
 
@@ -124,7 +125,7 @@ class Episode:
             self.sim.reset(self.seed, self.progress.settle)
         else:
             self.progress = Progress(task)
-            self.sim.reset(self.seed)
+            self.sim.reset(self.seed, state=self._initial_state())
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
         self.step_index = 0
@@ -149,6 +150,17 @@ class Episode:
             self._hide_objects()
         self._execution_step = (self.published.prompt_steps or 0) if self.demonstration_prompt else 0
         self._begin_if_due()
+
+    def _initial_state(self) -> NDArray[np.float64] | None:
+        """Return LIBERO's initial state of the episode, None in other suites, which draw it by the seed.
+
+        Episodes beyond their number begin with the first one again, as in LeRobot.
+        """
+        if self.published.suite not in LIBERO_SUITES:
+            return None
+        states = initial_states(self.published.name)
+        found: NDArray[np.float64] = states[(self.seed - self.settings.seed_base) % len(states)]
+        return found
 
     def _draw_holds(self) -> Iterator[int]:
         """Return the lengths of the episode's holds, which do not depend on the variant."""

@@ -71,10 +71,11 @@ UPSTREAM_ONLY = {
 """Settings with a fixed value in the authors' evaluation."""
 LIBERO_ONLY = {
     **{"difficulty": STANDARD, "protocol": BY_PAPER, "referent": REFERENTS[0], "oracle_memory": False},
-    **{"evidence": False, "salt": None, "expert_action": False, "blind_action": False},
+    **{"evidence": False, "salt": None, "expert_action": False, "blind_action": False, "obs_type": PIXELS},
     **MEMORY_CONTROLS,
 }
-"""Settings with a fixed value in LIBERO's suites, whose tasks have no checkpoints, prompts, variants and expert."""
+"""Settings with a fixed value in LIBERO's suites. Their tasks have no checkpoints, prompts, variants and expert, and
+object slots lack their classes."""
 
 
 def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None) -> Any:
@@ -160,7 +161,7 @@ class EnvSettings:
                 f"difficulty={self.difficulty} is for strict tasks; set suite={STRICT}, or leave it out"
             )
         if self.suite in LIBERO_SUITES:
-            self._require(LIBERO_ONLY, f"suite={self.suite}, whose tasks have no checkpoints, prompts and expert,")
+            self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
         if self.protocol == UPSTREAM:
             self._require(UPSTREAM_ONLY, f"protocol={UPSTREAM}, the authors' evaluation,")
             self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
@@ -230,11 +231,10 @@ class EnvSettings:
     @property
     def usual(self) -> dict[str, Any]:
         """Defaults that follow from other settings."""
-        limits: Mapping[str, int] = STEP_LIMITS
-        mirrored = self.suite in limits and self.obs_type != OBJECTS
+        limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
         return {
             "horizon": limits.get(self.suite, self.degree.horizon),
-            "convention": MIRRORED if mirrored else UPRIGHT,
+            "convention": MIRRORED if self.suite in limits else UPRIGHT,
         }
 
     @property

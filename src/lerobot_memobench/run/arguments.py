@@ -46,7 +46,7 @@ PREFIX = "lerobot-"
 
 COMMON: dict[str, tuple[str, ...]] = {
     **{key: (f"policy.{key}",) for key in ("align", "size", "perception", "detector", "visual_encoder", "device")},
-    **{key: (f"env.{key}",) for key in ("tasks", "task", "task_ids", "obs_type", "suite", "referent")},
+    **{key: (f"env.{key}",) for key in ("tasks", "obs_type", "suite", "referent")},
     "replan": ("policy.n_action_steps", "env.replan_steps"),
 }
 SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
@@ -56,7 +56,16 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         **{
             key: (f"env.{key}",)
             for key in (
-                *("convention", "difficulty", "protocol", "demonstration_prompt", "prompt_in", "horizon"),
+                *(
+                    "task",
+                    "task_ids",
+                    "convention",
+                    "difficulty",
+                    "protocol",
+                    "demonstration_prompt",
+                    "prompt_in",
+                    "horizon",
+                ),
                 *("pause_steps", "speed", "evidence", "salt", "videos"),
                 *("corrupt", "corrupt_step", "reshow", "interference"),
             )

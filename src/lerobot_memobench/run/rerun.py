@@ -282,7 +282,7 @@ def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> Ev
     if not all(OBSERVATION.fullmatch(name) for pair in asked.rename_map.items() for name in pair):
         raise _refused("rename_map", asked.rename_map, "expected names of observations")
     for name, value in asked.env.items():
-        if name not in ENVIRONMENT or name in ("log_dir", "resume"):
+        if name not in ENVIRONMENT or name in ("task", "task_ids", "log_dir", "resume"):
             raise _refused(f"env.{name}", value, "no card sets it")
         if name == "tasks" and not (isinstance(value, str) and WORD.fullmatch(value)):
             raise _refused("env.tasks", value, "expected names of tasks")

@@ -17,7 +17,7 @@ from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.controller import CLOSING_SIGNS, make_controller
 from lerobot_memobench.sim.hiding import HiddenObject, HiddenObjects
-from lerobot_memobench.sim.libero.placement import Placement, Placer
+from lerobot_memobench.sim.libero.placement import Placer
 from lerobot_memobench.sim.libero.scene import GLOW_OFF, GLOW_ON, get_scene
 from lerobot_memobench.sim.raster.drawlist import DrawList, Image
 from lerobot_memobench.sim.raster.highlights import Highlight
@@ -129,8 +129,13 @@ class Simulation:
 
     # --- life -----------------------------------------------------------------------------------------------
 
-    def reset(self, seed: int, settling: Callable[[Callable[[Atom], bool]], None] | None = None) -> None:
-        """Sample the initial state of a seed and run the stabilisation steps.
+    def reset(
+        self,
+        seed: int,
+        settling: Callable[[Callable[[Atom], bool]], None] | None = None,
+        state: Array | None = None,
+    ) -> None:
+        """Sample the initial state of a seed, or set a stored one, and run the stabilisation steps.
 
         Equal seeds of equal tasks give bit-equal states, independent of earlier simulation. A strict scene is drawn
         again, from the seed and the number of the draw, while an object is thrown or still moves after these steps.
@@ -138,14 +143,18 @@ class Simulation:
         Args:
             seed: seed of the scene.
             settling: called with `holds` after each stabilisation step.
+            state: initial state (state_dim,) of arm, objects and joints, as of `tasks.libero_suites`. The seed then
+                draws the poses of the fixtures only, which a state does not contain, as LIBERO's ``seed``, ``reset``
+                and ``set_init_state`` do.
 
         Raises:
-            MemobenchError: each of `MAX_SCENES` draws of a strict scene has such an object.
+            MemobenchError: the state has another shape, or each of `MAX_SCENES` draws of a strict scene has such an
+                object.
         """
         self._at_home, self.caught_at_home = None, False
         self._hidden.absent = ()
         for draw in range(MAX_SCENES):
-            self.settled = self._has_settled(self._set_up(seed, draw, settling))
+            self.settled = self._has_settled(self._set_up(seed, draw, settling, state))
             if self.settled or not self._strict:
                 break
         else:
@@ -157,28 +166,39 @@ class Simulation:
         self._at_home = self.snapshot() if self._strict else None
         self.begin_execution()
 
-    def _set_up(self, seed: int, draw: int, settling: Callable[[Callable[[Atom], bool]], None] | None) -> Placement:
-        """Set one draw of the initial state, run the stabilisation steps, and return the placement before them."""
+    def _set_up(
+        self, seed: int, draw: int, settling: Callable[[Callable[[Atom], bool]], None] | None, state: Array | None
+    ) -> dict[str, Array]:
+        """Set one draw of the initial state, run the stabilisation steps, and return the objects' places before them.
+
+        In the first of these steps the arm moves from the pose in ``state`` towards `robot.ARM_START`, and then keeps
+        the orientation of this pose, as LIBERO's arm does.
+        """
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._arm_qpos] = robot.ARM_START
         self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
-        placement = self._placer.place(seed, draw)
+        self._placer.place(seed, draw)
         self.highlights = ()
         mujoco.mj_step1(self.model, self.data)
         self._controller.reset(self.data)
         if self._strict:
             self._controller.gripper = np.array([1.0, -1.0])
-        for _ in range(STABILISATION_STEPS):
-            self.step(NO_OP)
+        if state is not None:
+            self.set_state(state)
+        places = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
+        for step in range(STABILISATION_STEPS):
+            if state is not None and step == 0:
+                self._controller.advance_from_set_state(self.data, NO_OP[6], SUBSTEPS)
+            else:
+                self.step(NO_OP)
             if settling is not None:
                 settling(self.holds)
-        return placement
+        return places
 
-    def _has_settled(self, placement: Placement) -> bool:
+    def _has_settled(self, places: dict[str, Array]) -> bool:
         """Return whether objects rest where they were placed, and nothing moves."""
         others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
-        poses = {name: pose for name, pose in placement.poses.items() if name in self.task.objects}
-        shifts = [self.data.body(name).xpos[:2] - pose[:2] for name, pose in poses.items()]
+        shifts = [self.data.body(name).xpos[:2] - place[:2] for name, place in places.items()]
         moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
         return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[others:]).max(initial=0.0)) <= SETTLED_SPEED
 

@@ -182,7 +182,7 @@ class World:
         if not over_region(self._data.body(a).xpos, *self._box_of(region)):
             return False
         declared = self._task.regions.get(region)
-        on_table = declared is not None and declared.target == TABLE
+        on_table = declared is not None and declared.target not in self._instances
         return on_table or self.touching(a, self._owner_of(region))
 
     def _box_of(self, region: str) -> tuple[Vector, Vector, Vector]:

@@ -207,7 +207,7 @@ def lerobots_choice(
             raise MemobenchError(f"task={task} and suite={suite} are both given; leave one of them out")
     elif words and suite not in words:
         if tasks != "all":
-            raise MemobenchError(f"task={task} and tasks={tasks} are both given; leave out task=")
+            raise MemobenchError(f"env.task={task} and env.tasks={tasks} are both given; remove env.task")
         tasks = str(task)
     if task_ids is None:
         return suites, tasks

@@ -11,8 +11,10 @@ from math import nan, pi
 
 from lerobot_memobench.sim.asset import ALONG_X, ALONG_Y, Grasp, JointRule
 
-Turn = tuple[str, float]
-"""Axis (x, y or z) and angle, rad."""
+Turn = tuple[str, float, float]
+"""Axis (x, y or z), and the range of the angle, rad."""
+UPRIGHT: Turn = ("x", 0.0, 0.0)
+QUARTER: Turn = ("x", pi / 2, pi / 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +55,7 @@ class LiberoClass:
     """
 
     mjcf: str
-    turns: tuple[Turn, ...] = (("x", pi / 2),)
+    turns: tuple[Turn, ...] = (QUARTER,)
     parts: tuple[tuple[str, Part], ...] = ()
     grasps: tuple[Grasp, ...] = ()
     floor: float = nan
@@ -72,7 +74,7 @@ def _grocery(name: str, *turns: Turn, grasps: tuple[Grasp, ...], y_up: bool = Fa
 
 
 def _modelled(name: str, grasps: tuple[Grasp, ...] = ()) -> LiberoClass:
-    return LiberoClass(f"turbosquid_objects/{name}/{name}.xml", (("x", 0.0),), grasps=grasps)
+    return LiberoClass(f"turbosquid_objects/{name}/{name}.xml", (UPRIGHT,), grasps=grasps)
 
 
 def _rim(radius: float, height: float, width: float) -> Grasp:
@@ -100,6 +102,8 @@ def _drawer(level: str, height: float) -> Part:
     )
 
 
+_DRAWER_PARTS = tuple((f"{level}_region", _drawer(level, height)) for level, height in _DRAWERS.items())
+"""Drawers of the wooden and of the white cabinet, which differ in colour and in parts of a millimetre."""
 _DOOR = Part(
     kind="door",
     joint="microjoint",
@@ -142,37 +146,63 @@ CLASSES: dict[str, LiberoClass] = {
     ),
     "bbq_sauce": _grocery(
         "bbq_sauce",
-        ("x", pi / 2),
+        QUARTER,
         grasps=(Grasp((0.0, 0.0, 0.0195), ALONG_Y, 0.0286), Grasp((0.0, 0.0, 0.0195), ALONG_X, 0.0362)),
     ),
     "butter": _grocery(
-        "butter", ("x", 0.0), grasps=(Grasp((0.0, 0.0, 0.0), ALONG_Y, 0.0396), Grasp((0.0, 0.0, 0.0), ALONG_X, 0.0762))
+        "butter", UPRIGHT, grasps=(Grasp((0.0, 0.0, 0.0), ALONG_Y, 0.0396), Grasp((0.0, 0.0, 0.0), ALONG_X, 0.0762))
     ),
     "milk": _grocery(
         "milk",
-        ("x", pi / 2),
-        ("z", pi / 2),
+        QUARTER,
+        ("z", pi / 2, pi / 2),
         grasps=(Grasp((0.0, 0.0, 0.029), ALONG_X, 0.0526), Grasp((0.0, 0.0, 0.029), ALONG_Y, 0.0526)),
         y_up=True,
     ),
     "ketchup": _grocery(
         "ketchup",
-        ("x", pi / 2),
-        ("z", pi / 2),
+        QUARTER,
+        ("z", pi / 2, pi / 2),
         grasps=(Grasp((0.0004, -0.0008, 0.0405), ALONG_Y, 0.0366), Grasp((0.0004, -0.0008, 0.0405), ALONG_X, 0.033)),
         y_up=True,
     ),
     "moka_pot": _modelled("moka_pot", (Grasp((0.0, 0.0755, 0.045), ALONG_X, 0.0131),)),
     "wooden_two_layer_shelf": _modelled("wooden_two_layer_shelf"),
-    "wooden_cabinet": LiberoClass(
-        "articulated_objects/wooden_cabinet.xml",
-        parts=tuple((f"{level}_region", _drawer(level, height)) for level, height in _DRAWERS.items()),
-    ),
+    "wooden_cabinet": LiberoClass("articulated_objects/wooden_cabinet.xml", parts=_DRAWER_PARTS),
     "microwave": LiberoClass("articulated_objects/microwave.xml", parts=(("", _DOOR),)),
     "flat_stove": LiberoClass("articulated_objects/flat_stove.xml", parts=(("", _KNOB),)),
 }
 
 
+def _upright_grocery(name: str, *turns: Turn) -> LiberoClass:
+    return _grocery(name, *turns, grasps=(), y_up=True)
+
+
+def _turned(name: str, low: float, high: float) -> LiberoClass:
+    return LiberoClass(f"turbosquid_objects/{name}/{name}.xml", (("x", low, high),))
+
+
+_TURNED_CAN: Turn = ("z", pi / 2, pi / 2)
+_BOTTLE = QUARTER, ("z", pi / 2, pi / 2)
+
+SUITE_CLASSES: dict[str, LiberoClass] = {
+    **{name: _upright_grocery(name, _TURNED_CAN) for name in ("alphabet_soup", "tomato_sauce")},
+    **{name: _upright_grocery(name, *_BOTTLE) for name in ("new_salad_dressing", "orange_juice", "salad_dressing")},
+    **{name: _grocery(name, UPRIGHT, grasps=()) for name in ("chocolate_pudding", "cream_cheese")},
+    "cookies": _grocery("cookies", QUARTER, grasps=()),
+    **{
+        name: LiberoClass(f"stable_scanned_objects/{name}/{name}.xml")
+        for name in ("basket", "glazed_rim_porcelain_ramekin")
+    },
+    **{name: _modelled(name) for name in ("desk_caddy", "wine_bottle", "wine_rack", "wooden_tray")},
+    **{name: _turned(name, -pi / 2, -pi / 4) for name in ("black_book", "yellow_book")},
+    **{name: _turned(name, -pi / 2, -pi / 2) for name in ("porcelain_mug", "red_coffee_mug", "white_yellow_mug")},
+    "white_cabinet": LiberoClass("articulated_objects/white_cabinet.xml", parts=_DRAWER_PARTS),
+}
+"""Classes of LIBERO's own suites only, which object observations do not contain."""
+ALL_CLASSES = CLASSES | SUITE_CLASSES
+
+
 def parts_of(class_name: str) -> tuple[tuple[str, Part], ...]:
     """Return the parts of a class; objects and scans have none."""
-    return CLASSES[class_name].parts if class_name in CLASSES else ()
+    return ALL_CLASSES[class_name].parts if class_name in ALL_CLASSES else ()

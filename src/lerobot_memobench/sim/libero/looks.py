@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.io import cache_folder, draft_of, file_hash
 from lerobot_memobench.sim.raster.drawlist import MAX_PIECE_TRIANGLES, VISUAL_GROUP, DrawList, build_draw_list
 from lerobot_memobench.sim.raster.shapes import Triangles, in_pieces, triangles_of, welded
-from lerobot_memobench.sim.raster.textures import LAYER_SIZE, resized
+from lerobot_memobench.sim.raster.textures import LAYER_SIZE, pixels_of, resized
 
 Arrays = Mapping[str, NDArray[Any]]
 """Cached content of a file: a NumPy record, which loads in a third of the time of an archive."""
@@ -112,11 +112,9 @@ def _extract(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) ->
     """Return the content to cache of a compiled mesh or texture; no pixels unless it is square with three channels."""
     if isinstance(part, mujoco.MjsTexture):
         texture = model.tex(part.name)
-        start, height, width = int(texture.adr[0]), int(texture.height[0]), int(texture.width[0])
-        if texture.nchannel[0] != 3 or height != width:
+        if texture.nchannel[0] != 3 or texture.height[0] != texture.width[0]:
             return {"pixels": np.zeros(0, np.uint8)}
-        pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
-        return {"pixels": resized(pixels)}
+        return {"pixels": resized(pixels_of(model, texture.id))}
     mesh = model.mesh(part.name).id
     shown = np.flatnonzero((model.geom_dataid == mesh) & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value))
     frame = np.concatenate([model.mesh_pos[mesh], model.mesh_quat[mesh], model.geom_size[shown[0]]])
@@ -146,6 +144,8 @@ def _thinned(shape: Triangles) -> Triangles:
         spots, faces, target_count=THIN_TO, agg=5, return_collapses=True, preserve_border=True
     )
     corners, thin, moved = fast_simplification.replay_simplification(spots, faces, collapses)
+    if len(thin) > 2 * THIN_TO:  # the texture has so many borders that it would be distorted between them
+        return shape
     off = np.linalg.norm(spots - corners[moved], axis=1)
     order = np.lexsort((-off, moved))  # the nearest vertex of each is written last
     nearest = np.zeros(len(corners), np.int64)
@@ -173,7 +173,7 @@ def _use_placeholder(mesh: mujoco.MjsMesh) -> None:
 
 
 def _replace(texture: mujoco.MjsTexture, pixels: NDArray[np.uint8]) -> None:
-    texture.file, texture.nchannel = "", 3
+    texture.file, texture.nchannel, texture.colorspace = "", 3, mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR
     texture.height, texture.width = pixels.shape[:2]
     texture.data = pixels.tobytes()
 

@@ -21,11 +21,11 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_name, refusing
 from lerobot_memobench.sim.asset import TABLE, split_class
 from lerobot_memobench.sim.libero import files
-from lerobot_memobench.sim.libero.classes import CLASSES, Turn
+from lerobot_memobench.sim.libero.arenas import ARENAS
+from lerobot_memobench.sim.libero.classes import ALL_CLASSES, CLASSES, QUARTER, Turn
 from lerobot_memobench.tasks.task import STRICT
 
-ARENA = "scenes/libero_kitchen_tabletop_base_style.xml"
-SCAN_TURNS: tuple[Turn, ...] = (("x", np.pi / 2),)
+SCAN_TURNS: tuple[Turn, ...] = (QUARTER,)
 REFERENCES = ("mesh", "material", "texture")
 """Attributes that reference an asset."""
 USER_TAGS = ("mujoco", "asset", "mesh", "texture", "material", "worldbody", "body", "geom", "site")
@@ -75,9 +75,9 @@ def class_file(class_name: str, suite: str) -> ClassFile:
         MemobenchError: the class is unknown, or its files are missing or have unexpected content.
     """
     own = own_objects()
-    given = files.user_objects({TABLE, *CLASSES, *own})
-    if class_name in CLASSES:
-        known = CLASSES[class_name]
+    given = files.user_objects({*ARENAS, *ALL_CLASSES, *own})
+    if class_name in ALL_CLASSES:
+        known = ALL_CLASSES[class_name]
         return _object_class(files.asset(known.mjcf), known.turns, posixpath.dirname(known.mjcf))
     if file_name(class_name, "the class of an object") in given:
         return _user_class(given[class_name])
@@ -85,7 +85,7 @@ def class_file(class_name: str, suite: str) -> ClassFile:
     if scan is not None:
         return _scanned_class(scan)
     if class_name not in own:
-        near = nearest(class_name, {*CLASSES, *own, *given})
+        near = nearest(class_name, {*ALL_CLASSES, *own, *given})
         add = f"set {files.OBJECTS_VARIABLE} to a folder with {class_name}/{class_name}.xml, see {GUIDE}"
         raise MemobenchError(f"there is no class {class_name!r} ({near}); to add it, {add}")
     return replace(_object_class(own[class_name], SCAN_TURNS), stand_in=suite != STRICT)
@@ -194,9 +194,9 @@ def _vertex_lines(file: Path) -> Iterator[str]:
 # --- MJCF ---
 
 
-def arena() -> ET.Element:
-    """Return the MJCF of LIBERO's kitchen."""
-    return _read(files.asset(ARENA))
+def arena(file: str) -> ET.Element:
+    """Return the MJCF of an arena, a path below LIBERO's assets folder."""
+    return _read(files.asset(file))
 
 
 def _read(path: Path) -> ET.Element:

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.asset import TABLE, TABLE_SIZE, TABLE_TOP, Asset
+from lerobot_memobench.sim.asset import Asset
+from lerobot_memobench.sim.libero.arenas import arena_of
 from lerobot_memobench.sim.libero.classes import Turn, parts_of
 from lerobot_memobench.sim.libero.mjcf import ClassFile, class_file
 from lerobot_memobench.tasks.formula import Atom
@@ -32,7 +33,6 @@ MODEL_LOADS = 2
 """Number of times LIBERO loads the model until the end of the first reset."""
 OBJECT_DROP_HEIGHT = 0.01
 """Initial height of an object above the table or another object, m."""
-FIXTURE_DROP_HEIGHT = 0.01 - TABLE_SIZE[2]
 
 Array = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]
@@ -79,6 +79,7 @@ class Placer:
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
+        self._arena = arena_of(task)
         self._places = list(placing_atoms(task, assets).values())
         self._files = {name: class_file(asset.class_name, task.suite) for name, asset in assets.items()}
 
@@ -112,7 +113,7 @@ class Placer:
                 return 3
             if atom.predicate == "in":
                 return 2
-            return 0 if self._task.regions[atom.args[1]].target == TABLE else 1
+            return 1 if self._task.regions[atom.args[1]].target in self._assets else 0
 
         return sorted(self._places, key=turn)
 
@@ -172,8 +173,8 @@ class Placer:
     def _room(self, atom: Atom, poses: Mapping[str, Pose]) -> tuple[Sequence[Rectangle], Array]:
         """Return the ranges of x and y, and their origin (3,) with the height of the underside.
 
-        On a fixture's region the range is half the region, reduced by the object's radius. In regions and on objects
-        the position is the centre.
+        On a fixture's region the range is half the region, reduced by the object's radius, by which some arenas reduce
+        all ranges. In regions and on objects the position is the centre.
         """
         name, where = atom.args
         if where in self._assets:
@@ -183,9 +184,13 @@ class Placer:
                 )
             return [CENTRE_ONLY], poses[where][:3] + np.array([0.0, 0.0, self._files[where].top + OBJECT_DROP_HEIGHT])
         region = self._task.regions[where]
-        if region.target == TABLE:
-            gap = FIXTURE_DROP_HEIGHT if self._assets[name].kind == "fixture" else OBJECT_DROP_HEIGHT
-            return region.ranges, np.array([0.0, 0.0, TABLE_TOP + gap])
+        if region.target not in self._assets:
+            x, y, z = self._arena.origin
+            if self._assets[name].kind == "fixture":
+                return region.ranges, np.array([x, y, z + self._arena.fixture_drop])
+            r = self._files[name].radius if self._arena.inset else 0.0
+            ranges = [(x1 + r, y1 + r, x2 - r, y2 - r) for x1, y1, x2, y2 in region.ranges]
+            return ranges, np.array([x, y, z + OBJECT_DROP_HEIGHT])
         site, owner = self._model.site(where).id, poses[region.target]
         base = owner[:3] + single_precision_matrix(owner[3:]) @ self._data.site_xpos[site]
         if atom.predicate == "in":
@@ -238,7 +243,7 @@ def sample_orientation(turns: tuple[Turn, ...], rng: np.random.RandomState) -> A
     LIBERO's sampler writes (x, y, z, w), but its reader expects (w, x, y, z): a rotation of 90° about x becomes one
     about z. Several rotations are multiplied in single precision.
     """
-    drawn = [np.roll(quaternion(axis, rng.uniform(angle, angle)), -1) for axis, angle in turns]
+    drawn = [np.roll(quaternion(axis, rng.uniform(low, high)), -1) for axis, low, high in turns]
     if len(drawn) == 1:
         return drawn[0]
     q = np.array([0.0, 0.0, 0.0, 1.0])

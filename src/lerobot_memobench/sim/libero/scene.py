@@ -1,4 +1,4 @@
-"""Build a task's scene of LIBERO's assets: kitchen, arm of robosuite 1.4.0, objects, fixtures.
+"""Build a task's scene of LIBERO's assets: room and table, arm of robosuite 1.4.0, objects, fixtures.
 
 The simulated model has no visual geoms; it moves bit-equally to the complete model and is built in some 25 ms. Visual
 assets (80 MB) are loaded for the first image (`looks`).
@@ -26,7 +26,6 @@ from lerobot_memobench.sim.asset import (
     ALONG_Y,
     COLLISION_GROUP,
     SITE_GROUP,
-    TABLE,
     TABLE_SIZE,
     TABLE_TOP,
     Articulation,
@@ -39,13 +38,12 @@ from lerobot_memobench.sim.asset import (
 )
 from lerobot_memobench.sim.detents import add_detents
 from lerobot_memobench.sim.libero import mjcf
-from lerobot_memobench.sim.libero.classes import CLASSES, LiberoClass, Part, parts_of
+from lerobot_memobench.sim.libero.arenas import ARENAS, Arena, arena_of
+from lerobot_memobench.sim.libero.classes import ALL_CLASSES, CLASSES, LiberoClass, Part, parts_of
 from lerobot_memobench.sim.libero.looks import drawing_model
 from lerobot_memobench.sim.raster.drawlist import VISUAL_GROUP, DrawList
 from lerobot_memobench.sim.scene import (
     AGENTVIEW,
-    AGENTVIEW_POSITION,
-    AGENTVIEW_QUATERNION,
     ARENA_BYTES,
     Scene,
     scene_key,
@@ -55,8 +53,6 @@ from lerobot_memobench.tasks.task import STRICT, Task
 
 ZONE_HALF_HEIGHT = 0.007
 """Half height of the site of a table region, m."""
-FLOOR_TEXTURE, WALL_TEXTURE = "textures/gray_ceramic_tile.png", "textures/yellow_linen_wall_texture.png"
-"""Textures of LIBERO's kitchen."""
 FREE_DAMPING = "0.0005"
 GLOW_SITES = {"flat_stove": "burner"}
 """Class -> site that LIBERO shows while an instance is on."""
@@ -124,7 +120,7 @@ def instances(task: Task) -> Iterator[tuple[str, str]]:
     """Yield name and class of each instance in LIBERO's order: objects by class, then fixtures by class."""
     for declared in (task.objects, task.fixtures):
         for class_name in dict.fromkeys(declared.values()):
-            yield from ((name, class_name) for name in declared if declared[name] == class_name != TABLE)
+            yield from ((name, class_name) for name in declared if declared[name] == class_name not in ARENAS)
 
 
 def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
@@ -169,8 +165,10 @@ def scene_xml(task: Task, visuals: bool) -> str:
     assert world is not None
     assert assets is not None
     _remove(world, lambda element: element.get("name") == "robot0_link7_collision")  # robosuite 1.4.0 has none
-    kitchen = mjcf.arena()
-    for place, element in enumerate(_kitchen(kitchen, task)):
+    arena = arena_of(task)
+    _place_arm(world, arena)
+    room = mjcf.arena(arena.file)
+    for place, element in enumerate(_room(room, arena, task)):
         world.insert(place, element)
     classes: dict[str, mjcf.ClassFile] = {}
     for name, class_name in instances(task):
@@ -185,29 +183,42 @@ def scene_xml(task: Task, visuals: bool) -> str:
     for class_name, known in classes.items():
         if visuals or known.collides_by_mesh:
             assets.extend(mjcf.shared_assets(class_name, known))
-    if visuals:
-        assets.extend(_kitchen_assets(kitchen))
-    else:
+    assets.extend(_room_assets(room, arena))
+    if not visuals:
         _strip(world, assets)
     return ET.tostring(root, encoding="unicode")
 
 
-# --- the kitchen ---
+# --- arm, room and table ---
 
 
-def _kitchen(arena: ET.Element, task: Task) -> Iterator[ET.Element]:
-    """Yield the elements of the kitchen, with the table's layout from LIBERO's code and the task's regions."""
-    for element in arena.iterfind("worldbody/*"):
-        if element.tag == "body" and element.get("name") == "table":
-            _lay_out(element)
-            element.extend(_zones(task))
+def _place_arm(world: ET.Element, arena: Arena) -> None:
+    """Move the arm to its place in an arena, and remove its mount in arenas without one."""
+    base = next(body for body in world.iter("body") if body.get("name") == "robot0_base")
+    mount = next(body for body in base.iter("body") if body.get("name") == "mount0_base")
+    x, y, z = arena.base
+    if arena.mounted:
+        z = mjcf.parse_numbers(base.attrib["pos"])[2]
+    else:
+        mount.clear()
+        mount.attrib.update(name="mount0_base", pos="0 0 0")
+    base.set("pos", mjcf.format_numbers((x, y, z)))
+
+
+def _room(room: ET.Element, arena: Arena, task: Task) -> Iterator[ET.Element]:
+    """Yield the elements of an arena, with the table's layout from LIBERO's code and the task's regions."""
+    for element in room.iterfind("worldbody/*"):
+        if element.tag == "body" and element.get("name") == arena.body:
+            if arena.lays_out:
+                _lay_out(element, arena.friction)
+            element.extend(_zones(arena, task))
         if element.tag != "camera":
             yield element
-    view = {"pos": mjcf.format_numbers(AGENTVIEW_POSITION), "quat": mjcf.format_numbers(AGENTVIEW_QUATERNION)}
-    yield ET.Element("camera", {"name": AGENTVIEW, "mode": "fixed", **view})
+    view = mjcf.format_numbers(arena.camera_position), mjcf.format_numbers(arena.camera_quaternion)
+    yield ET.Element("camera", {"name": AGENTVIEW, "mode": "fixed", "pos": view[0], "quat": view[1]})
 
 
-def _lay_out(table: ET.Element) -> None:
+def _lay_out(table: ET.Element, friction: tuple[float, float, float] | None) -> None:
     """Set sizes and positions of the table's board and legs."""
     x, y, half = (side / 2 for side in TABLE_SIZE)
     table.set("pos", mjcf.format_numbers((0, 0, TABLE_TOP - half)))
@@ -223,30 +234,33 @@ def _lay_out(table: ET.Element) -> None:
             right, back = next(corners)
             part.set("pos", mjcf.format_numbers((right * (x - 0.1), back * (y - 0.1), -leg)))
             part.set("size", mjcf.format_numbers((0.025, leg)))
+        if name == "table_collision" and friction is not None:
+            part.set("friction", mjcf.format_numbers(friction))
 
 
-def _zones(task: Task) -> Iterator[ET.Element]:
+def _zones(arena: Arena, task: Task) -> Iterator[ET.Element]:
     """Yield the sites of the table's regions, one for the first range of each."""
     for name, region in task.regions.items():
-        if region.target == TABLE and region.ranges:
-            yield ET.Element("site", {"name": name, "type": "box", "group": str(SITE_GROUP), **_zone(region)})
+        if task.fixtures.get(region.target) in ARENAS and region.ranges:
+            yield ET.Element("site", {"name": name, "type": "box", "group": str(SITE_GROUP), **_zone(arena, region)})
 
 
-def _zone(region: Region) -> dict[str, str]:
+def _zone(arena: Arena, region: Region) -> dict[str, str]:
     x1, y1, x2, y2 = region.ranges[0]
+    x, y, z = arena.zones
     return {
-        "pos": mjcf.format_numbers(((x2 + x1) / 2, (y2 + y1) / 2, 0.0)),
+        "pos": mjcf.format_numbers(((x2 + x1) / 2 + x, (y2 + y1) / 2 + y, z)),
         "size": mjcf.format_numbers(((x2 - x1) / 2, (y2 - y1) / 2, ZONE_HALF_HEIGHT)),
     }
 
 
-def _kitchen_assets(arena: ET.Element) -> Iterator[ET.Element]:
-    """Yield the kitchen's meshes, textures and materials, with floor and wall textures from LIBERO's code."""
-    chosen = {"texplane": FLOOR_TEXTURE, "tex-wall": WALL_TEXTURE}
-    for element in arena.iterfind("asset/texture"):
+def _room_assets(room: ET.Element, arena: Arena) -> Iterator[ET.Element]:
+    """Yield an arena's meshes, textures and materials, with floor and wall textures from LIBERO's code."""
+    chosen = {"texplane": arena.floor, "tex-wall": arena.wall}
+    for element in room.iterfind("asset/texture"):
         if element.get("name") in chosen:
-            element.set("file", f"../{chosen[element.attrib['name']]}")
-    yield from mjcf.assets_of(arena, "scenes")
+            element.set("file", f"../textures/{chosen[element.attrib['name']]}")
+    yield from mjcf.assets_of(room, "scenes")
 
 
 # --- objects and fixtures ---
@@ -298,7 +312,7 @@ Triple = tuple[float, float, float]
 
 def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Asset:
     """Return the facts about an instance."""
-    known = CLASSES.get(class_name, UNKNOWN_CLASS)
+    known = ALL_CLASSES.get(class_name, UNKNOWN_CLASS)
     upright = Y_UP if known.y_up else None
     root = model.body(name).id
     low, high = _bounds(model, root, upright)

@@ -30,16 +30,28 @@ def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple
     for texture in range(model.ntex):
         if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX or model.tex_nchannel[texture] != 3:
             continue
-        height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
-        start = int(model.tex_adr[texture])
-        pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
-        for picture in _pictures(model, texture, pixels):
+        for picture in _pictures(model, texture, pixels_of(model, texture)):
             content = picture.tobytes()
             if content not in known:
                 known[content] = len(layers)
                 layers.append(resized(picture))
             layer_of[texture] = (*layer_of.get(texture, ()), known[content])
     return np.stack(layers), layer_of
+
+
+def pixels_of(model: mujoco.MjModel, texture: int) -> NDArray[np.uint8]:
+    """Return the image (height, width, 3) of a texture with three channels.
+
+    MuJoCo's renderer converts a file that is marked as sRGB to linear values, which are darker, and no other file.
+    """
+    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+    start = int(model.tex_adr[texture])
+    pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
+    if model.tex_colorspace[texture] != mujoco.mjtColorSpace.mjCOLORSPACE_SRGB.value:
+        return pixels
+    value = np.arange(256) / 255
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * linear).astype(np.uint8)[pixels]
 
 
 def resized(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

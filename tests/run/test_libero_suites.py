@@ -1,0 +1,238 @@
+"""Evaluations of LIBERO's suites: commands, plans, results, and refusals of what its tasks do not have."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lerobot_memobench.cli.lerobot import main as lerobot
+from lerobot_memobench.cli.memobench import main as memobench
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.run.plan import EvaluationPlan, plan_line
+from lerobot_memobench.tasks.libero_suites import libero_tasks
+from tests.support.fake_loop import FakeLoop, content, make_checkpoint, results
+
+SOUP, CHEESE = libero_tasks("libero_object")[:2]
+RANDOM = ["env=memobench", "policy=memobench_random"]
+LINE = [*RANDOM, "suite=libero_object", "tasks=0,1", "episodes=4", "batch_size=2"]
+COMMAND = ["eval", *LINE]
+
+
+def plan(*words: str) -> EvaluationPlan:
+    return plan_line([*RANDOM, "output_dir=out", *words])
+
+
+def error(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert lerobot(["eval", "env=memobench", *words]) == 2
+    return capsys.readouterr().err.strip()
+
+
+# --- plans ---
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["suite=libero_object", "tasks=0-1"],
+        ["suite=libero_object", f"tasks={SOUP},{CHEESE}"],
+        ["task=libero_object", "task_ids=[0,1]"],
+        ["--env.task=libero_object", "--env.task_ids=[0, 1]"],
+    ],
+)
+def test_task_numbers_are_liberos_ids(fake_loop: FakeLoop, words: list[str]) -> None:
+    found = plan(*words)
+    assert [(task.suite, task.number, task.name) for task in found.grid.tasks] == [
+        ("libero_object", 0, SOUP),
+        ("libero_object", 1, CHEESE),
+    ]
+    assert found.settings.env["suite"] == "libero_object"
+    assert not {"task", "task_ids"} & {*found.settings.portable["env"]}, "a card holds one name of each setting"
+
+
+@pytest.mark.parametrize(
+    ("suite", "horizon"),  # LeRobot's TASK_SUITE_MAX_STEPS
+    [("libero_spatial", 280), ("libero_object", 280), ("libero_goal", 300), ("libero_10", 520), ("libero_90", 400)],
+)
+def test_settings_follow_the_suite(fake_loop: FakeLoop, suite: str, horizon: int) -> None:
+    found = plan(f"suite={suite}", "tasks=0")
+    settings = found.environment.settings
+    assert (settings.horizon, settings.convention, found.grid.runs, found.seeds) == (
+        horizon,
+        "libero",
+        50,
+        range(7, 57),
+    )
+    asked = plan(f"suite={suite}", "tasks=0", "horizon=1200", "convention=upright").environment.settings
+    assert (asked.horizon, asked.convention) == (1200, "upright")
+
+
+def test_published_settings_are_as_before(fake_loop: FakeLoop) -> None:
+    settings = plan().environment.settings
+    assert (settings.horizon, settings.convention) == (1200, "upright")
+    assert plan("suite=strict", "difficulty=hard").environment.settings.horizon == 2000
+
+
+# --- refusals ---
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["task=libero_objct"], "did you mean 'libero_object'"),
+        (["task=libero_object,libero_goa"], "did you mean 'libero_goal'"),
+        (["suite=libero_objct"], "did you mean 'libero_object'"),
+        (["task=libero_object", "task_ids=[10]", "policy=memobench_random"], "numbered 0 to 9"),
+        (["task=libero_object", "task_ids=0"], "expected ids of LIBERO's tasks in a list"),
+        (["task=libero_object", "suite=libero_goal"], "both given"),
+        (["task=libero_object", "task_ids=[0]", "tasks=1"], "both given"),
+        (["task_ids=[0]"], "ids of LIBERO's suites"),
+        (["suite=libero_object", "tasks=libero_goal"], "is a suite, no task; set suite=libero_goal"),
+        (["suite=libero_object", "tasks=pick_up_the_mil_and_place_it_in_the_basket"], "'pick_up_the_milk_and"),
+        (["suite=libero_object", "tasks=turn_on_the_stove"], "is a task of the libero_goal suite"),
+        (["suite=libero_object"], "no scripted expert"),
+        (["suite=libero_object", "policy=memobench_blind"], "no scripted expert"),
+        (["suite=libero_object", "policy=memobench_random", "episodes=51"], "50 initial states"),
+        (["suite=libero_object", "policy=memobench_random", "seed=50", "env.seed_base=7"], "50 initial states"),
+        (["suite=libero_object", "policy=memobench_random", "split=validation"], "split=validation is of memory tasks"),
+        (["suite=libero_object", "policy=memobench_random", "protocol=upstream"], "requires protocol=paper"),
+        (["suite=libero_object", "policy=memobench_random", "referent=random"], "requires referent=fixed"),
+        (["suite=libero_object", "policy=memobench_random", "evidence=true"], "requires evidence=false"),
+        (["suite=libero_object", "policy=memobench_random", "difficulty=hard"], "difficulty=hard is for strict tasks"),
+        (["suite=libero_object", "policy=memobench_random", "interference=1"], "requires interference=0"),
+        (["suite=libero_object", "policy=memobench_random", "reshow=true"], "requires reshow=false"),
+        (["suite=libero_object", "policy=memobench_random", "env.oracle_memory=true"], "requires oracle_memory=false"),
+    ],
+)
+def test_refusals_are_one_sentence(
+    fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str], words: list[str], expected: str
+) -> None:
+    found = error(capsys, *words)
+    assert expected in found
+    assert found.count("\n") == 0
+    assert not fake_loop.ran
+
+
+def test_a_checkpoint_of_upright_pictures_is_refused(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = {"type": "VISUAL", "shape": [3, 256, 256]}
+    make_checkpoint(
+        Path("upright"),
+        "act",
+        input_features={f"observation.images.{name}": picture for name in ("image", "wrist_image")},
+    )
+    found = error(capsys, "suite=libero_object", "policy=./upright")
+    assert "expects pictures of convention=upright" in found
+    assert "and found libero" in found
+
+
+def test_board_and_demonstrations_refuse_liberos_tasks(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    assert memobench(["generate", "--suite", "libero_object", "--out", "data"]) == 2
+    assert "no scripted expert" in capsys.readouterr().err
+    assert lerobot([*COMMAND, "output_dir=out"]) == 0
+    assert memobench(["submit", "out", "--check"]) == 2
+    assert "the board is of memory tasks" in capsys.readouterr().err
+
+
+# --- results ---
+
+
+def test_reports_hold_success_alone(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=out"]) == 0
+    shown = capsys.readouterr().out
+    report = json.loads(Path("out/report.json").read_text())
+    assert report["tasks"] == {SOUP: {"n": 4, "SR": 50.0}, CHEESE: {"n": 4, "SR": 50.0}}
+    assert report["memory_types"] == {"libero_object": {"n": 8, "SR": 50.0}}
+    assert report["failures"] == {"execution_failure": 4}
+    assert "memobench_random: libero_object suite, convention libero, seeds 7 to 10, 4 episodes of each of 2" in shown
+    written = Path("out/report.md").read_text()
+    assert memobench(["report", "out", "--format", "csv", "--format", "latex", "--format", "json"]) == 0
+    printed = capsys.readouterr().out
+    for text in (shown, written, printed):
+        assert "libero_object" in text
+        assert not {word for word in ("MSR", "MUR", "MCR", "Storage", "memory type", "average of") if word in text}
+    assert "50.0 [21.5, 78.5]" in written, "Wilson's interval of 4 of 8"
+    assert memobench(["report", "out", "--html", "page"]) == 0
+    page = Path("page/index.html").read_text()
+    assert '"metrics":["SR"]' in page.replace(" ", "")
+
+
+def test_evaluations_are_compared(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=a"]) == 0
+    fake_loop.changed = {"success": True, "failure": None}
+    assert lerobot([*COMMAND, "output_dir=b"]) == 0
+    capsys.readouterr()
+    assert memobench(["compare", "a", "b", "--format", "markdown"]) == 0
+    shown = capsys.readouterr().out
+    assert "| libero_object | SR | 8 | 50.0 | 100.0 | +50.0 |" in shown.replace("\\_", "_")
+    assert "memory types" not in shown
+    assert memobench(["report", "a", "b"]) == 0
+    assert "MSR" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("ending", [["shards=2", "workers=1"], ["resume=true"]])
+def test_parts_and_resumed_runs_equal_a_whole_run(
+    fake_loop: FakeLoop, monkeypatch: pytest.MonkeyPatch, ending: list[str]
+) -> None:
+    monkeypatch.setattr("lerobot_memobench.run.shards.ShardJob.run", lambda job: lerobot(job.arguments))
+    assert lerobot([*COMMAND, "output_dir=whole"]) == 0
+    if ending == ["resume=true"]:
+        fake_loop.killed_after(5, *COMMAND, "output_dir=out")
+    assert lerobot([*COMMAND, "output_dir=out", *ending]) == 0
+    assert results("out") == results("whole")
+
+
+def test_parts_are_merged(fake_loop: FakeLoop) -> None:
+    assert lerobot([*COMMAND, "output_dir=whole"]) == 0
+    for number in (1, 2):
+        assert lerobot([*COMMAND, "output_dir=out", f"shard={number}/2"]) == 0
+    assert memobench(["merge", "out"]) == 0
+    assert results("out") == results("whole")
+
+
+def test_an_evaluation_is_repeated(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot(["eval", *RANDOM, "task=libero_object", "task_ids=[1]", "episodes=3", "output_dir=out"]) == 0
+    before = content(Path("out"))
+    assert memobench(["rerun", "out", "--out", "again"]) == 0
+    assert "repeated: 3 episodes" in capsys.readouterr().out
+    assert fake_loop.plans[0].environment.settings == fake_loop.plans[1].environment.settings
+    assert content(Path("out")) == before
+
+
+def test_suites_are_evaluated_one_after_another(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ["eval", *RANDOM, "task=libero_goal,libero_10", "task_ids=[2]", "episodes=2", "output_dir=out"]
+    assert lerobot(line) == 0
+    assert [made.environment.settings.horizon for made in fake_loop.plans] == [300, 520]
+    assert "SR: libero_goal 50.0, libero_10 50.0; mean of 2 suites 50.0" in capsys.readouterr().out
+    assert {*Path("out").iterdir()} == {Path("out/libero_goal"), Path("out/libero_10")}
+    assert lerobot([*line, "resume=true"]) == 0
+    assert len(fake_loop.ran) == 4
+
+
+# --- LeRobot's configuration ---
+
+
+def test_lerobots_names_choose_suite_and_tasks() -> None:
+    config = MemobenchEnvConfig(task="libero_object", task_ids=[1])
+    assert (config.suite, config.tasks, config.task, config.task_ids) == ("libero_object", "1", None, None)
+    assert [each[:2] for each in config.selected()] == [("libero_object", 1)]
+    assert {*config.features} == {"action", "agent_pos", "pixels/image", "pixels/image2"}
+    assert MemobenchEnvConfig(task="object").tasks == "object"
+    with pytest.raises(MemobenchError, match="ids of LIBERO's suites"):
+        MemobenchEnvConfig(task_ids=[1])
+
+
+def test_lerobot_eval_gets_environments_by_suite_and_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["lerobot-eval", "--seed=100", "--eval.n_episodes=5"])
+    config = MemobenchEnvConfig(task="libero_goal,libero_10", task_ids=[0, 3], log_dir=str(tmp_path))
+    found = config.create_envs(2)
+    assert {suite: [*envs] for suite, envs in found.items()} == {"libero_goal": [0, 3], "libero_10": [0, 3]}
+    settings = {suite: envs[0].envs[0].unwrapped.settings for suite, envs in found.items()}
+    assert [(each.horizon, each.convention, each.seed_base) for each in settings.values()] == [
+        (300, "libero", 100),
+        (520, "libero", 100),
+    ]
+    monkeypatch.setattr("sys.argv", ["lerobot-eval", "--eval.n_episodes=51"])
+    with pytest.raises(MemobenchError, match="50 initial states"):
+        MemobenchEnvConfig(task="libero_goal", log_dir=str(tmp_path)).create_envs(1)
