@@ -206,7 +206,7 @@ def spaces_page() -> str:
     from lerobot_memobench.envs.settings import BOTH, EnvSettings
     from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, STARTS
 
-    settings = EnvSettings(obs_type=BOTH, expert_action=True, blind_action=True)
+    settings = EnvSettings(obs_type=BOTH, robot_state=True, expert_action=True, blind_action=True)
     space = observations.observation_space(settings, longest(settings))
     units = {
         "pixels/image": "third-person camera, RGB, upright",
@@ -215,10 +215,17 @@ def spaces_page() -> str:
         "phase": "0 demonstration prompt and the rest after it, 1 execution",
         "step": "control steps since the start of the phase; in the execution of strict tasks −1, and −2 at its end",
         "environment_state": f"{SLOTS} object slots, with `env.obs_type` of that name or `both`",
+        "robot_state/eef/pos": "grip site, m; with `env.robot_state=true`, as all of `robot_state`",
+        "robot_state/eef/quat": "orientation of the hand's body, xyzw",
+        "robot_state/eef/mat": "rotation matrix of the grip site",
+        "robot_state/gripper/qpos": "fingers, m",
+        "robot_state/gripper/qvel": "velocities of the fingers, m/s",
+        "robot_state/joints/pos": "joints of the arm, rad",
+        "robot_state/joints/vel": "velocities of the joints, rad/s",
         "expert_action": "action of the scripted expert; with `env.expert_action=true`",
         "blind_action": "action of the published routine; with `env.blind_action=true`",
     }
-    at_policy = observations.policy_names(BOTH)
+    at_policy = observations.policy_names(settings)
     rows = []
     for name, part in sorted(flat(space), key=lambda leaf: [*units].index(leaf[0])):
         policy_name = at_policy.get(name, f"observation.{name}")

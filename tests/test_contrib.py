@@ -19,6 +19,7 @@ from lerobot.envs import utils as env_utils
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import policy_features, policy_names
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.evaluation.metrics import METRICS
 from lerobot_memobench.sim.robot import ROBOSUITE
 from lerobot_memobench.tasks.catalogue import load_task, task_names
@@ -110,8 +111,9 @@ def test_page_lists_suites_metrics_features_and_tasks() -> None:
     assert listed == {suite: suites.count(suite) for suite in suites}
     assert [name for name, _ in rows("`memobench report` adds")] == list(METRICS)
     shapes = {key: tuple(int(n) for n in re.findall(r"\d+", shape)) for key, shape, _ in rows("**Observations:**")}
-    names = policy_names("both")
-    features = {names[key]: tuple(one.shape) for key, one in policy_features("both").items() if key != "action"}
+    settings = EnvSettings(obs_type="both")
+    names, found = policy_names(settings), policy_features(settings)
+    features = {names[key]: tuple(one.shape) for key, one in found.items() if key != "action"}
     assert shapes == features | {"observation.phase": (1,), "observation.step": (1,)}
     named = re.findall(r"\b[a-z]+(?:_[a-z]+){4,}\b", PAGE + yaml.safe_dump(JOB))
     assert named

@@ -65,11 +65,12 @@ DECIDED = {
 class MEMOBench(StepBenchmark):
     """The tasks of one suite; episode i of each task has the scene of seed ``seed`` + i.
 
-    Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (256, 256, 3); ``states`` float32 (8,):
-    end-effector position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) of
-    `MemobenchEnv`. The first observation of an episode with a demonstration prompt also contains ``video_history`` and
-    ``wrist_video_history``, lists of pictures, ``state_history``, a list of states, and ``episode_restart``. Frames
-    of the rest between prompt and execution are omitted, because they equal the first observation.
+    Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (H, W, 3); ``states`` float32 (8,): end-effector
+    position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) and, with
+    ``robot_state=True``, ``robot_state`` of `MemobenchEnv`. The first observation of an episode with a demonstration
+    prompt also contains ``video_history`` and ``wrist_video_history``, lists of pictures, ``state_history``, a list of
+    states, and ``episode_restart``. Frames of the rest between prompt and execution are omitted, because they equal the
+    first observation.
 
     Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`.
 
@@ -236,13 +237,15 @@ class MEMOBench(StepBenchmark):
         }
         if self._send_state:
             found[STATES] = raw_obs["agent_pos"]
+        if self._settings.robot_state:
+            found["robot_state"] = raw_obs["robot_state"]
         if self._history:
             found |= {**self._history, "episode_restart": True}
             self._history = {}
         return found
 
     def _picture(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
-        picture: NDArray[np.uint8] = observation["pixels"][CONVENTIONS[self._settings.convention][name]]
+        picture: NDArray[np.uint8] = observation["pixels"][self._settings.pictures[name]]
         return picture
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import copy
+import json
 from pathlib import Path
 from typing import Any
 
+import av
+import draccus
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from lerobot.configs import FeatureType
 from lerobot.envs import env_to_policy_features, preprocess_observation
+from lerobot.processor.env_processor import LiberoProcessorStep
 
 import lerobot_memobench.envs  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import differences, read_log
+from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences, read_log
 from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.observations import ROBOT_STATE
+from lerobot_memobench.envs.video import BAND
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
@@ -26,6 +33,7 @@ STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
 REST = np.zeros(7, np.float32)
 NAMES = ("image", "image2")
+MAPPING = {"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}
 
 
 def opened(task: str = STOVE, **settings: Any) -> Any:
@@ -66,14 +74,118 @@ def test_lerobots_features_have_the_names() -> None:
     [
         ({"convention": "liberoo"}, "did you mean 'libero'"),
         ({"convention": "Upright"}, "did you mean 'upright'"),
-        ({"control_mode": "absolute"}, "control_mode is 'absolute'; known are 'relative'"),
+        ({"control_mode": "absolute"}, "control_mode is 'absolute', and actions of this environment are displacements"),
         ({"convention": "libero", "obs_type": "environment_state_agent_pos"}, "is of pictures"),
+        ({"observation_height": 360, "obs_type": "environment_state_agent_pos"}, "is of pictures"),
+        ({"camera_name_mapping": MAPPING}, "convention is upright; set convention=libero"),
+        *(
+            (
+                {"convention": "libero", "camera_name_mapping": bad},
+                "camera_name_mapping is .*; expected different names",
+            )
+            for bad in (
+                {"agentview": "camera1"},
+                {"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera1"},
+                {"agentview_image": "image2"},
+                {"agentview_image": "pixels/camera1"},
+                {"agentview_image": ""},
+                {"agentview_image": None},
+                "camera1",
+            )
+        ),
+        ({"observation_width": 15}, "observation_width is 15; expected a whole number from 16 on"),
+        ({"observation_height": 361}, "are 361 and 256; expected even numbers up to 2048"),
+        ({"observation_width": 4096}, "are 256 and 4096; expected even numbers up to 2048"),
     ],
 )
 def test_refused_settings(settings: dict[str, Any], named: str) -> None:
     for make in (opened, MemobenchEnvConfig):
         with pytest.raises(MemobenchError, match=named):
             make(**settings)
+
+
+@pytest.mark.parametrize("render", ["default", "high"])
+def test_sizes_of_pictures(tmp_path: Path, render: str) -> None:
+    """Also not square: a narrower picture is the middle of a wider one. Video and spaces follow."""
+    small = {"observation_height": 16, "observation_width": 16}
+    sizes = {"observation_height": 96, "observation_width": 64, "render": render}
+    config = MemobenchEnvConfig(**sizes)
+    features = env_to_policy_features(config)
+    assert {one.shape for one in features.values() if one.type is FeatureType.VISUAL} == {(3, 96, 64)}
+    narrow = opened(log_dir=str(tmp_path), videos=-1, horizon=1, **sizes)
+    wide = opened(horizon=1, **sizes | {"observation_width": 96})
+    (first, _), (other, _) = (env.reset(seed=20_000) for env in (narrow, wide))
+    assert narrow.observation_space.contains(first)
+    for name, picture in first["pixels"].items():
+        middle = other["pixels"][name][:, 16:80]
+        assert picture.shape == middle.shape == (96, 64, 3)
+        assert np.abs(picture.astype(int) - middle).mean() < 0.5
+    narrow.step(REST)
+    other = opened(horizon=1, **small)
+    other.reset(seed=20_000)
+    assert other.render().shape == (BAND + 16, 32, 3)
+    with av.open(str(next(tmp_path.glob("videos/*.mp4")))) as video:
+        assert (video.streams.video[0].height, video.streams.video[0].width) == (BAND + 96, 2 * 64)
+
+
+def test_log_file_and_comparison_name_the_size(tmp_path: Path) -> None:
+    env = MemobenchEnv(STOVE, log_dir=str(tmp_path), observation_height=128, observation_width=96, horizon=1)
+    env.reset(seed=7)
+    env.step(REST)
+    (line,) = read_log(tmp_path)
+    assert (line["observation_height"], line["observation_width"]) == (128, 96)
+    protocol = protocol_of(tmp_path)
+    found = ["observation_height: 256 and 128", "observation_width: 256 and 96"]
+    assert differences(MemobenchEnv(STOVE, horizon=1).settings.protocol_block, protocol) == found
+    assert set(found) < {*differences({}, protocol)}, "of an earlier version"
+    assert "observation_height 128, observation_width 96" in headline(read_runs([tmp_path]))
+
+
+def test_camera_name_mapping_names_the_pictures(tmp_path: Path) -> None:
+    """As in LeRobot's libero: in its features, in observations, and through the parser of its commands."""
+    wrist = {"robot0_eye_in_hand_image": "wrist"}
+    for given, names in ((MAPPING, ("camera1", "camera2")), (wrist, ("image", "wrist"))):
+        flags = ["--convention=libero", f"--camera_name_mapping={json.dumps(given)}"]
+        config = draccus.parse(MemobenchEnvConfig, args=flags)
+        features = env_to_policy_features(config)
+        pictures = [key for key, one in features.items() if one.type is FeatureType.VISUAL]
+        assert pictures == [f"observation.images.{name}" for name in names]
+        env = MemobenchEnv(STOVE, config.settings, log_dir=str(tmp_path / names[0]), horizon=1)
+        observed, _ = env.reset(seed=7)
+        assert env.observation_space.contains(observed)
+        usual, _ = MemobenchEnv(STOVE, convention="libero", horizon=1).reset(seed=7)
+        for name, other in zip(names, NAMES, strict=True):
+            assert np.array_equal(observed["pixels"][name], usual["pixels"][other])
+        env.step(REST)
+    assert read_log(tmp_path / "camera1")[0]["camera_name_mapping"] == MAPPING
+    protocols = [protocol_of(tmp_path / name) for name in ("camera1", "image")]
+    assert protocols[0]["camera_name_mapping"] == MAPPING
+    assert [each.split(":")[0] for each in differences(*protocols)] == ["camera_name_mapping.robot0_eye_in_hand_image"]
+    assert not differences(*protocols, ignore=OF_ONE_EVALUATION), "evaluations of two policies compare"
+
+
+def test_robot_state_is_that_of_lerobots_libero() -> None:
+    """LeRobot's processor of LIBERO computes the benchmark's own state from it, at home and after a motion."""
+    config = MemobenchEnvConfig(tasks=STOVE, robot_state=True, prompt_in="reset", seed_base=20_000)
+    (tasks,) = config.create_envs(2).values()
+    (env,) = tasks.values()
+    observed, _ = env.reset(seed=[20_000, 20_001])
+    numbers = set()
+    for _ in range(3):
+        assert env.observation_space.contains(observed)
+        found = preprocess_observation(copy.deepcopy(observed))
+        state = found["observation.robot_state"]
+        shapes = {name: {key: tuple(one.shape) for key, one in group.items()} for name, group in state.items()}
+        two = {name: {key: (2, *shape) for key, shape in group.items()} for name, group in ROBOT_STATE.items()}
+        assert shapes == two
+        assert {one.dtype for group in state.values() for one in group.values()} == {torch.float64}
+        theirs = LiberoProcessorStep().observation({"observation.robot_state": state})["observation.state"]
+        assert (theirs - found["observation.state"]).abs().max() <= 1e-5
+        numbers.add(float(theirs[0, 0]))
+        for _ in range(5):
+            observed, *_ = env.step(np.array([[0.8, 0.3, -0.4, 0.9, -0.5, 0.7, 1.0]] * 2, np.float32))
+    assert len(numbers) == 3
+    env.close()
 
 
 def test_log_file_and_headline_name_the_convention(tmp_path: Path) -> None:

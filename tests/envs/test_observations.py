@@ -12,7 +12,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
 from lerobot_memobench.envs.observations import Observer, check_obs_type, obs_type_of, policy_inputs
-from lerobot_memobench.envs.settings import BOTH, OBJECTS, OBS_TYPES, PIXELS
+from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.baselines.configuration_baselines import (
     MemobenchExpertConfig,
@@ -93,7 +93,7 @@ def test_observation_kind_must_contain_the_inputs(policy: Any, needed: str | Non
 
 def test_a_picture_may_be_changed_in_place() -> None:
     """A scene at rest is rendered once, and each observation has arrays of its own."""
-    observer = Observer(PIXELS)
+    observer = Observer(DEFAULTS)
     observer._images = {name: np.ones((2, 2, 3), np.uint8) for name in CAMERAS}
     observer.observation()["pixels"]["image"][:] = 0
     assert observer.observation()["pixels"]["image"].all()

@@ -159,6 +159,14 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
     assert list(whole["images"]) == ["agentview", "wrist"]
     for camera in whole["images"]:
         assert np.array_equal(first["images"][camera], whole["images"][camera][:, ::-1])
+    sizes, names = {"observation_height": 96, "observation_width": 64}, {"agentview_image": "camera1"}
+    other = benchmarks(UNPROMPTED, horizon=1, convention="libero", camera_name_mapping=names, robot_state=True, **sizes)
+    asked, _ = played(other)
+    assert {name: picture.shape for name, picture in asked["images"].items()} == {
+        "agentview": (96, 64, 3),
+        "wrist": (96, 64, 3),
+    }
+    assert np.allclose(asked["robot_state"]["eef"]["pos"], asked["states"][:3])
     declared = plain.get_observation_spec()
     assert check_specs(plain.get_action_spec(), plain.get_action_spec(), declared, declared) == []
     assert set(declared) == {"agentview", "wrist", "language", "state"}

@@ -177,6 +177,27 @@ def test_lerobots_command_cannot_run_an_xvla(tmp_path: Path, monkeypatch: pytest
             plan_line(["env=memobench", f"tasks={STOVE}", "episodes=1", f"policy={path}"])
 
 
+def test_camera_name_mapping_of_a_command(tmp_path: Path) -> None:
+    """A checkpoint with the names of a LIBERO model card needs no ``rename_map``."""
+    names = {"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}
+    path = saved(tmp_path, NUMBERED, rename_map=RENAMED_LIBERO)
+    line = ["env=memobench", f"tasks={STOVE}", "episodes=1", f"policy={path}"]
+    plan = plan_line([*line, f"camera_name_mapping={json.dumps(names)}"])
+    assert plan.settings.portable["env"]["camera_name_mapping"] == names
+    assert plan.environment.features_map["pixels/camera2"] == "observation.images.camera2"
+    unclear = saved(tmp_path / "unclear", NUMBERED)
+    mapping = f"camera_name_mapping={json.dumps(names)}"
+    assert plan_line([*line[:3], f"policy={unclear}", mapping]).environment.convention == "libero"
+    ours = saved(tmp_path / "ours", OURS)
+    with pytest.raises(MemobenchError, match=r"expects pictures of convention=upright.*, and found libero"):
+        plan_line([*line[:3], f"policy={ours}", mapping])
+    for bad in ("camera1", "[camera1]", "{"):
+        with pytest.raises(MemobenchError, match="expected a mapping"):
+            plan_line([*line, f"camera_name_mapping={bad}"])
+    with pytest.raises(MemobenchError, match=r"camera_name_mapping is .*; expected different names"):
+        plan_line([*line, 'camera_name_mapping={"agentview": "camera1"}'])
+
+
 def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     theirs, unclear = saved(tmp_path, THEIRS), saved(tmp_path / "unclear", NUMBERED)
 

@@ -15,20 +15,22 @@ import msgpack
 import numpy as np
 import pytest
 import torch
-from lerobot.policies import make_pre_post_processors
+from lerobot.envs import preprocess_observation
+from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import OBS_IMAGES
 from vla_eval import serve_background
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote import transports as wire
-from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
+from lerobot_memobench.policies.remote.configuration_remote import OPENPI_KEYS, RemoteConfig
 from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
 from lerobot_memobench.policies.remote.session import MOST_ACTIONS, fit
 from tests.support.policy_server import PolicyServer, robomme
-from tests.support.remote_case import IMPATIENT, TASK, batch, counting, frames_of, free_port, make, pictures
+from tests.support.remote_case import IMPATIENT, PATIENT, TASK, batch, counting, frames_of, free_port, make, pictures
 from tests.support.vla_eval_server import DigestServer, ScriptedServer, action, hello
 
 
@@ -38,6 +40,29 @@ def steps_of(questions: list[dict[str, Any]]) -> list[int]:
 
 
 # --- openpi ---
+
+
+def test_openpi_gets_liberos_pictures_under_its_names_whatever_the_environment_calls_them() -> None:
+    """And parts of ``robot_state`` where ``keys`` asks for them."""
+    keys = ",".join([*(f"{theirs}={ours}" for theirs, ours in OPENPI_KEYS.items()), "joints=robot_state.joints.pos"])
+    mapping = {"agentview_image": "second", "robot0_eye_in_hand_image": "first"}
+    task = "turn_on_the_stove_and_turn_it_off"
+    for given, asked in ((None, None), (mapping, keys)):
+        config = MemobenchEnvConfig(tasks=task, convention="libero", camera_name_mapping=given, robot_state=True)
+        (env,) = config.create_envs(1)["temporal"].values()
+        observed = preprocess_observation(env.reset(seed=[20_000])[0]) | {"task": ["do it"]}
+        with PolicyServer() as server:
+            policy = make_policy(RemoteConfig(port=server.port, image_size=0, keys=asked, **PATIENT), env_cfg=config)
+            policy.reset()
+            policy.select_action(observed)
+        (question,) = server.questions
+        joints = question.pop("joints", None)
+        assert set(question) == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
+        (episode,) = env.get_attr("episode")
+        for name, picture in episode.images().items():
+            assert np.array_equal(question[f"observation/{name}"], picture[:, ::-1])
+    assert joints is not None
+    assert np.array_equal(joints, np.float32(episode.sim.robot_state()["joints"]["pos"]))
 
 
 def test_openpi_questions_hold_the_inputs_of_its_libero_servers() -> None:

@@ -8,12 +8,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy_config
 
 import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.conformance.subject import load_subject
 from lerobot_memobench.datasets.lerobot_format.layout import read_info
@@ -50,6 +53,84 @@ def test_a_view_keeps_the_convention(both: dict[str, Path], tmp_path: Path) -> N
     for here, there in zip(NAMES, VIEWS, strict=True):
         assert (libero[here] - upright[there].flip(-1)).abs().mean() < 0.01
         assert (libero[here] - upright[there]).abs().mean() > 0.05
+
+
+@pytest.mark.parametrize(("old", "new"), [("upright", "libero"), ("libero", "upright")])
+def test_a_view_turns_videos_into_the_other_convention(
+    both: dict[str, Path], tmp_path: Path, old: str, new: str
+) -> None:
+    """Equal to a dataset that was written in it, but for the second encoding."""
+    write_view(both[new], tmp_path / "wanted", Choice())
+    line = ["view", str(both[old]), "--convention", new, "--obs-type", "pixels_agent_pos"]
+    assert memobench([*line, "--out", str(tmp_path / "turned")]) == 0
+    wanted, turned = (LeRobotDataset("local/view", root=tmp_path / name) for name in ("wanted", "turned"))
+    assert turned.meta.features == wanted.meta.features  # so that LeRobot merges them
+    assert {*turned.meta.stats} == {*wanted.meta.stats}
+    names = [name for name in turned.meta.stats if name.startswith("observation.images")]
+    assert len(names) == 2
+    for name in names:
+        for key in ("mean", "std", "q01", "q99"):
+            assert np.allclose(turned.meta.stats[name][key], wanted.meta.stats[name][key], atol=0.01), (name, key)
+    assert len(turned) == len(wanted)
+    unlike: list[float] = []
+    for frame in range(len(wanted)):
+        there, here = wanted[frame], turned[frame]
+        for name in names:
+            assert (here[name] - there[name]).abs().mean() < 0.01
+            unlike.append(float((here[name].flip(-1) - there[name]).abs().mean()))
+        for name in ("observation.state", "action", "timestamp"):
+            assert torch.equal(here[name], there[name])
+    assert max(unlike) > 0.05  # some frames are nearly symmetric
+    again = ["view", str(tmp_path / "turned"), "--convention", new, "--prompts", "--out", str(tmp_path / "same")]
+    assert memobench(again) == 0
+    assert next((tmp_path / "same").rglob("*.mp4")).is_symlink()
+
+
+@pytest.fixture
+def liberos(tmp_path: Path) -> Path:
+    """A dataset of another package with LIBERO's names, whose pictures are PNG in the tables."""
+    picture = {"dtype": "image", "shape": (16, 24, 3), "names": ["height", "width", "channels"]}
+    numbers = {"dtype": "float32", "shape": (3,), "names": None}
+    features = {**dict.fromkeys(NAMES, picture), "observation.state": numbers, "action": numbers}
+    made = LeRobotDataset.create("local/made", 10, features, root=tmp_path / "made", use_videos=False)
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        for _ in range(4):
+            pictures = {name: rng.integers(0, 255, picture["shape"], np.uint8) for name in NAMES}
+            vectors = {name: rng.random(3, np.float32) for name in ("observation.state", "action")}
+            made.add_frame(pictures | vectors | {"task": "open the drawer"})
+        made.save_episode()
+    made.finalize()
+    return tmp_path / "made"
+
+
+def test_a_view_turns_images_to_the_bit(liberos: Path, tmp_path: Path) -> None:
+    write_view(liberos, tmp_path / "upright", Choice(convention="upright"))
+    write_view(tmp_path / "upright", tmp_path / "back", Choice(convention="libero"))
+    first, upright, back = (
+        LeRobotDataset("local/view", root=root) for root in (liberos, tmp_path / "upright", tmp_path / "back")
+    )
+    assert convention_of(upright.meta.features) == "upright"
+    for frame in range(len(first)):
+        for there, here in zip(NAMES, VIEWS, strict=True):
+            assert torch.equal(upright[frame][here], first[frame][there].flip(-1))
+            assert torch.equal(back[frame][there], first[frame][there])
+            assert np.array_equal(upright.meta.stats[here]["mean"], first.meta.stats[there]["mean"])
+        for name in ("observation.state", "action"):
+            assert torch.equal(upright[frame][name], first[frame][name])
+
+
+def test_a_view_needs_pictures_of_a_known_convention(liberos: Path, tmp_path: Path) -> None:
+    objects = write_streams(tmp_path / "objects", pictures=False, frames=3)
+    info = liberos / "meta" / "info.json"
+    unknown = info.read_text().replace("images.image2", "images.wrist_image")
+    for root, obs_type, named in ((objects, None, "no pictures"), (liberos, "environment_state_agent_pos", "has")):
+        with pytest.raises(MemobenchError, match=named):
+            write_view(root, tmp_path / "view", Choice(obs_type=obs_type, convention="libero"))
+    info.write_text(unknown)
+    with pytest.raises(MemobenchError, match=r"it is unknown whether .*wrist_image are upright or mirrored"):
+        write_view(liberos, tmp_path / "view", Choice(convention="libero"))
+    assert not (tmp_path / "view").exists()
 
 
 def test_evaluations_during_a_training_follow_the_dataset(both: dict[str, Path]) -> None:

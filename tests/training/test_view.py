@@ -148,7 +148,7 @@ def test_trainings_share_a_view(pictured: Path, tmp_path: Path, monkeypatch: pyt
     assert "observation.images.image" in str(kept.get("policy.input_features"))
     (note,) = (note for note in notes if "pixels" in note)
     assert "pixels, and policy=act does not resize them" in note
-    assert "256 x 256" in note
+    assert "evaluate it with observation_height=48 observation_width=48" in note
     with pytest.raises(MemobenchError, match=r"episodes=\[7\]"):
         viewed(given.default("dataset.episodes", "[7]"), None, None, notes.append)
 

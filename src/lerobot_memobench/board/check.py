@@ -22,7 +22,7 @@ from lerobot_memobench.datasets.generation import task_hash
 from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, OMITTED, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
 from lerobot_memobench.envs.pacing import paused
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PIXELS, SCENE_HASHES, EnvSettings
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PICTURES, PIXELS, SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.metrics import failure_of, operations, seed_base
@@ -289,8 +289,8 @@ def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
     """Check one line: settings as on the card, seed, and an outcome that this task can have."""
     protocol, named = run.protocol, (run.records[0].get(POLICY), str(run.card[POLICY].get("type")))
     where = f"{run.place}: {record['task']}, episode {record['episode']}"
-    settings = ("suite", "world", "difficulty", "protocol", "convention", "referent", "salt", "replan_steps", INPUTS)
-    for key in (*settings, *MEMORY_CONTROLS):
+    settings = ("suite", "world", "difficulty", "protocol", "referent", "salt", "replan_steps", INPUTS)
+    for key in (*settings, *PICTURES, "camera_name_mapping", *MEMORY_CONTROLS):
         value = record.get(key, OMITTED.get(key))
         expected = protocol.get(key)
         if value != expected:

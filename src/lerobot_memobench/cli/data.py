@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.jobs.slurm import read_options
-from lerobot_memobench.sim.convention import UPRIGHT
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
@@ -236,6 +237,9 @@ def view(
         str | None, typer.Option(help=f"Inputs: {', '.join(OBS_TYPES)}; pictures if there are some by default.")
     ] = None,
     prompts: Annotated[bool, typer.Option(help="Keep the frames of demonstration prompts and holds.")] = False,
+    convention: Annotated[
+        str | None, typer.Option(help="Pictures upright, or libero: mirrored. Those of the dataset by default.")
+    ] = None,
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
     from lerobot_memobench.datasets.lerobot_format.layout import read_info
@@ -243,7 +247,10 @@ def view(
 
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)
-    write_view(dataset, out, choice_for(None, read_info(dataset)["features"], prompts, obs_type))
+    if convention is not None:
+        check_choice("convention", convention, [*CONVENTIONS])
+    choice = choice_for(None, read_info(dataset)["features"], prompts, obs_type)
+    write_view(dataset, out, replace(choice, convention=convention))
     say(f"view: {out}")
 
 

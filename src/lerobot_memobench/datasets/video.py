@@ -42,13 +42,13 @@ def _encoder() -> RGBEncoderConfig:
 
 
 class VideoWriter:
-    """Encode a video frame by frame, so that an episode's images are never in memory together.
+    """Encode a video of ``rate`` frames/s frame by frame, so that an episode's images are never in memory together.
 
     It uses one thread, so that the bytes do not depend on the machine's cores or on other processes.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, rate: int = CONTROL_HZ) -> None:
+        self._path, self._rate = path, rate
         self._container: Any = None
         self._stream: Any = None
 
@@ -60,7 +60,7 @@ class VideoWriter:
             encoder = _encoder()
             options = encoder.get_codec_options(1, as_strings=True)
             self._container = av.open(str(self._path), "w")
-            self._stream = self._container.add_stream(encoder.vcodec, CONTROL_HZ, options=options)
+            self._stream = self._container.add_stream(encoder.vcodec, self._rate, options=options)
             self._stream.pix_fmt = encoder.pix_fmt
             self._stream.height, self._stream.width = frame.shape[:2]
         picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
@@ -78,6 +78,17 @@ class VideoWriter:
         if self._container is not None:
             self._container.close()
             self._container = None
+
+
+def mirror_video(source: Path, path: Path, rate: int) -> None:
+    """Encode a video of ``rate`` frames/s again, with each frame mirrored left to right."""
+    import av
+
+    writer = VideoWriter(path, rate)
+    with av.open(str(source)) as container:
+        for frame in container.decode(video=0):
+            writer.add(np.ascontiguousarray(frame.to_ndarray(format="rgb24")[:, ::-1]))
+    writer.close()
 
 
 def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:

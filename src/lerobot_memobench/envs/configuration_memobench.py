@@ -33,10 +33,9 @@ from lerobot_memobench.envs.observations import (
     prompt_in,
 )
 from lerobot_memobench.envs.pacing import longest
-from lerobot_memobench.envs.settings import AUTO, INTACT, PIXELS, STEPS, EnvSettings
+from lerobot_memobench.envs.settings import AUTO, INTACT, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
-from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.catalogue import (
     find_tasks,
     group_of,
@@ -108,8 +107,8 @@ class MemobenchEnvConfig(_WithSettings):
                 f"env.task_dir={self.task_dir} runs every task of that folder and excludes tasks={self.tasks}; remove "
                 "tasks=, or set env.task_dir= to the folder of one task"
             )
-        if (pictures := (self.obs_type, self.convention)) != (PIXELS, UPRIGHT):
-            self.features, self.features_map = policy_features(*pictures), policy_names(*pictures)
+        if (features := policy_features(self.settings)) != policy_features():
+            self.features, self.features_map = features, policy_names(self.settings)
 
     @property
     def settings(self) -> EnvSettings:

@@ -26,7 +26,6 @@ from lerobot_memobench.protocol import (
     EXECUTION,
     HOLD_MEAN,
     HOLD_SHAPE,
-    IMAGE_SIZE,
     LONGEST_HOLD,
     MOST_HOLDS,
     NO_CLOCK,
@@ -67,8 +66,8 @@ class Episode:
     Args:
         task: the task of the catalogue.
         settings: settings of the environment. An episode uses ``referent``, ``demonstration_prompt``, ``horizon``,
-            ``protocol``, ``render``, ``corrupt_step``, ``reshow``, ``interference`` and those of `Pacing`. Without the
-            demonstration prompt, objects that it hides are hidden before the first frame.
+            ``protocol``, ``render``, sizes of pictures, ``corrupt_step``, ``reshow``, ``interference`` and those of
+            `Pacing`. Without the demonstration prompt, objects that it hides are hidden before the first frame.
         render: size and quality of frames; None for those of ``settings``.
         changes: settings by name that replace those of ``settings``.
 
@@ -90,7 +89,7 @@ class Episode:
         self, task: Task, settings: EnvSettings = DEFAULTS, *, render: RenderSettings | None = None, **changes: Any
     ) -> None:
         self.settings = settings = settings.changed(**changes)
-        render = render or RenderSettings(IMAGE_SIZE, IMAGE_SIZE, settings.render)
+        render = render or RenderSettings(settings.observation_height, settings.observation_width, settings.render)
         self.published = task = task.at(cast("Difficulty", settings.difficulty))
         self.referent = referent_text(settings.referent, task.drawn)
         self._limit = settings.horizon * steps_per_action(settings.speed)
@@ -387,7 +386,7 @@ class Episode:
         return self._slots.observe()
 
     def images(self) -> dict[str, Image]:
-        """Render both cameras, (256, 256, 3) uint8 each, upright."""
+        """Render both cameras, (height, width, 3) uint8 each, upright."""
         return {key: self.sim.render(camera) for key, camera in CAMERAS.items()}
 
     def subgoal(self) -> str:

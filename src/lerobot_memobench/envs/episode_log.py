@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDic
 
 from annotated_types import Ge, Le
 
-from lerobot_memobench.envs.settings import GOALS, HOLD, MEMORY_CONTROLS, SCENE_HASHES
+from lerobot_memobench.envs.settings import GOALS, HOLD, MEMORY_CONTROLS, PICTURES, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -36,7 +36,6 @@ from lerobot_memobench.io import (
     write_file,
 )
 from lerobot_memobench.protocol import BY_PAPER
-from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
 from lerobot_memobench.tasks.difficulty import STANDARD, Difficulty
 from lerobot_memobench.tasks.evidence import chance
@@ -142,6 +141,9 @@ class Outcome(TypedDict, total=False):
         stand_ins: classes whose missing scans this package's objects replaced.
         protocol: ``upstream``, the authors' evaluation; absent for the paper's.
         convention: of the pictures; absent for upright ones.
+        observation_height: of the pictures, pixels; absent for 256.
+        observation_width: of the pictures, pixels; absent for 256.
+        camera_name_mapping: LIBERO's names of cameras -> names of pictures; absent without.
         lost: strict tasks: whether the goal became unreachable.
         fault: reason why the episode was aborted: an invalid action or unstable physics.
         scene_hash: hash of the initial scene.
@@ -173,6 +175,9 @@ class Outcome(TypedDict, total=False):
     stand_ins: list[Name]
     protocol: Name
     convention: Name
+    observation_height: Count
+    observation_width: Count
+    camera_name_mapping: dict[Name, Name]
     lost: bool
     fault: str
     scene_hash: Name | None
@@ -507,14 +512,15 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
 
 OMITTED: dict[str, Any] = {
     **{"suite": PUBLISHED, WORLD: FORMER, "difficulty": STANDARD, "protocol": BY_PAPER},
-    "convention": UPRIGHT,
+    **PICTURES,
+    **{"camera_name_mapping": None, "robot_state": False},
     **{"pause_steps": 0, "speed": 1.0, "evidence": False, HOLD: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
     **{"window_steps": 1, "delay_steps": 0, "salt": None},
     **MEMORY_CONTROLS,
 }
 """Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
 steps per rendered picture, exists in earlier versions only."""
-OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", INPUTS, "salt")
+OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", "camera_name_mapping", "robot_state", INPUTS, "salt")
 """Settings that follow from the policy, and the salt, which the start of a sealed evaluation draws. They may differ
 between compared evaluations, not between parts of one."""
 EXTENT = ("tasks", "episodes")

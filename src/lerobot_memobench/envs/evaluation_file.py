@@ -40,6 +40,7 @@ _CHECKED: dict[Any, Any] = {
     float: Number | None,
     str: Name | None | list[Name | None],
     bool: bool | None,
+    dict[str, str]: dict[Name, Name] | None | list[dict[Name, Name] | None],
 }
 """Type of a setting -> type of its value in a file; joined parts may differ and then give a list."""
 

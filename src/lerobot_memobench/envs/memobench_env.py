@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import (
+    OMITTED,
     UNKNOWN_POLICY,
     Acting,
     EpisodeLog,
@@ -37,21 +38,19 @@ from lerobot_memobench.envs.observations import (
     observation_space,
 )
 from lerobot_memobench.envs.pacing import longest
-from lerobot_memobench.envs.settings import AUTO, DEFAULTS, EVERY, RESET, STEPS, EnvSettings
+from lerobot_memobench.envs.settings import AUTO, DEFAULTS, EVERY, PICTURES, RESET, STEPS, EnvSettings
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
 from lerobot_memobench.protocol import (
     ACTION_DIM,
     EXECUTION,
-    IMAGE_SIZE,
     PROMPT,
     PROMPT_HORIZON,
     SEALED,
     SPLITS,
     UNSEEDED,
 )
-from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
 from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import scene_and_variant
@@ -63,13 +62,13 @@ logger = logging.getLogger(__name__)
 class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     """One task of the benchmark.
 
-    Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (256, 256, 3) upright, with ``convention=libero``
+    Observation: ``pixels/image`` and ``pixels/wrist_image`` uint8 (H, W, 3) upright, with ``convention=libero``
     ``pixels/image`` and ``pixels/image2`` mirrored left to right, or ``environment_state`` float32 (208,): the visible
-    objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector
-    position (3, m), axis-angle (3, rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and
-    actions have no effect, 1 in execution; ``step`` (1,): control steps since the phase began, in the execution of a
-    strict task `NO_CLOCK` or `ENDED`; optionally ``expert_action`` (7,) and ``blind_action`` (7,). A strict task is
-    held at the start of the execution and after each return home (`Pacing.hold`); observations do not show it.
+    objects (`sim.object_layout`), or both; ``agent_pos`` float32 (8,): end-effector position (3, m), axis-angle (3,
+    rad), fingers (2, m); ``phase`` (1,): 0 while the demonstration prompt plays and actions have no effect, 1 in
+    execution; ``step`` (1,): control steps since the phase began, in the execution of a strict task `NO_CLOCK` or
+    `ENDED`; optionally ``robot_state`` (`ROBOT_STATE`), ``expert_action`` (7,) and ``blind_action`` (7,). A strict task
+    is held at the start of the execution and after each return home (`Pacing.hold`); observations do not show it.
 
     Action: float32 (7,) in [−1, 1]: end-effector displacement (±5 cm, ±0.5 rad per unit), gripper (−1 opens, 1 closes).
 
@@ -129,7 +128,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._log_dir = Path(log_dir) if log_dir is not None else None
         self._log = self._opened_log(log_dir) if log_dir is not None else None
         self._video: VideoRecorder | None = None
-        self._observer = Observer(settings.obs_type, settings.convention)
+        self._observer = Observer(settings)
         self._others: Interference | None = None
         self._began = self._closed = False
         self._not_run: str | None = None
@@ -323,8 +322,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             variants = len(self._task.random_variants) if self.settings.evidence else None
             referent = self.settings.referent
             found = not_run_record(self._task, self._number, self._scene_seed, referent, self._not_run, variants)
-        convention = self.settings.convention
-        return found | self._acting.line | ({} if convention == UPRIGHT else {"convention": convention})
+        pictures = {name: getattr(self.settings, name) for name in (*PICTURES, "camera_name_mapping")}
+        return found | self._acting.line | {name: one for name, one in pictures.items() if one != OMITTED[name]}
 
     def _observation(self) -> dict[str, Any]:
         if self._not_run is not None:
@@ -336,6 +335,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "phase": np.array([episode.phase], dtype=np.float32),
             "step": np.array([episode.clock], dtype=np.float32),
         }
+        if self.settings.robot_state:
+            observation["robot_state"] = self._shown.sim.robot_state()
         if self.settings.expert_action:
             observation["expert_action"] = self._offered(episode.expert_action)
         if self.settings.blind_action:
@@ -368,7 +369,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: no episode is running.
         """
         self._check_began("render")
-        return self._observer.frame(self._shown) if self._not_run is None else _black()
+        return self._observer.frame(self._shown) if self._not_run is None else _black(self.settings)
 
     def close(self) -> None:
         """Release the scene; the next `reset` opens it again. Closing twice is allowed."""
@@ -396,13 +397,13 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, settings: EnvSettings) -> None:
         super().__init__(make())
-        self._log_dir, self._referent, self._seed_base = log_dir, settings.referent, settings.seed_base
+        self._log_dir, self._settings = log_dir, settings
         self._logged: dict[int, dict[str, Any]] | None = None
         self._skipped: dict[str, Any] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start the episode of a seed, or skip it if it is logged."""
-        self._skipped = None if seed is None else self._records().get(seed - self._seed_base)
+        self._skipped = None if seed is None else self._records().get(seed - self._settings.seed_base)
         if self._skipped is None:
             return self.env.reset(seed=seed, options=options)
         return blank(self.observation_space), self._info(False)
@@ -416,7 +417,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
 
     def render(self) -> Any:
         """Return the environment's picture; black for a skipped episode."""
-        return self.env.render() if self._skipped is None else _black()
+        return self.env.render() if self._skipped is None else _black(self._settings)
 
     def _info(self, success: bool) -> dict[str, Any]:
         return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
@@ -429,14 +430,14 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
             self._logged = {
                 record["episode"]: record
                 for record in records
-                if record["task"] == name and record.get("referent", "fixed") == self._referent
+                if record["task"] == name and record.get("referent", "fixed") == self._settings.referent
             }
         return self._logged
 
 
-def _black() -> NDArray[np.uint8]:
+def _black(settings: EnvSettings) -> NDArray[np.uint8]:
     """Return the rendered frame of an episode that is not run."""
-    return np.zeros((BAND + IMAGE_SIZE, 2 * IMAGE_SIZE, 3), np.uint8)
+    return np.zeros((BAND + settings.observation_height, 2 * settings.observation_width, 3), np.uint8)
 
 
 def _warn_of_sealed_seed(seed: int, log_dir: Path | None) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS, RESET, STEPS, EnvSettings
+from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, PIXELS, RESET, STEPS, EnvSettings
 from lerobot_memobench.envs.video import annotate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import (
@@ -19,12 +19,11 @@ from lerobot_memobench.protocol import (
     CONTROL_HZ,
     ENDED,
     EXECUTION,
-    IMAGE_SIZE,
     PROMPT,
     PROMPT_HORIZON,
     PROPRIO_DIM,
 )
-from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
+from lerobot_memobench.sim.convention import shown
 from lerobot_memobench.sim.object_layout import BOUNDS, FIELDS, SIZE, SLOTS
 
 if TYPE_CHECKING:
@@ -32,6 +31,13 @@ if TYPE_CHECKING:
 
     from lerobot_memobench.envs.episode import Episode
     from lerobot_memobench.sim.raster.drawlist import Image
+
+ROBOT_STATE: dict[str, dict[str, tuple[int, ...]]] = {
+    "eef": {"pos": (3,), "quat": (4,), "mat": (3, 3)},
+    "gripper": {"qpos": (2,), "qvel": (2,)},
+    "joints": {"pos": (7,), "vel": (7,)},
+}
+"""Shapes of ``robot_state``, see `Simulation.robot_state`."""
 
 SPARSE, CHECKPOINTS = "sparse", "checkpoints"
 REWARDS = (SPARSE, CHECKPOINTS)
@@ -125,32 +131,33 @@ def prompt_in(policy: object | None) -> str:
 # --- shapes ---
 
 
-def policy_features(obs_type: str = PIXELS, convention: str = UPRIGHT) -> dict[str, PolicyFeature]:
+def policy_features(settings: EnvSettings = DEFAULTS) -> dict[str, PolicyFeature]:
     """Return LeRobot's features of actions and observations, by the environment's names."""
     from lerobot.configs import FeatureType, PolicyFeature
 
+    picture = (settings.observation_height, settings.observation_width, 3)
     shapes: dict[str, tuple[FeatureType, tuple[int, ...]]] = {
         "action": (FeatureType.ACTION, (ACTION_DIM,)),
-        **dict.fromkeys(_pictures(obs_type, convention), (FeatureType.VISUAL, (IMAGE_SIZE, IMAGE_SIZE, 3))),
-        **({"environment_state": (FeatureType.ENV, (SIZE,))} if obs_type != PIXELS else {}),
+        **dict.fromkeys(_pictures(settings), (FeatureType.VISUAL, picture)),
+        **({"environment_state": (FeatureType.ENV, (SIZE,))} if settings.obs_type != PIXELS else {}),
         "agent_pos": (FeatureType.STATE, (PROPRIO_DIM,)),
     }
     return {name: PolicyFeature(type=kind, shape=shape) for name, (kind, shape) in shapes.items()}
 
 
-def policy_names(obs_type: str = PIXELS, convention: str = UPRIGHT) -> dict[str, str]:
+def policy_names(settings: EnvSettings = DEFAULTS) -> dict[str, str]:
     """Return the environment's name -> the policy's name of each feature."""
     return {
         "action": "action",
-        **_pictures(obs_type, convention),
-        **({"environment_state": "observation.environment_state"} if obs_type != PIXELS else {}),
+        **_pictures(settings),
+        **({"environment_state": "observation.environment_state"} if settings.obs_type != PIXELS else {}),
         "agent_pos": "observation.state",
     }
 
 
-def _pictures(obs_type: str, convention: str) -> dict[str, str]:
+def _pictures(settings: EnvSettings) -> dict[str, str]:
     """Return the environment's name -> the policy's name of each picture."""
-    names = () if obs_type == OBJECTS else CONVENTIONS[convention].values()
+    names = () if settings.obs_type == OBJECTS else settings.pictures.values()
     return {f"pixels/{name}": f"observation.images.{name}" for name in names}
 
 
@@ -171,16 +178,23 @@ def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
         "step": spaces.Box(ENDED, longest, (1,), np.float32),
     }
     if settings.obs_type != OBJECTS:
-        image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-        parts["pixels"] = spaces.Dict(dict.fromkeys(CONVENTIONS[settings.convention].values(), image))
+        image = spaces.Box(0, 255, (settings.observation_height, settings.observation_width, 3), np.uint8)
+        parts["pixels"] = spaces.Dict(dict.fromkeys(settings.pictures.values(), image))
     if settings.obs_type != PIXELS:
         low, high = (np.tile(np.repeat(ends, [*FIELDS.values()]), SLOTS) for ends in zip(*BOUNDS.values(), strict=True))
         parts["environment_state"] = spaces.Box(low.astype(np.float32), high.astype(np.float32), (SIZE,), np.float32)
+    if settings.robot_state:
+        groups = {name: {key: _any(shape) for key, shape in group.items()} for name, group in ROBOT_STATE.items()}
+        parts["robot_state"] = spaces.Dict({name: spaces.Dict(group) for name, group in groups.items()})
     if settings.expert_action:
         parts["expert_action"] = action_space()
     if settings.blind_action:
         parts["blind_action"] = action_space()
     return spaces.Dict(parts)
+
+
+def _any(shape: tuple[int, ...]) -> spaces.Space[Any]:
+    return spaces.Box(-np.inf, np.inf, shape, np.float64)
 
 
 def action_space() -> spaces.Space[NDArray[np.float32]]:
@@ -202,17 +216,16 @@ class Observer:
     """Render pictures and compute objects only for frames that are read.
 
     Args:
-        obs_type: one of `OBS_TYPES`.
-        convention: of the pictures in observations; `frame` is upright.
+        settings: settings of the environment; pictures of `frame` are upright.
 
     Attributes:
         needed: whether the policy reads the following frames. If not, observations repeat an earlier frame, except
             for the first and the last frame of the execution, and the frame before which memory is corrupted.
     """
 
-    def __init__(self, obs_type: str, convention: str = UPRIGHT) -> None:
-        self._convention = convention
-        self._has_pictures, self._has_objects = obs_type != OBJECTS, obs_type != PIXELS
+    def __init__(self, settings: EnvSettings) -> None:
+        self._convention, self._mapping = settings.convention, settings.camera_name_mapping
+        self._has_pictures, self._has_objects = settings.obs_type != OBJECTS, settings.obs_type != PIXELS
         self.needed = True
 
     def begin(self, episode: Episode) -> None:
@@ -243,7 +256,7 @@ class Observer:
         """Return the pictures and objects of the observation, see `observation_space`."""
         found: dict[str, Any] = {}
         if self._has_pictures:
-            found["pixels"] = shown(self._images, self._convention)
+            found["pixels"] = shown(self._images, self._convention, self._mapping)
         if self._has_objects:
             found["environment_state"] = self._objects.copy()  # may be returned again
         return found

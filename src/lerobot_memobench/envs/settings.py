@@ -18,12 +18,13 @@ from lerobot_memobench.protocol import (
     BY_PAPER,
     EVALUATION_SEED,
     HOLD_MEAN,
+    IMAGE_SIZE,
     PROMPT_HORIZON,
     PROTOCOLS,
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
-from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT
+from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
 from lerobot_memobench.sim.scene_hash import LIBERO, SCENE_HASH_VERSION, WORLD
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
@@ -42,11 +43,19 @@ policies the prompt plays in `reset`. ``auto`` chooses by the policy; without a 
 
 REFERENT_VALUES = (*REFERENTS, DRAWN)
 """Values of ``referent``; strict tasks always use the last one."""
+RELATIVE = "relative"
 QUALITIES = ("default", "high")
 EVERY = -1
 """Value of ``videos``: record every episode."""
 SLOWEST = 10
 """Maximum number of control steps per action, see ``speed``."""
+
+SMALLEST, LARGEST = 16, 2048
+"""Least and greatest height and width of pictures, pixels."""
+
+EXAMPLE = '{"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}'
+"""A value of ``camera_name_mapping``."""
+PICTURE_NAME = re.compile("[A-Za-z0-9_]+")
 
 SALT = re.compile("[0-9a-f]{32}")
 """Form of a ``salt``."""
@@ -54,6 +63,10 @@ INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 """Values of ``corrupt``: what happens to the memory of the policy."""
 
+PICTURES: Mapping[str, Any] = {
+    **{"convention": UPRIGHT, "observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE},
+}
+"""Settings of pictures, with the values that a log omits."""
 MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0}
 """Settings of corruption and interference, with their values in the protocol."""
 
@@ -111,9 +124,12 @@ class EnvSettings:
         "pictures upright, or mirrored and named as in LIBERO's data; the default follows the suite",
         [*CONVENTIONS],
     )
-    control_mode: str = setting(
-        "relative", "actions are displacements; LIBERO's absolute ones do not exist", ("relative",)
+    camera_name_mapping: dict[str, str] | None = setting(  # noqa: RUF009 - its default is None
+        None, "with convention=libero: LIBERO's name of each camera -> name of its picture"
     )
+    observation_height: int = setting(IMAGE_SIZE, "height of pictures, pixels", least=SMALLEST)
+    observation_width: int = setting(IMAGE_SIZE, "width of pictures, pixels", least=SMALLEST)
+    control_mode: str = setting(RELATIVE, "actions are displacements; LIBERO's absolute ones do not exist")
     referent: str = setting(
         "fixed", "published goals, or goals drawn by the seed; strict tasks always draw", REFERENT_VALUES
     )
@@ -135,6 +151,7 @@ class EnvSettings:
     corrupt_step: int = setting(0, "execution step at which corrupt acts; 0: at the end of the prompt", least=0)
     reshow: bool = setting(False, "the prompt plays a second time, after corrupt has acted")
     interference: int = setting(0, "episodes of other tasks shown between prompt and execution", least=0)
+    robot_state: bool = setting(False, "add the nested robot_state of LeRobot's libero: hand, fingers and joints")
     expert_action: bool = setting(False, "add the scripted expert's action as observation.expert_action")
     blind_action: bool = setting(False, "add the blind published routine's action as observation.blind_action")
     videos: int = setting(0, "number of first episodes of each task recorded as videos; -1 for all", least=EVERY)
@@ -152,8 +169,12 @@ class EnvSettings:
             )
         if self.salt is not None and not SALT.fullmatch(str(self.salt)):
             raise MemobenchError(f"salt is {self.salt!r}; expected 32 hexadecimal digits in lower case")
-        if self.convention != UPRIGHT and self.obs_type == OBJECTS:
-            raise MemobenchError(f"convention={self.convention} is of pictures, and obs_type={OBJECTS} has none")
+        if self.control_mode != RELATIVE:
+            raise MemobenchError(
+                f"control_mode is {self.control_mode!r}, and actions of this environment are displacements; leave "
+                f"control_mode out, and evaluate a policy of control_mode={RELATIVE}"
+            )
+        self._check_pictures()
         if self.suite == STRICT:
             self._set(referent=DRAWN)
         elif self.difficulty != STANDARD:
@@ -168,6 +189,35 @@ class EnvSettings:
         if self.evidence:
             check_referent(self.referent)
         self._check_memory_controls()
+
+    def _check_pictures(self) -> None:
+        """Check that the settings of pictures fit each other and the observations."""
+        height, width = self.observation_height, self.observation_width
+        if height % 2 or width % 2 or max(height, width) > LARGEST:
+            raise MemobenchError(
+                f"observation_height and observation_width are {height} and {width}; expected even numbers up to "
+                f"{LARGEST}"
+            )
+        for name, value in PICTURES.items():
+            if self.obs_type == OBJECTS and (given := getattr(self, name)) != value:
+                raise MemobenchError(f"{name}={given} is of pictures, and obs_type={OBJECTS} has none; leave it out")
+
+        mapping = self.camera_name_mapping
+        if mapping is not None and self.convention != MIRRORED:
+            raise MemobenchError(
+                f"camera_name_mapping= names LIBERO's pictures, and convention is {self.convention}; set "
+                f"convention={MIRRORED}, or leave camera_name_mapping out"
+            )
+        if mapping is not None and not _names_pictures(mapping):
+            raise MemobenchError(
+                f"camera_name_mapping is {mapping!r}; expected different names of letters, digits and _ for "
+                f"{' and '.join(LIBERO_CAMERAS.values())}, as in {EXAMPLE}"
+            )
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """Camera -> name of its picture."""
+        return picture_names(self.convention, self.camera_name_mapping)
 
     def _check_memory_controls(self) -> None:
         """Check that the settings of corruption and interference do not exclude each other."""
@@ -232,9 +282,10 @@ class EnvSettings:
     def usual(self) -> dict[str, Any]:
         """Defaults that follow from other settings."""
         limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
+        named = self.suite in limits or self.camera_name_mapping is not None
         return {
             "horizon": limits.get(self.suite, self.degree.horizon),
-            "convention": MIRRORED if self.suite in limits else UPRIGHT,
+            "convention": MIRRORED if named else UPRIGHT,  # as in LeRobot's environment `libero`
         }
 
     @property
@@ -276,6 +327,14 @@ def revision(suite: str, difficulty: str) -> dict[str, int]:
 def steps_per_action(speed: float) -> int:
     """Return the number of control steps per action."""
     return round(1 / speed)
+
+
+def _names_pictures(mapping: Any) -> bool:
+    """Return whether a ``camera_name_mapping`` gives LIBERO's cameras names that a picture can have."""
+    if not isinstance(mapping, Mapping) or not {*mapping} <= {*LIBERO_CAMERAS.values()}:
+        return False
+    names = [*picture_names(MIRRORED, mapping).values()]
+    return all(isinstance(name, str) and PICTURE_NAME.fullmatch(name) for name in names) and len({*names}) == len(names)
 
 
 DEFAULTS = EnvSettings()

@@ -74,7 +74,7 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     now = "watch the prompt" if prompt else "done" if episode.success else following
     frame[:BAND] = _band(width, episode.task.language, operations, done, now, prompt)
     pieces = ("prompt ", *str(episode.step_index)) if prompt else ("step ", *str(episode.exec_steps))
-    clock = np.concatenate([_piece(piece, prompt) for piece in pieces], axis=1)
+    clock = np.concatenate([_piece(piece, prompt) for piece in pieces], axis=1)[:, : width - 2 * MARGIN]
     frame[:CLOCK_BOTTOM, width - MARGIN - clock.shape[1] : width - MARGIN] = clock
     np.concatenate(pictures, axis=1, out=frame[BAND:])
     return frame

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_memobench.envs.episode_log import OMITTED, POLICY
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS
+from lerobot_memobench.envs.settings import MEMORY_CONTROLS, PICTURES
 from lerobot_memobench.evaluation.metrics import Record, policy_inputs, stand_ins_of
 from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
@@ -55,7 +55,7 @@ def protocol_phrases(run: Run) -> list[str]:
         *(["scenes that version 0.2 modelled in code"] if of_all(records, WORLD) == FORMER else []),
         *(
             f"{key} {value}"
-            for key in ("difficulty", "protocol", "convention")
+            for key in ("difficulty", "protocol", *PICTURES)
             if (value := of_all(records, key)) != OMITTED[key]
         ),
         *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),

@@ -25,7 +25,7 @@ from lerobot_memobench.envs.episode_log import (
     with_omitted,
 )
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
-from lerobot_memobench.envs.settings import SCENE_HASHES, SETTINGS
+from lerobot_memobench.envs.settings import PICTURES, SCENE_HASHES, SETTINGS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.evaluation.asked import check_lines, extent_of
@@ -69,7 +69,7 @@ def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     seeded = all(record.get("seed") is not None for record in records)
     values: dict[str, set[Any]] = {
         "seed_base": {seed_base(record) for record in records if seeded},
-        **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", WORLD, "protocol", "convention")},
+        **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", WORLD, "protocol", *PICTURES)},
         **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
     }
     for key, distinct in values.items():
@@ -82,8 +82,8 @@ APART = ("suite", WORLD)
 """Settings whose values are reported separately: other tasks, other scenes."""
 
 
-def of_all(records: Iterable[Mapping[str, Any]], key: str) -> str:
-    """Return the suite, the world, the protocol or the convention (``key``) of an evaluation's rollouts.
+def of_all(records: Iterable[Mapping[str, Any]], key: str) -> Any:
+    """Return the suite, the world, the protocol or a setting of pictures (``key``) of an evaluation's rollouts.
 
     Raises:
         MemobenchError: they are of several.
@@ -91,10 +91,10 @@ def of_all(records: Iterable[Mapping[str, Any]], key: str) -> str:
     there = {record.get(key, OMITTED[key]) for record in records} or {OMITTED[key]}
     if len(there) > 1:
         raise MemobenchError(
-            f"the rollouts are of the {key}s {' and '.join(sorted(there))}; report each {key} by itself"
+            f"the rollouts are of the {key}s {' and '.join(sorted(map(str, there)))}; report each {key} by itself"
         )
     (found,) = there
-    return str(found)
+    return found
 
 
 # --- evaluations ---

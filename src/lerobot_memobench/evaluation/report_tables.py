@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from lerobot_memobench.envs.episode_log import with_omitted
+from lerobot_memobench.envs.settings import PICTURES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
@@ -22,7 +23,6 @@ from lerobot_memobench.evaluation.tables import (
 from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
 from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
-from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import GROUPS
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
@@ -352,7 +352,7 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
 
 PAPER_PROTOCOL = {
     **{WORLD: LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True, "horizon": HORIZON},
-    **{"seed_base": EVALUATION_SEED, "convention": UPRIGHT},
+    **{"seed_base": EVALUATION_SEED, **PICTURES},
 }
 PAPER_INPUTS = "pixels"
 PAPER_TASKS, PAPER_EPISODES = 30, 50

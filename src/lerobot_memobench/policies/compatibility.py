@@ -158,6 +158,8 @@ def _length(policy: Any, name: str, feature: PolicyFeature | None, trained: Mapp
 
 def keeps_sizes(policy: PreTrainedConfig) -> bool:
     """Return whether a policy reads pictures in the size of its training data alone."""
+    if getattr(policy, "uses_detector", False):  # which measures places in them
+        return True
     resizes = SIZE_COUNTS.get(policy.type)
     return policy.type in SIZE_COUNTS and (resizes is None or getattr(policy, resizes) is None)
 
@@ -165,14 +167,16 @@ def keeps_sizes(policy: PreTrainedConfig) -> bool:
 def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, PolicyFeature]) -> None:
     if not keeps_sizes(policy):
         return
-    resizes = SIZE_COUNTS[policy.type]
+    resizes = SIZE_COUNTS.get(policy.type)
     for name, feature in policy.image_features.items():
         if name in there and tuple(there[name].shape) != tuple(feature.shape):
             here, seen = (" x ".join(map(str, shape[1:])) for shape in (there[name].shape, feature.shape))
+            height, width = feature.shape[1:]
             also = "" if resizes is None else f", or with --policy.{resizes} for both"
             raise MemobenchError(
                 f"the policy {path} was trained on {name} of {seen} pixels and does not resize it, and the environment "
-                f"has {here}; train it on pictures of that size{also}"
+                f"has {here}; set env.observation_height={height} and env.observation_width={width}, or train it on "
+                f"pictures of that size{also}"
             )
 
 

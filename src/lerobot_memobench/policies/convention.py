@@ -117,10 +117,11 @@ def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
             "lerobot-eval runs every XVLA with the processors of LIBERO, which mirror a picture and convert actions; "
             f"run `lerobot eval env=memobench policy={path}`"
         )
-    found = chosen_convention(path, policy, _named("env.convention"), _named("rename_map"))
+    asked = _named("env.convention") or (MIRRORED if environment.camera_name_mapping else None)
+    found = chosen_convention(path, policy, asked, _named("rename_map"))
     if found not in (None, environment.convention):  # with the names of its pictures
-        named = {"features": policy_features(), "features_map": policy_names(), "convention": found}
-        vars(environment).update(vars(replace(environment, **named)))
+        names = {"features": policy_features(), "features_map": policy_names()}
+        vars(environment).update(vars(replace(environment, **names, convention=found)))
     return policy
 
 

@@ -35,6 +35,7 @@ from lerobot_memobench.protocol import (
     VALIDATION,
 )
 from lerobot_memobench.run.arguments import RUN_OPTIONS, Arguments, is_true, joined, split_arguments
+from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.tasks.libero_suites import NUM_STATES
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
@@ -159,7 +160,8 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     asked = with_device(with_policy(asked), options)
     policy = policy_of(asked)
     check_expert(policy, asked.env.get("suite", PUBLISHED))
-    convention = chosen_convention(asked.policy_path, policy, asked.env.get("convention"), asked.rename_map)
+    named = asked.env.get("convention") or (MIRRORED if asked.env.get("camera_name_mapping") else None)
+    convention = chosen_convention(asked.policy_path, policy, named, asked.rename_map)
     asked = asked if convention is None else replace(asked, env={**asked.env, "convention": convention})
     output = _output(asked, options, policy)
     log = Path(asked.env.get("log_dir") or output)

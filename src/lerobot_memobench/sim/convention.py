@@ -18,17 +18,30 @@ CONVENTIONS = {convention: {"image": "image", "wrist_image": wrist} for conventi
 """Convention -> camera -> name of its picture."""
 STATED = "trained_convention"
 """Key by which a policy server states the convention of its policy's training."""
+OTHER = {UPRIGHT: MIRRORED, MIRRORED: UPRIGHT}
+LIBERO_CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
+"""Camera -> its name in LIBERO, which LeRobot's ``camera_name_mapping`` maps to the name of its picture."""
 
 
-def shown(pictures: Mapping[str, NDArray[np.uint8]], convention: str) -> dict[str, NDArray[np.uint8]]:
+def picture_names(convention: str, mapping: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return camera -> name of its picture, by a convention and LeRobot's ``camera_name_mapping``."""
+    given = mapping or {}
+    return {camera: given.get(LIBERO_CAMERAS[camera], name) for camera, name in CONVENTIONS[convention].items()}
+
+
+def shown(
+    pictures: Mapping[str, NDArray[np.uint8]], convention: str, mapping: Mapping[str, str] | None = None
+) -> dict[str, NDArray[np.uint8]]:
     """Return each camera's upright picture (H, W, 3) by the name and in the orientation of a convention, as a copy."""
     step = -1 if convention == MIRRORED else 1
-    return {name: pictures[camera][:, ::step].copy() for camera, name in CONVENTIONS[convention].items()}
+    return {name: pictures[camera][:, ::step].copy() for camera, name in picture_names(convention, mapping).items()}
 
 
 def convention_of(features: Mapping[str, Any]) -> str | None:
     """Return the convention of a dataset's pictures by the description of its columns; None if it is unknown."""
     pictures = {name: one for name, one in features.items() if one.get("dtype") in ("video", "image")}
-    if "observation.images.image2" in pictures or any(one.get("convention") == MIRRORED for one in pictures.values()):
+    stated = {one.get("convention") for one in pictures.values()}
+    if "observation.images.image2" in pictures or MIRRORED in stated:
         return MIRRORED
-    return UPRIGHT if pictures and "checkpoint.index" in features else None  # a column of this package
+    ours = pictures and "checkpoint.index" in features  # a column of this package
+    return UPRIGHT if ours or UPRIGHT in stated else None

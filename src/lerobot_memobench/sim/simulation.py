@@ -405,6 +405,20 @@ class Simulation:
         position, rotation_vector = self.data.site_xpos[self._grip], axis_angle(self.data.xquat[self._hand])
         return np.concatenate([position, rotation_vector, self.data.qpos[self._finger_qpos]]).astype(np.float32)
 
+    def robot_state(self) -> dict[str, dict[str, Array]]:
+        """Return hand, fingers and joints as in LeRobot's ``libero``, float64.
+
+        ``eef``: ``pos`` (3,) and ``mat`` (3, 3) of the grip site, ``quat`` xyzw (4,) of the hand's body; ``gripper``:
+        ``qpos`` and ``qvel`` (2,); ``joints``: ``pos`` and ``vel`` (7,).
+        """
+        position, rotation = self.eef_pose()
+        qpos, qvel, fingers, arm = self.data.qpos, self.data.qvel, self._finger_qpos, self._arm_qpos
+        return {  # arm and fingers come first in the model, so that qvel has their places of qpos
+            "eef": {"pos": position, "quat": self.data.xquat[self._hand, [1, 2, 3, 0]], "mat": rotation},
+            "gripper": {"qpos": qpos[fingers], "qvel": qvel[fingers]},
+            "joints": {"pos": qpos[arm], "vel": qvel[arm]},
+        }
+
     def eef_pose(self) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of the grip site, between the finger tips."""
         return self.data.site_xpos[self._grip].copy(), self.data.site_xmat[self._grip].reshape(3, 3).copy()

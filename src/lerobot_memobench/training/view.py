@@ -2,8 +2,9 @@
 
 LeRobot trains on all frames, including those of demonstration prompts and holds, in which actions have no effect. It
 uses every column that begins with ``observation`` as an input: pictures, object state, phase and step. A view is a
-LeRobotDataset v3.0 with a part of the frames and columns; its videos are links to the dataset's. Each part of an
-episode between two holds is an episode of the view, so that chunks of actions and windows of inputs end at a hold.
+LeRobotDataset v3.0 with a part of the frames and columns; its videos are links to the dataset's, or mirrored copies for
+another convention of pictures. Each part of an episode between two holds is an episode of the view, so that chunks of
+actions and windows of inputs end at a hold.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +25,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.utils.constants import OBS_IMAGES
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from PIL import Image, ImageOps
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS
 from lerobot_memobench.datasets.frames import FrameTable, read_frame_table
@@ -33,20 +37,23 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     PRIVILEGED,
     STATS_FILE,
     TASKS_FILE,
+    image_key,
     read_info,
     undamaged,
     without_pattern,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.statistics import recorded
+from lerobot_memobench.datasets.video import mirror_video, video_info
 from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
 from lerobot_memobench.policies.checkpoint import trained_names
 from lerobot_memobench.policies.compatibility import keeps_sizes
-from lerobot_memobench.protocol import CLOCK, IMAGE_SIZE
+from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 from lerobot_memobench.run.arguments import LerobotArguments
+from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, OTHER, convention_of
 from lerobot_memobench.training.configuration import check_environment, read_config, with_features
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
@@ -63,10 +70,12 @@ class Choice:
     Attributes:
         prompts: whether the view has the frames of demonstration prompts and holds, and the clock.
         obs_type: `envs.observations.OBS_TYPES`; None: all observations.
+        convention: of the pictures (`sim.convention`); None: the dataset's.
     """
 
     prompts: bool = False
     obs_type: str | None = None
+    convention: str | None = None
 
     def columns(self, features: Mapping[str, Any]) -> dict[str, str]:
         """Return the view's columns: name in the dataset -> name in the view.
@@ -88,7 +97,28 @@ class Choice:
         if self.obs_type == PIXELS:
             dropped |= {OBJECTS_COLUMN}
         renamed = {PRIVILEGED: OBJECTS_COLUMN} if self.obs_type in (OBJECTS, BOTH) else {}
+        if self.mirrors(features):
+            old, new = (CONVENTIONS[one] for one in (OTHER[str(self.convention)], str(self.convention)))
+            renamed |= {image_key(old[camera]): image_key(new[camera]) for camera in CAMERAS}
         return {name: renamed.get(name, name) for name in features if name not in dropped}
+
+    def mirrors(self, features: Mapping[str, Any]) -> bool:
+        """Return whether the view's pictures are those of the dataset, mirrored left to right.
+
+        Raises:
+            MemobenchError: the view has no pictures, or the dataset's convention is unknown.
+        """
+        if self.convention is None:
+            return False
+        cameras, found = cameras_of(features), convention_of(features)
+        if not cameras or self.obs_type == OBJECTS:
+            raise MemobenchError(f"found convention={self.convention}, and the view has no pictures; leave it out")
+        if found is None:
+            raise MemobenchError(
+                f"found convention={self.convention}, and it is unknown whether {', '.join(cameras)} are upright or "
+                "mirrored; name a dataset of this package, or one of LIBERO with image and image2"
+            )
+        return found != self.convention
 
 
 # -- for a training ----------------------------------------------------------------------------------------------------
@@ -130,7 +160,7 @@ def viewed(
         height, width = sizes[0]
         notify(
             f"note: {meta.root} has pictures of {height} x {width} pixels, and policy={policy.type} does not resize "
-            f"them; it cannot be evaluated on the benchmark, which has {IMAGE_SIZE} x {IMAGE_SIZE}"
+            f"them; evaluate it with observation_height={height} observation_width={width}"
         )
     if given.streaming and not (Path(meta.root) / "data").is_dir():
         if needs_view(meta.features, choice):
@@ -210,7 +240,8 @@ def _is_ours(features: Mapping[str, Any]) -> bool:
 def needs_view(features: Mapping[str, Any], choice: Choice) -> bool:
     """Return whether a dataset differs from its view."""
     kept = choice.columns(features)
-    return (_is_ours(features) and not choice.prompts) or kept != {name: name for name in features}
+    shortened = _is_ours(features) and not choice.prompts
+    return shortened or choice.mirrors(features) or kept != {name: name for name in features}
 
 
 def described(choice: Choice) -> str:
@@ -239,7 +270,7 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
     if out.exists():
         raise MemobenchError(f"{out} exists already; name another folder, or delete it")
     info, table = read_info(root), read_frame_table(root)
-    kept = choice.columns(info["features"])
+    kept, mirrors = choice.columns(info["features"]), choice.mirrors(info["features"])
     part = Part.of(table, _is_ours(info["features"]) and not choice.prompts)
     if not part.starts.size:
         raise MemobenchError(f"{root} has no frame whose action has an effect; name a dataset of `memobench generate`")
@@ -248,13 +279,20 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
         shutil.rmtree(build, ignore_errors=True)
         for path in files_below(root / "data", ".parquet"):
             with undamaged(path):
-                rows = pq.read_table(path)
-            _write_table(_frames_of(rows, kept, part, info["fps"]), build / path.relative_to(root))
+                frames = _frames_of(pq.read_table(path), kept, part, info["fps"])
+                frames = _mirrored(frames) if mirrors else frames
+            _write_table(frames, build / path.relative_to(root))
         for path in files_below(root / EPISODES_FOLDER, ".parquet"):
             with undamaged(path):
                 rows = pq.read_table(path)
-            _write_table(_episodes_of(rows, part, info["fps"]), build / path.relative_to(root))
+            _write_table(_episodes_of(rows, kept, part, info["fps"]), build / path.relative_to(root))
         features = {new: info["features"][name] for name, new in kept.items()}
+        for name in cameras_of(info["features"]):
+            if name in kept:
+                _write_videos(root, build, name, kept[name], info["fps"] if mirrors else None)
+        for name in cameras_of(features) if mirrors else ():
+            stated = choice.convention if choice.convention == MIRRORED or not _is_ours(info["features"]) else None
+            features[name] = _described(features[name], build / "videos" / name, stated)
         count = len(part.starts)
         info |= {"features": features, "total_episodes": count, "total_frames": int(part.lengths.sum())}
         info["splits"] = {"train": f"0:{count}"}
@@ -262,9 +300,6 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
         stats = recorded(root)
         write_file(build / STATS_FILE, json.dumps({kept[name]: one for name, one in stats.items() if name in kept}))
         shutil.copyfile(root / TASKS_FILE, build / TASKS_FILE)
-        for camera in cameras_of(features):
-            for path in files_below(root / "videos" / camera, ".mp4"):
-                _link(path.resolve(), build / path.relative_to(root))
         build.rename(out)
 
 
@@ -323,7 +358,41 @@ def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
     return pa.ListArray.from_arrays(offsets, pa.StructArray.from_arrays(list(columns.values()), fields=list(rows.type)))
 
 
-def _episodes_of(rows: pa.Table, part: Part, fps: float) -> pa.Table:
+def _mirrored(frames: pa.Table) -> pa.Table:
+    """Return frames with LeRobot's images in them mirrored left to right, as PNG."""
+    for place, field in enumerate(frames.schema):
+        if field.name.startswith(OBS_IMAGES) and pa.types.is_struct(field.type):
+            rows = [{**row, "bytes": _mirrored_image(row["bytes"])} for row in frames.column(place).to_pylist()]
+            frames = frames.set_column(place, field, pa.array(rows, field.type))
+    return frames
+
+
+def _mirrored_image(content: bytes) -> bytes:
+    with Image.open(BytesIO(content)) as image, BytesIO() as file:
+        ImageOps.mirror(image).save(file, "PNG")
+        return file.getvalue()
+
+
+def _write_videos(root: Path, build: Path, name: str, new: str, mirrored_at: int | None) -> None:
+    """Write a camera's videos: links to the dataset's, or mirrored at so many frames/s."""
+    for path in files_below(root / "videos" / name, ".mp4"):
+        place = build / "videos" / new / path.relative_to(root / "videos" / name)
+        if mirrored_at is None:
+            _link(path.resolve(), place)
+        else:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            with undamaged(path):
+                mirror_video(path, place, mirrored_at)
+
+
+def _described(feature: dict[str, Any], videos: Path, stated: str | None) -> dict[str, Any]:
+    """Return LeRobot's description of a camera's mirrored pictures, which states their convention where needed."""
+    found = {key: one for key, one in feature.items() if key not in ("convention", "info")}
+    files = files_below(videos, ".mp4")
+    return found | ({"convention": stated} if stated else {}) | ({"info": video_info(files[0])} if files else {})
+
+
+def _episodes_of(rows: pa.Table, kept: Mapping[str, str], part: Part, fps: float) -> pa.Table:
     """Return the view's rows of a file of the episodes' table: numbers, bounds of frames, and times in the videos."""
     numbers = rows.column("episode_index").to_numpy()
     stretches = np.flatnonzero(np.isin(part.sources, numbers))
@@ -343,8 +412,10 @@ def _episodes_of(rows: pa.Table, part: Part, fps: float) -> pa.Table:
     rows = rows.append_column(SOURCE_EPISODE, rows.column("episode_index"))
     for name, values in changed.items():
         rows = rows.set_column(rows.column_names.index(name), name, pa.array(values, rows.schema.field(name).type))
-    kept = [name for name in rows.column_names if not name.startswith("stats/")]
-    return rows.select(kept).replace_schema_metadata(None)
+    rows = rows.select([name for name in rows.column_names if not name.startswith("stats/")])
+    parts = [name.split("/") for name in rows.column_names]  # videos/<camera>/<place>
+    names = ["/".join(kept.get(one, one) if at == 1 else one for at, one in enumerate(each)) for each in parts]
+    return rows.rename_columns(names).replace_schema_metadata(None)
 
 
 def _write_table(table: pa.Table, path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import OBS_STATE, OBS_STR
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,7 +20,7 @@ from lerobot_memobench.policies.baselines.modeling_baselines import UntrainedPol
 from lerobot_memobench.policies.compatibility import begins_episode, is_frozen
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.session import Row, Session
-from lerobot_memobench.protocol import ACTION_DIM, EXECUTION
+from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION
 
 Action = NDArray[np.float32]
 MOST_THREADS = 256
@@ -106,6 +106,7 @@ class RemotePolicy(UntrainedPolicy):
         super().__init__(config)
         self.config: RemoteConfig = config
         self._actors: list[Actor] = []
+        self._cameras = dict(zip(CAMERAS, config.image_features, strict=False))  # LeRobot's, in the environment's order
 
     def reset(self) -> None:
         """Begin a rollout. Connections stay open; a missing server is an error before any simulation."""
@@ -129,7 +130,7 @@ class RemotePolicy(UntrainedPolicy):
         Raises:
             MemobenchError: a server fails or does not return, or its memory cannot serve the batch.
         """
-        rows = _size(batch)
+        rows, batch = _size(batch), _flat(batch)
         limit = self.config.max_environments
         if limit is not None and rows > limit:
             raise MemobenchError(
@@ -138,12 +139,19 @@ class RemotePolicy(UntrainedPolicy):
             )
         while len(self._actors) < rows:
             self._add_actor()
-        jobs = [partial(actor.act, Row(batch, k)) for k, actor in enumerate(self._actors[:rows])]
+        jobs = [partial(actor.act, Row(batch, k, self._cameras)) for k, actor in enumerate(self._actors[:rows])]
         return torch.from_numpy(np.stack([job() for job in jobs] if rows == 1 else [*self._pool.map(call, jobs)]))
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(MOST_THREADS, "policy-server")
+
+
+def _flat(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a batch whose parts of ``robot_state`` have names with dots, such as ``robot_state.joints.pos``."""
+    nested = f"{OBS_STR}.robot_state"
+    parts = {f"{nested}.{group}.{key}": one for group, of in batch.get(nested, {}).items() for key, one in of.items()}
+    return {name: value for name, value in batch.items() if name != nested} | parts
 
 
 def _size(batch: Mapping[str, Any]) -> int:

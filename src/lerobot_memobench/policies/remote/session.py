@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -219,10 +219,14 @@ def _wrong(address: str, found: str) -> MemobenchError:
 
 @dataclass(frozen=True)
 class Row:
-    """One environment's row of a batch; values are copied on access."""
+    """One environment's row of a batch; values are copied on access.
+
+    ``cameras``: our name of a camera -> name of its picture in the batch, where ``camera_name_mapping`` changes it.
+    """
 
     batch: Mapping[str, Any]
     number: int
+    cameras: Mapping[str, str] = field(default_factory=dict)
 
     def scalar(self, name: str) -> int | None:
         """Return an observation that is one integer, None if the environment has no such observation."""
@@ -245,7 +249,7 @@ class Row:
         if name == TASK:
             return str(self.batch[TASK][self.number])
         pictures = [f"{OBS_IMAGES}.{names.get(name, name)}" for names in CONVENTIONS.values()]
-        for key in (*pictures, OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
+        for key in (self.cameras.get(name, ""), *pictures, OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
             if key in self.batch:
                 value = self.batch[key][self.number]
                 return to_image(value) if OBS_IMAGES in key else value.float().cpu().reshape(-1).numpy()
