@@ -111,14 +111,15 @@ def cameras_read(policy: Any, trained: Mapping[str, Any]) -> list[str]:
     """Return the cameras that a policy needs.
 
     A policy that fills missing pictures may list cameras of the checkpoint that its training began with; it needs those
-    of its training data, which its statistics name.
+    of its training data, which its statistics name. Without such names, LeRobot's ``policy.empty_cameras`` fills the
+    last ones.
     """
     cameras = list(policy.image_features)
     if not hasattr(policy, "empty_cameras"):
         return cameras
-    return [name for name in cameras if name in trained] or [
-        name for name in cameras if not name.startswith(EMPTY_CAMERA)
-    ]
+    named = [name for name in cameras if not name.startswith(EMPTY_CAMERA)]
+    filled = max(0, policy.empty_cameras - (len(cameras) - len(named)))
+    return [name for name in cameras if name in trained] or named[: max(1, len(named) - filled)]
 
 
 def _check_cameras(
