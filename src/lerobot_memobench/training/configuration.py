@@ -155,7 +155,7 @@ def check_convention(config: TrainPipelineConfig, meta: Any, features: dict[str,
     if found not in (None, stated):
         raise MemobenchError(
             f"the policy {policy.pretrained_path} was trained on pictures of convention={found} ({why}), and "
-            f"{meta.root} has convention={stated}; turn them: `memobench view {meta.root} --convention {found} --out "
+            f"{meta.root} has convention={stated}; mirror them: `memobench view {meta.root} --convention {found} --out "
             "<folder>`"
         )
 
