@@ -115,14 +115,18 @@ def test_refusals_are_one_sentence(
     assert not fake_loop.ran
 
 
-def test_a_checkpoint_of_upright_pictures_is_refused(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+def test_checkpoints_run_on_the_pictures_of_their_training(
+    fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]
+) -> None:
     picture = {"type": "VISUAL", "shape": [3, 256, 256]}
-    make_checkpoint(
-        Path("upright"),
-        "act",
-        input_features={f"observation.images.{name}": picture for name in ("image", "wrist_image")},
-    )
-    found = error(capsys, "suite=libero_object", "policy=./upright")
+    state, action = {"type": "STATE", "shape": [8]}, {"type": "ACTION", "shape": [7]}
+    for name, wrist in (("upright", "wrist_image"), ("mirrored", "image2")):
+        pictures = {f"observation.images.{camera}": picture for camera in ("image", wrist)}
+        features = {"input_features": {**pictures, "observation.state": state}, "output_features": {"action": action}}
+        make_checkpoint(Path(name), "act", **features)
+    for name, convention in (("mirrored", "libero"), ("upright", "upright")):
+        assert plan_line([*LINE[:1], *LINE[2:], f"policy=./{name}"]).environment.convention == convention
+    found = error(capsys, "suite=libero_object", "convention=libero", "policy=./upright")
     assert "expects pictures of convention=upright" in found
     assert "and found libero" in found
 
