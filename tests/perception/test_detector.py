@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector, detections
-from lerobot_memobench.perception.visual_encoder import GRID, SIDE
+from lerobot_memobench.perception.visual_encoder import GRID, SIDE, resized
 from lerobot_memobench.perception.weights import load_detector, save_detector
 from research.detector.training import targets
 from tests.support.labelled_images import (
@@ -72,3 +72,9 @@ def test_uncertainties_are_of_the_image_and_of_metres() -> None:
     assert not detections(output)[0]["uncertainty"].any()
     for things in detections(replace(output, uncertainty=laid_out(uncertainty))):
         assert things["uncertainty"] == pytest.approx(np.tile([0.01, 0.01, 0.02], (KINDS, 1)), rel=1e-4)
+
+
+def test_pictures_are_square() -> None:
+    assert resized(torch.zeros(1, 3, 360, 360)).shape == (1, 3, SIDE, SIDE)
+    with pytest.raises(MemobenchError, match="found pictures of 320 x 256 pixels"):
+        resized(torch.zeros(1, 3, 320, SIDE))

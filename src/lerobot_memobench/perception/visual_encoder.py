@@ -8,6 +8,8 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from lerobot_memobench.errors import MemobenchError
+
 SIDE = 256
 """Side of the encoder's images, pixels: the benchmark's own."""
 GRID, POOLED = 8, 4
@@ -19,7 +21,17 @@ WIDTHS, BLOCKS = (16, 24, 48, 96, WIDTH), (0, 0, 2, 3, 1)
 
 
 def resized(images: Tensor) -> Tensor:
-    """Return square images (N, 3, H, H) at the encoder's size, float (N, 3, SIDE, SIDE), by area averaging."""
+    """Return square images (N, 3, H, H) at the encoder's size, float (N, 3, SIDE, SIDE), by area averaging.
+
+    Raises:
+        MemobenchError: the images are not square.
+    """
+    height, width = images.shape[-2:]
+    if height != width:
+        raise MemobenchError(
+            f"found pictures of {height} x {width} pixels, and the visual encoder and the detector read square ones; "
+            "set observation_height and observation_width to one number"
+        )
     images = images.to(torch.float32)
     return images if images.shape[-1] == SIDE else interpolate(images, (SIDE, SIDE), mode="area")
 

@@ -159,8 +159,6 @@ def _length(policy: Any, name: str, feature: PolicyFeature | None, trained: Mapp
 
 def keeps_sizes(policy: PreTrainedConfig) -> bool:
     """Return whether a policy reads pictures in the size of its training data alone."""
-    if getattr(policy, "uses_detector", False):  # which measures places in them
-        return True
     resizes = SIZE_COUNTS.get(policy.type)
     return policy.type in SIZE_COUNTS and (resizes is None or getattr(policy, resizes) is None)
 
@@ -168,7 +166,7 @@ def keeps_sizes(policy: PreTrainedConfig) -> bool:
 def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, PolicyFeature]) -> None:
     if not keeps_sizes(policy):
         return
-    resizes = SIZE_COUNTS.get(policy.type)
+    resizes = SIZE_COUNTS[policy.type]
     for name, feature in policy.image_features.items():
         if name in there and tuple(there[name].shape) != tuple(feature.shape):
             here, seen = (" x ".join(map(str, shape[1:])) for shape in (there[name].shape, feature.shape))
