@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.errors import MemobenchError
@@ -115,6 +116,8 @@ LARGEST_FIGURE = 400_000
 """Bytes: the figure of the documentation is kept in the repository."""
 
 CAMERAS = ("third person", "wrist")
+TITLE_WIDTH = 92
+"""Largest number of characters in a line of a title."""
 
 
 def pairs_figure(out: Path, results: Sequence[Result]) -> bytes | None:
@@ -159,7 +162,8 @@ def _drawn(shown: Sequence[tuple[Result, Strip]]) -> Figure:
     plot = Figure(figsize=(8.4, 2.75 * len(shown)), layout="constrained")
     for row, (result, strip) in zip(plot.subfigures(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
         pair, side = result["examples"][0], strip.height
-        row.suptitle(get_task(result["task"]).title, fontsize=11, fontweight="bold", x=0.01, ha="left")
+        title = fill(get_task(result["task"]).title, TITLE_WIDTH)
+        row.suptitle(title, fontsize=11, fontweight="bold", x=0.01, ha="left")
         axes = row.subplots(1, 4)
         for k, axis in enumerate(axes):
             axis.imshow(strip.crop((k * side, 0, (k + 1) * side, side)))

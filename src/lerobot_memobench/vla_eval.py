@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig, check_loop
+from lerobot_memobench.envs.configuration_memobench import UNKNOWN_PLAN, MemobenchEnvConfig, check_loop
 from lerobot_memobench.envs.episode_log import Acting
 from lerobot_memobench.envs.evaluation_file import check_protocol
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
@@ -28,7 +28,7 @@ from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PRO
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.libero_suites import NUM_STATES
-from lerobot_memobench.tasks.task import LIBERO_SUITES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 try:
     from vla_eval.benchmarks.base import StepBenchmark, StepResult
@@ -54,7 +54,6 @@ STATES, STATE_HISTORY, STEP = "states", "state_history", "step"
 SUCCESS, STEPS_KEY = "success", "n_action_steps"
 DECIDED = {
     "seed_base": "seed",
-    "replan_steps": STEPS_KEY,
     "prompt_in": "send_video_history",
     "obs_type": "send_state and send_wrist_image",
     "mirror": "convention to libero",  # an argument of earlier versions
@@ -81,7 +80,9 @@ class MEMOBench(StepBenchmark):
         tasks: `all`, memory types, task names or numbers, separated by commas or as a list.
         seed: seed of episode 0.
         history_every: interval of the sent frames of the prompt, control steps.
-        n_action_steps: actions executed per answer, open-loop. A pause starts and ends between two answers.
+        n_action_steps: actions executed per answer, open-loop.
+        replan_steps: actions per plan of the server, which may answer one action and queue the rest (its
+            ``chunk_size``); default ``n_action_steps``. Strict tasks need it, because holds are longer than a plan.
         send_wrist_image: whether the wrist camera is sent. The harness sets this, the next two arguments and
             ``trained_convention`` from the hello message of a model server.
         send_state: whether the arm's state is sent.
@@ -109,6 +110,7 @@ class MEMOBench(StepBenchmark):
         seed: int = EVALUATION_SEED,
         history_every: int = 1,
         n_action_steps: int = 1,
+        replan_steps: int | None = None,
         send_wrist_image: bool = True,
         send_state: bool = True,
         send_video_history: bool = True,
@@ -137,12 +139,14 @@ class MEMOBench(StepBenchmark):
                     f"the model server expects pictures of convention={trained_convention}, and found convention="
                     f"{asked}; leave it out"
                 )
-        prompt_in = STEPS if send_video_history else RESET
+        planned, prompt_in = replan_steps or n_action_steps, STEPS if send_video_history else RESET
         for name in DECIDED.keys() & settings.keys():
             raise MemobenchError(f"{name} is {settings[name]!r}, but follows from other arguments; set {DECIDED[name]}")
-        self._settings = EnvSettings().changed(
-            **settings, seed_base=seed, replan_steps=n_action_steps, prompt_in=prompt_in
-        )
+        self._settings = EnvSettings().changed(**settings, seed_base=seed, replan_steps=planned, prompt_in=prompt_in)
+        if self._settings.suite == STRICT and replan_steps is None and n_action_steps == 1:
+            raise MemobenchError(UNKNOWN_PLAN.format("replan_steps"))
+        if planned % n_action_steps:
+            raise MemobenchError(f"replan_steps is {planned}; expected a multiple of {STEPS_KEY}={n_action_steps}")
         check_loop(self._settings)
         chosen = str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks))
         selected = MemobenchEnvConfig(tasks=chosen, **asdict(self._settings)).selected()

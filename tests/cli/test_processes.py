@@ -45,7 +45,7 @@ from lerobot.envs.configs import EnvConfig
 assert "memobench" in EnvConfig.get_known_choices()
 policies = {"memobench_mem", "memobench_expert", "memobench_random", "memobench_remote"}
 assert policies <= set(PreTrainedConfig.get_known_choices())
-found = {"mujoco", "robosuite"} & set(sys.modules) | {n for n in sys.modules if "memobench" in n and "modeling" in n}
+found = {"mujoco"} & set(sys.modules) | {n for n in sys.modules if "memobench" in n and "modeling" in n}
 assert not found, found
 """
 

@@ -1,7 +1,8 @@
 """Strict scenes keep no trace, bit for bit, of past events, of hidden objects and of the variant.
 
 - After an event, with the hand at home, the observation equals that of the first execution frame.
-- The first execution frame is the same for all variants of a seed.
+- The first execution frame is the same for all variants of a seed, and so are all others until a drawer that hides
+  something opens.
 """
 
 from __future__ import annotations
@@ -13,18 +14,20 @@ import pytest
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs import episode as episode_module
+from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.hand import Hand
 from lerobot_memobench.experts.travel import come_home
-from lerobot_memobench.protocol import NO_CLOCK
+from lerobot_memobench.protocol import NO_CLOCK, PROMPT
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
+from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import STRICT, Task
 
 ARM = 9
 """Number of positions, and of velocities, of arm and fingers; they come first in the state."""
@@ -158,6 +161,41 @@ def test_first_execution_frame_is_the_same_for_all_variants(
             np.testing.assert_array_equal(value, first[part], err_msg=f"{part} of variant {env.episode.task}")
         if name == HIDING:
             check_hiding(env.episode.sim)
+
+
+STROKES, STROKE_STEPS = 6, 10
+"""Random displacements of a motion, and control steps for which each lasts, so that the hand meets things."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.usefixtures("short_holds")
+@pytest.mark.parametrize("name", task_names(suite=STRICT))
+def test_variants_are_the_same_under_random_actions_until_a_hiding_drawer_opens(name: str) -> None:
+    """Physics, object slots and pictures, bit for bit."""
+    task = get_task(name)
+    prompts = [task.variant(variant).prompt for variant in range(task.num_variants)]
+    hiding = {drawer for prompt in prompts if prompt is not None for _, drawer in prompt.places}
+    strokes = np.random.default_rng(20_003).uniform(-1, 1, (STROKES, 7)).astype(np.float32)
+    strokes[0, 2] = -1  # down to the things
+    episode = Episode(task, suite=STRICT, render=RenderSettings(64, 64))
+    first: list[dict[str, NDArray[np.generic]]] = []
+    for variant in range(task.num_variants):
+        episode.reset(20_003, variant)
+        while episode.phase == PROMPT:
+            episode.step(np.zeros(7, np.float32))
+        sim, frames = episode.sim, []
+        for action in np.repeat(strokes, STROKE_STEPS, axis=0):
+            if any(sim.holds(Atom("ajar", (drawer,))) for drawer in hiding):
+                break
+            frames.append({**episode.images(), "state": sim.state()[1:], "slots": episode.objects()})  # without time
+            episode.step(action)
+        first = first or frames
+        assert len(frames) == len(first) > STROKE_STEPS
+        assert not np.array_equal(frames[0]["state"], frames[-1]["state"])
+        for step, (now, before) in enumerate(zip(frames, first, strict=True)):
+            for part, value in now.items():
+                np.testing.assert_array_equal(value, before[part], err_msg=f"{part}, {variant=}, {step=}")
 
 
 def check_hiding(sim: Simulation) -> None:

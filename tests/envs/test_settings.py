@@ -11,8 +11,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
+import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import differences
@@ -137,10 +139,51 @@ def test_plans_longer_than_declared_are_refused(declared: int) -> None:
         MemobenchEnvConfig(replan_steps=declared).settings_for(SimpleNamespace(n_action_steps=400))
 
 
-@pytest.mark.parametrize(("policy", "executed"), [("vqbet", 5), ("tdmpc", 2), ("act", 100)])
-def test_executed_actions_of_lerobots_policies(policy: str, executed: int) -> None:
-    config = make_policy_config(policy, device="cpu")
-    assert MemobenchEnvConfig().settings_for(config).replan_steps == executed
+PLANS = {
+    **dict.fromkeys(["evo1", "pi0", "pi05", "pi0_fast", "smolvla", "memobench_mem"], (50, 1)),
+    **dict.fromkeys(["fastwam", "wall_x", "xvla"], (32, 1)),
+    **{
+        "act": (100, 1),
+        "eo1": (8, 1),
+        "groot": (40, 1),
+        "lingbot_va": (16, 1),
+        "molmoact2": (30, 1),
+        "vla_jepa": (7, 1),
+    },
+    **{"diffusion": (32, 2), "multi_task_dit": (24, 2), "tdmpc": (2, 1), "vqbet": (5, 5), "memobench_remote": (5, 1)},
+    **dict.fromkeys(["gaussian_actor", "memobench_expert", "memobench_blind", "memobench_random"], (None, 1)),
+}
+"""Policy -> executed actions and observed steps of a plan under default settings, read in LeRobot 0.6.1: lengths of the
+queues that `select_action` fills. None: it plans at every step."""
+
+
+KNOWN = [name for name, each in PreTrainedConfig.get_known_choices().items() if each.__module__.startswith("lerobot")]
+
+
+@pytest.mark.parametrize("policy", sorted({*KNOWN, *PLANS}))
+def test_plans_of_all_policies(policy: str) -> None:
+    own = {"vlm_config": {}} if policy == "eo1" else {}  # by default it reads the hub
+    settings = MemobenchEnvConfig(suite=STRICT).settings_for(make_policy_config(policy, device="cpu", **own))
+    assert (settings.replan_steps, settings.window_steps) == PLANS[policy]
+
+
+def test_groot_executes_what_its_base_model_decodes(tmp_path: Path) -> None:
+    """LeRobot's policy shortens 40 actions to 8 for NVIDIA's LIBERO model; a hold must end with those plans."""
+    action = {"action": {"delta_indices": [*range(16)]}}
+    processor = {"processor_kwargs": {"modality_configs": {"libero_sim": action}}}
+    (tmp_path / "processor_config.json").write_text(json.dumps(processor))
+    groot = make_policy_config("groot", device="cpu", base_model_path=str(tmp_path), embodiment_tag="libero_sim")
+    assert MemobenchEnvConfig(suite=STRICT).settings_for(groot).replan_steps == 8
+
+
+def test_strict_tasks_need_a_known_plan() -> None:
+    """A server of vla-evaluation-harness queues its own plan, and a script opens environments without a policy."""
+    queueing = make_policy_config("memobench_remote", dialect="vla_eval", device="cpu")
+    for policy in (queueing, None):
+        with pytest.raises(MemobenchError, match=r"set env\.replan_steps"):
+            MemobenchEnvConfig(suite=STRICT).settings_for(policy)
+        assert MemobenchEnvConfig(suite=STRICT, replan_steps=8).settings_for(policy).replan_steps == 8
+        assert MemobenchEnvConfig().settings_for(policy).replan_steps == (None if policy is None else 1)
 
 
 def test_averaged_plans_count_as_observed_steps() -> None:

@@ -142,7 +142,7 @@ Make = Callable[..., MEMOBench]
 
 
 def test_frames_at_rest_after_a_prompt_are_not_sent(benchmarks: Make) -> None:
-    first, _ = played(benchmarks(HIGHLIGHT, suite="strict", horizon=1, seed=20_000))
+    first, _ = played(benchmarks(HIGHLIGHT, suite="strict", replan_steps=1, horizon=1, seed=20_000))
     assert first["step"].tolist() == [NO_CLOCK]
     assert len(first["video_history"]) == len(first["state_history"]) == 66, "the highlight only"
     assert not np.array_equal(first["video_history"][30], first["images"]["agentview"])
@@ -179,7 +179,7 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
     held = plain.get_hold_action({"actions": np.full((2, 7), 0.5)})["actions"]
     assert held.tolist() == [0] * 6 + [0.5]
     assert len(MEMOBench().get_tasks()) == 30
-    assert {task["suite"] for task in MEMOBench("object", suite="strict").get_tasks()} == {"object"}
+    assert {task["suite"] for task in MEMOBench("object", suite="strict", n_action_steps=8).get_tasks()} == {"object"}
     assert MEMOBench(horizon=9).get_metadata()["max_steps"] == 9
 
 
@@ -193,6 +193,8 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
         ({"obs_type": "both"}, "send_state"),
         ({"mirror": True}, "convention to libero"),
         ({"evidence": True}, "referent"),
+        ({"suite": "strict"}, "set replan_steps"),
+        ({"n_action_steps": 4, "replan_steps": 6}, "multiple of n_action_steps=4"),
     ],
 )
 def test_wrong_settings_are_named(params: dict[str, Any], named: str) -> None:

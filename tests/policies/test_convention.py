@@ -219,7 +219,23 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
         envs(unclear)
     assert _executed(envs(theirs, "--env.convention=libero", convention="libero")) == 100
     assert envs(unclear, "--env.convention=upright")
-    assert _executed(envs(theirs, command="lerobot-train")) is None, "a training may continue from any checkpoint"
+
+
+@pytest.mark.parametrize(("policy", "executed"), [("--policy.type=act", 100), ("--policy.type=vqbet", 5), ("", 100)])
+def test_lerobots_commands_evaluate_with_the_plans_of_their_policies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str, executed: int
+) -> None:
+    """A training may continue from any checkpoint."""
+    flags = ["--dataset.repo_id=local/demos", policy or f"--policy.path={saved(tmp_path, THEIRS)}"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags, "--env.type=memobench"])
+    strict = MemobenchEnvConfig(tasks="10", suite="strict", log_dir=str(tmp_path / "log"))
+    assert _executed(strict.create_envs(1)) == executed
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--policy.type=memobench_expert", "--env.type=memobench"])
+    assert _executed(MemobenchEnvConfig(suite="strict", tasks="10").create_envs(1)) == 1
+    file = tmp_path / "train_config.json"
+    file.write_text(json.dumps({"dataset": {"repo_id": "local/demos"}, "policy": {"type": "vqbet"}}))
+    monkeypatch.setattr(sys, "argv", ["lerobot_train.py", f"--config_path={file}"])
+    assert _executed(MemobenchEnvConfig(suite="strict", tasks="10").create_envs(1)) == 5
 
 
 def _shown(suites: Any) -> set[str]:

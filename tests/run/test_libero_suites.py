@@ -100,7 +100,7 @@ def test_published_settings_are_as_before(fake_loop: FakeLoop) -> None:
         (["suite=libero_object", "policy=memobench_random", "protocol=upstream"], "requires protocol=paper"),
         (["suite=libero_object", "policy=memobench_random", "referent=random"], "requires referent=fixed"),
         (["suite=libero_object", "policy=memobench_random", "evidence=true"], "requires evidence=false"),
-        (["suite=libero_object", "policy=memobench_random", "difficulty=hard"], "difficulty=hard is for strict tasks"),
+        (["suite=libero_object", "policy=memobench_random", "difficulty=hard"], "requires difficulty=standard"),
         (["suite=libero_object", "policy=memobench_random", "interference=1"], "requires interference=0"),
         (["suite=libero_object", "policy=memobench_random", "reshow=true"], "requires reshow=false"),
         (["suite=libero_object", "policy=memobench_random", "env.oracle_memory=true"], "requires oracle_memory=false"),

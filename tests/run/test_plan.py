@@ -29,7 +29,7 @@ from lerobot_memobench.run.plan import (
     take_run_options,
 )
 from lerobot_memobench.run.settings import EvaluationSettings
-from lerobot_memobench.sim import robot
+from lerobot_memobench.sim.libero import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
 
 BARE = ["env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4"]
@@ -171,9 +171,9 @@ def test_bad_settings_are_refused_before_anything_is_written(words: list[str], n
     assert not any(Path().iterdir())
 
 
-def test_without_the_arm_nothing_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot, "ROBOSUITE", "1.4.2")
-    with pytest.raises(MemobenchError, match="robosuite"):
+def test_without_the_assets_nothing_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "places", lambda: [])
+    with pytest.raises(MemobenchError, match="LIBERO's assets"):
         plan_line([*LINE, "output_dir=out"])
 
 

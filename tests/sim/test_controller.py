@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
+import hashlib
 import sys
 import threading
 from collections.abc import Callable
-from importlib import metadata
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -18,7 +16,6 @@ from numba.core import caching
 
 import lerobot_memobench.sim
 from lerobot_memobench.envs.episode import PROMPT, Episode
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import controller as control
 from lerobot_memobench.sim import osc_kernel, robot
 from lerobot_memobench.sim.controller import CompiledController, OSCController
@@ -264,35 +261,23 @@ def test_scarce_memory_uses_numpy(times: float, ways: list[str], monkeypatch: py
     assert taken == ways
 
 
-# --- another robosuite ---
+# --- the carried arm ---
+
+CARRIED = "e36735ac29316c701c722f5d41b46efc854356d1fdbc46ce611cbd1f02a5262b"
+"""Hash of the names and contents that scripts/robosuite_arm.py writes."""
 
 
-@pytest.mark.parametrize("found", [None, "1.4.0"])
-def test_another_robosuite_names_the_install_command(monkeypatch: pytest.MonkeyPatch, found: str | None) -> None:
-    def version(name: str) -> str:
-        if found is None:
-            raise metadata.PackageNotFoundError(name)
-        return found
-
-    robot.robot_xml.cache_clear()
-    monkeypatch.setattr(metadata, "version", version)
-    with pytest.raises(MemobenchError, match=r"run: pip install --no-deps robosuite==1\.4\.1$"):
-        robot.robot_xml()
+def test_the_arm_is_the_one_of_robosuite() -> None:
+    digest = hashlib.sha256()
+    for path in sorted(robot.FOLDER.iterdir()):
+        digest.update(path.name.encode() + path.read_bytes())
+    assert digest.hexdigest() == CARRIED
+    base = mujoco.MjModel.from_xml_string(robot.robot_xml()).body("robot0_base").pos
+    assert tuple(base[:2]) == robot.BASE_POSITION[:2]
 
 
-def test_the_cached_arm_is_of_this_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The file holds absolute paths of meshes, and environments of one machine share the folder of caches."""
-    here = robot._cache_file()
-    elsewhere = SimpleNamespace(submodule_search_locations=["/elsewhere/robosuite"])
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: elsewhere)
-    assert robot._cache_file() != here
-
-
-def test_a_modified_arm_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    xml = robot._robosuite_xml()
-    robot.robot_xml.cache_clear()
-    monkeypatch.setattr(robot, "cache_folder", lambda: tmp_path)
-    assert robot.arm_hash(xml) == robot.ARM_SHA256
-    monkeypatch.setattr(robot, "_robosuite_xml", lambda: xml.replace('mass="', 'mass="1', 1))
-    with pytest.raises(MemobenchError, match="not those of robosuite"):
-        robot.robot_xml()
+def test_the_arm_is_read_from_any_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder = tmp_path / 'R&D "1"'
+    folder.symlink_to(robot.FOLDER)
+    monkeypatch.setattr(robot, "FOLDER", folder)
+    assert mujoco.MjModel.from_xml_string(robot.robot_xml.__wrapped__()).nmesh > 60

@@ -17,6 +17,7 @@ from lerobot.policies.factory import make_policy_config
 from lerobot.scripts import lerobot_train
 from torch.utils.data import DataLoader
 
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.training import command, samples
 from lerobot_memobench.training.samples import keep_in_memory, open_datasets
 
@@ -74,3 +75,16 @@ def test_lerobots_trainer_opens_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lerobot_train, "main", lambda: None)
     samples.main()
     assert lerobot_train.make_train_eval_datasets is open_datasets
+
+
+@pytest.mark.parametrize(("policy", "plan"), [("vqbet", (5, 5)), ("gaussian_actor", (1, 1))])
+def test_environments_of_a_training_get_the_plans_of_its_policy(
+    monkeypatch: pytest.MonkeyPatch, policy: str, plan: tuple[int, int]
+) -> None:
+    """LeRobot's trainer opens them without the policy, and holds of strict tasks depend on its plans."""
+    dataset = SimpleNamespace(meta=SimpleNamespace(camera_keys=["observation.images.image"]))
+    monkeypatch.setattr(samples, "make_train_eval_datasets", lambda config: (dataset, None))
+    environment = MemobenchEnvConfig(suite="strict")
+    config = make_policy_config(policy, device="cpu", push_to_hub=False)
+    open_datasets(TrainPipelineConfig(DatasetConfig("local/data"), env=environment, policy=config))
+    assert (environment.replan_steps, environment.window_steps) == plan

@@ -23,7 +23,6 @@ from lerobot_memobench.io import cache_base
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, OBTAIN, places, unused, usable
-from lerobot_memobench.sim.robot import INSTALL_ROBOSUITE, ROBOSUITE
 
 DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"
 PLUGIN = "LeRobot plugin"
@@ -31,7 +30,7 @@ RUN_WITH = "0.6.1"
 """The version of LeRobot with which all tests of this version ran."""
 
 #: Packages checked against the requirements of this project and of LeRobot.
-SHOWN = ("lerobot", "torch", "transformers", "mujoco", "robosuite", "numpy", "gymnasium", "torchcodec", "av")
+SHOWN = ("lerobot", "torch", "transformers", "mujoco", "numpy", "gymnasium", "torchcodec", "av")
 
 EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av-dep")
 """Extras of LeRobot that this project installs."""
@@ -103,8 +102,7 @@ def package_versions() -> Iterator[Finding]:
         wanted = requirements.get(name, SpecifierSet())
         if found is None or not wanted.contains(found, prereleases=True):
             detail = "not installed" if found is None else f"{found}; supported is {wanted}"
-            fix = INSTALL_ROBOSUITE if name == "robosuite" else f'pip install "{name}{wanted}"'
-            yield Finding(name, "failed", detail, fix)
+            yield Finding(name, "failed", detail, f'pip install "{name}{wanted}"')
         elif name == "lerobot" and found != RUN_WITH:
             detail = f"{found}, with which this version was not tested; it was with {RUN_WITH}"
             yield Finding(name, "warning", detail, f'pip install "lerobot=={RUN_WITH}" if a command fails')
@@ -125,7 +123,7 @@ def physics() -> Finding:
 
 def supported_versions() -> dict[str, SpecifierSet]:
     """Return package -> versions that both this project and LeRobot accept."""
-    found = {"robosuite": SpecifierSet(f"=={ROBOSUITE}")}
+    found: dict[str, SpecifierSet] = {}
     for owner in ("lerobot", DISTRIBUTION):
         for requirement in _requirements(owner):
             name = requirement.name.lower().replace("_", "-")

@@ -53,6 +53,11 @@ Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
 
 EXECUTED = ("n_action_steps", "n_action_repeats", "action_chunk_size")
 """Fields of LeRobot's policies with the actions executed per plan: of most, of TD-MPC (its larger one), of VQ-BeT."""
+UNKNOWN_PLAN = (
+    "a strict task holds the scene for longer than a plan, and the number of actions that the policy executes per plan "
+    "is unknown here; set {}, to 1 for a policy that plans at every step"
+)
+"""Message of a refusal, without the setting's name."""
 
 _TYPES = typing.get_type_hints(EnvSettings)
 # LeRobot reads `--env.<name>` into fields of the configuration itself.
@@ -169,10 +174,7 @@ class MemobenchEnvConfig(_WithSettings):
         self._number_as_lerobot()
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
-        policy = type(self).check_policy(self)
-        if policy is not None:  # its plans; the rest is the user's
-            planned = self.settings_for(policy)
-            self.replan_steps, self.window_steps = planned.replan_steps, planned.window_steps
+        self.declare_plans(type(self).check_policy(self))
         opened = self.opener(None, UNKNOWN_POLICY, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
@@ -208,22 +210,34 @@ class MemobenchEnvConfig(_WithSettings):
                 f"most {NUM_STATES}"
             )
 
+    def declare_plans(self, policy: Any) -> None:
+        """Set the actions and frames of a plan from a policy's configuration; the rest is the user's.
+
+        LeRobot's trainer opens environments without the policy. Errors as of `settings_for`.
+        """
+        planned = self.settings_for(policy)
+        known = 1 if policy is not None and self.suite == STRICT else None  # it plans at every step
+        self.replan_steps, self.window_steps = planned.replan_steps or known, planned.window_steps
+
     def settings_for(self, policy: Any) -> EnvSettings:
         """Return the settings with defaults that follow from a policy's configuration (None if unknown).
 
         Raises:
-            MemobenchError: ``replan_steps`` is no multiple of the actions that the policy executes per plan.
+            MemobenchError: ``replan_steps`` is no multiple of the actions that the policy executes per plan, or these
+                are unknown in strict tasks.
         """
         settings = self.settings
         if settings.prompt_in == AUTO:
             settings = settings.changed(prompt_in=STEPS if policy is None else prompt_in(policy))
-        executed = max(getattr(policy, name, None) or 0 for name in EXECUTED)
+        executed = executed_actions(policy)
         if settings.replan_steps is None:
+            if self.suite == STRICT and (policy is None or getattr(policy, "plans_unseen", False)):
+                raise MemobenchError(UNKNOWN_PLAN.format("env.replan_steps"))
             settings = settings.changed(replan_steps=executed or None)
         elif executed and settings.replan_steps % executed:  # a hold must be longer than a plan, and end with one
             raise MemobenchError(
                 f"env.replan_steps is {settings.replan_steps}, but the policy executes {executed} actions per plan; "
-                f"leave env.replan_steps out, or change the policy by replan={settings.replan_steps}"
+                f"leave env.replan_steps out, or set both by replan={settings.replan_steps}"
             )
         observed = getattr(policy, "n_obs_steps", 1)  # a hold must be longer than the policy's input
         if getattr(policy, "temporal_ensemble_coeff", None) is not None:  # ACT averages the plans of so many steps
@@ -268,6 +282,19 @@ class MemobenchEnvConfig(_WithSettings):
         if self.resume or not has_log(folder):
             return folder
         return next(place for k in count(2) if not (place := folder / f"evaluation-{k}").exists())
+
+
+def executed_actions(policy: Any) -> int:
+    """Return the number of actions that a policy of this configuration executes per plan; 0 if it states none."""
+    stated = max(getattr(policy, name, None) or 0 for name in EXECUTED)
+    if getattr(policy, "type", None) != "groot":
+        return stated
+    from lerobot.policies.groot.configuration_groot import infer_groot_n1_7_action_execution_horizon
+
+    # GR00T executes no more actions than its base model was made for.
+    return min(
+        stated, infer_groot_n1_7_action_execution_horizon(policy.base_model_path, policy.embodiment_tag) or stated
+    )
 
 
 def check_loop(settings: EnvSettings) -> None:

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 VARIABLE = "MEMOBENCH_PROMPT_CACHE"
 LARGEST = 2 << 30
 """Maximum bytes of all files: several thousand prompts of 0.2 to 0.7 MB. The least recently used ones are removed."""
-PACKAGES = ("mujoco", "numpy", "scipy", "robosuite")
+PACKAGES = ("mujoco", "numpy", "scipy")
 SOURCES = ("tasks", "sim", "experts", "envs")
 
 

@@ -174,6 +174,8 @@ class EnvSettings:
                 f"control_mode is {self.control_mode!r}, and actions of this environment are displacements; leave "
                 f"control_mode out, and evaluate a policy of control_mode={RELATIVE}"
             )
+        if self.suite in LIBERO_SUITES:
+            self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
         self._check_pictures()
         if self.suite == STRICT:
             self._set(referent=DRAWN)
@@ -181,8 +183,6 @@ class EnvSettings:
             raise MemobenchError(
                 f"difficulty={self.difficulty} is for strict tasks; set suite={STRICT}, or leave it out"
             )
-        if self.suite in LIBERO_SUITES:
-            self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
         if self.protocol == UPSTREAM:
             self._require(UPSTREAM_ONLY, f"protocol={UPSTREAM}, the authors' evaluation,")
             self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))

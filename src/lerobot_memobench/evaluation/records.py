@@ -83,7 +83,7 @@ APART = ("suite", WORLD)
 
 
 def of_all(records: Iterable[Mapping[str, Any]], key: str) -> Any:
-    """Return the suite, the world, the protocol or a setting of pictures (``key``) of an evaluation's rollouts.
+    """Return an evaluation's value of ``key``: suite, source of the scenes, protocol or a setting of pictures.
 
     Raises:
         MemobenchError: they are of several.
@@ -152,7 +152,7 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
 
     Raises:
         MemobenchError: a folder holds no rollouts or is given twice, one method has two results at one interval, or
-            the suites or worlds differ.
+            the suites or the sources of the scenes differ.
     """
     given = [_split(word) for word in words]
     if not given:

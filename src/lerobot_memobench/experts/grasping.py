@@ -88,6 +88,9 @@ RIM_GAP_SLOPE = 0.7
 """Gap per height of the finger above the container's floor."""
 CLOSING_LEAD = 0.03
 """Reduction of the present opening for targets while closing, because the arm lags behind the fingers, m."""
+MAX_RELEASE_OFFSET, LEVEL_COSINE = 0.03, 0.95
+"""Largest horizontal distance from the target at which an object is released, m, and smallest upright cosine of its
+support."""
 MAX_DRAWER_OFFSET = 0.025
 """Largest distance from the target in a drawer at which an object is released, m; farther away it would lean on a
 wall."""
@@ -328,12 +331,13 @@ def _cost(way: _Approach, avoid: Array | None) -> float:
     else:
         cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
     cost += 0.3 if way.grasp.width > WIDE_GRASP else 0.0
-    cost += TIGHT_COST if way.grasp.width >= TIGHT_GRASP and hand.strict else 0.0
     position, _ = hand.sim.asset_pose(name)
     if _is_rim(hand, name, way.grasp):
         cost += FAR_SIDE_COST * (1.0 + float(unit(target - position) @ hand.radial(position)))
     ends = [target] if way.place is None else [target, way.place + target - position]
     stretch = max(hand.stretch(end, turn) for end in ends)
+    if way.grasp.width >= TIGHT_GRASP and hand.strict:
+        cost += TIGHT_COST * (2.0 if hand.stretch(target, turn) > MAX_STRETCH else 1.0)
     # Beyond `MAX_STRETCH` the hand stops short and closes on an edge, which slips.
     return cost + 20.0 * max(0.0, stretch - COMFORTABLE_STRETCH) + 40.0 * max(0.0, stretch - MAX_STRETCH)
 
@@ -433,10 +437,15 @@ def carry(
         target = at(clearance)()
         return np.array([target[0], target[1], max(target[2], high - 0.02)])
 
-    yield from hand.move(over, turn, CLOSED, tolerance=0.012, turn_tolerance=0.08, give_up=lost)
-    yield from hand.move(at(clearance), turn, CLOSED, tolerance=0.012, timeout=60, give_up=lost)
-    if not lost():
+    for _ in range(MAX_ATTEMPTS if hand.strict else 1):
+        yield from hand.move(over, turn, CLOSED, tolerance=0.012, turn_tolerance=0.08, give_up=lost)
+        yield from hand.move(at(clearance), turn, CLOSED, tolerance=0.012, timeout=60, give_up=lost)
+        if lost():
+            return
         yield from hand.lower(at(0.0), turn, CLOSED, tolerance=tolerance)
+        tipped = support in hand.sim.assets and hand.sim.asset_pose(support)[1][2, 2] < LEVEL_COSINE
+        if not tipped and length((hand.position - at(0.0)())[:2]) < MAX_RELEASE_OFFSET:
+            return  # otherwise a push moved the hand aside: over the rim of a bowl, or in the air
 
 
 def _hand_over(hand: Hand, held: Held, destination: Target, turn: Array) -> Callable[[float], Target]:

@@ -17,6 +17,8 @@ from typing import Any
 
 import yaml
 from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_info
@@ -24,13 +26,16 @@ from lerobot_memobench.envs.observations import policy_features, policy_names
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import statistics_shapes, trained_names, training_of
 from lerobot_memobench.policies.compatibility import cameras_read, check_actions
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.lerobot_config import quiet, read_lerobots_config
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
 
 logger = logging.getLogger(__name__)
 
 OF_LIBERO = ("lerobot/", "HuggingFaceVLA/", "physical-intelligence/")
 """Owners of LIBERO's data on the hub. Other datasets of that name may be of this package."""
+
+LEROBOTS_COMMANDS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalPipelineConfig}
+"""LeRobot's command -> its configuration."""
 
 
 def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
@@ -99,38 +104,40 @@ def chosen_convention(
 
 
 def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
-    """Set the convention for the checkpoint that the command line of ``lerobot-eval`` names; return its configuration.
+    """Return the configuration of the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, else None.
 
-    None for another command: a training may begin with any checkpoint.
+    Set the convention for the checkpoint of an evaluation; a training may begin with any.
 
     Raises:
         MemobenchError: as of `chosen_convention`; or LeRobot's command would run the policy in LIBERO's pipelines.
     """
-    path = parser.get_path_arg("policy")
-    if path is None or "eval" not in Path(sys.argv[0]).name:
+    command = Path(sys.argv[0]).name.replace("_", "-")
+    kind = next((kind for name, kind in LEROBOTS_COMMANDS.items() if command.startswith(name)), None)
+    if kind is None:
         return None
     with quiet():
-        policy = PreTrainedConfig.from_pretrained(path, cli_overrides=parser.get_cli_overrides("policy") or [])
+        config = read_lerobots_config(kind, sys.argv[1:])
+    path, policy = parser.get_path_arg("policy"), config.policy
+    if not isinstance(config, EvalPipelineConfig) or policy is None or path is None:
+        return policy
     check_actions(path, policy)
     if policy.type == "xvla":
         raise MemobenchError(
             "lerobot-eval runs every XVLA with the processors of LIBERO, which mirror a picture and convert actions; "
             f"run `lerobot eval env=memobench policy={path}`"
         )
-    asked = _named("env.convention") or (MIRRORED if environment.camera_name_mapping else None)
-    found = chosen_convention(path, policy, asked, _named("rename_map"))
+    asked = _named_convention() or (MIRRORED if environment.camera_name_mapping else None)
+    found = chosen_convention(path, policy, asked, config.rename_map)
     if found not in (None, environment.convention):  # with the names of its pictures
         names = {"features": policy_features(), "features_map": policy_names()}
         vars(environment).update(vars(replace(environment, **names, convention=found)))
     return policy
 
 
-def _named(key: str) -> Any:
-    """Return a setting of LeRobot's command line, else of the file that its ``config_path`` names; None without it."""
-    if (typed := parser.parse_arg(key)) is not None:
-        return yaml.safe_load(typed)
+def _named_convention() -> str | None:
+    """Return the convention that LeRobot's command line, or the file of its ``config_path``, names; None without it."""
     file = parser.parse_arg("config_path")
     found: Any = yaml.safe_load(Path(file).read_bytes()) if file and Path(file).is_file() else None
-    for part in key.split("."):
+    for part in ("env", "convention"):
         found = found.get(part) if isinstance(found, dict) else None
-    return found
+    return parser.parse_arg("env.convention") or found

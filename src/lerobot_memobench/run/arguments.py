@@ -56,8 +56,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
         **{
             key: (f"env.{key}",)
             for key in (
-                *("task", "task_ids"),
-                *("convention", "camera_name_mapping", "observation_height", "observation_width"),
+                *("task", "task_ids", "convention", "camera_name_mapping", "observation_height", "observation_width"),
                 *("robot_state", "control_mode"),
                 *("difficulty", "protocol", "demonstration_prompt", "prompt_in", "horizon"),
                 *("pause_steps", "speed", "evidence", "salt", "videos"),

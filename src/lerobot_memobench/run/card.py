@@ -34,7 +34,7 @@ from lerobot_memobench.policies.checkpoint import (
 from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.run.plan import EvaluationPlan
 
-PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "robosuite", "torch", "transformers", "numpy", "gymnasium")
+PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transformers", "numpy", "gymnasium")
 
 # --- the card of a plan, before anything has been found ---
 

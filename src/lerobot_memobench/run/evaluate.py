@@ -50,7 +50,9 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     environment = replace(plan.environment, resume=rests and has_log(plan.log))
     asked = range(plan.seed, plan.seed + plan.grid.runs)
     by = acting(policy, plan.policy_path, asked, environment.settings)
-    environments = Environments(environment.opener(policy, by, plan.log), plan.settings.use_async_envs is not False)
+    # The loaded policy's configuration: some policies of LeRobot replace their plan by that of the checkpoint.
+    opened = environment.opener(actor.policy.config, by, plan.log)
+    environments = Environments(opened, plan.settings.use_async_envs is not False)
     seeds = BatchSeeds(actor.policy, plan.seed)
     scenes = environment.settings
     reads = ReadLog(plan.log, scenes.seed_base, scenes.referent) if plan.options.memory_reads else None

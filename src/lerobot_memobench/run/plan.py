@@ -177,7 +177,9 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     check_split(plan)
     check_scenes(plan)
     if options.slurm is None:  # there, each part checks its own machine
-        _check_simulator(environment)
+        from lerobot_memobench.sim.libero.files import check_assets
+
+        check_assets()
     return plan
 
 
@@ -319,15 +321,6 @@ def check_scenes(plan: EvaluationPlan) -> None:
             f"found episodes={plan.grid.runs} with evidence=true; {name} runs each scene with {variants[name]} "
             f"variants: ask for at least episodes={variants[name]}, or for other tasks"
         )
-
-
-def _check_simulator(environment: MemobenchEnvConfig) -> None:
-    """Refuse a machine on which every episode would fail: without the arm or the assets."""
-    from lerobot_memobench.sim.libero.files import check_assets
-    from lerobot_memobench.sim.robot import robosuite_version
-
-    robosuite_version()
-    check_assets()
 
 
 # --- the benchmark's defaults ---

@@ -2,4 +2,4 @@
 
 from lerobot_memobench.io import choose_caches
 
-choose_caches()  # before robosuite and this package import numba, in programs that use none of the commands
+choose_caches()  # before this package imports numba, in programs that use none of the commands

@@ -128,6 +128,10 @@ class OSCController:
         """Write the controls for one physics step into ``data.ctrl``."""
         self._apply(data, self.torques(data), gripper_action)
 
+    def apply_gravity(self, data: mujoco.MjData, gripper_action: float) -> None:
+        """Write controls that only hold the arm against gravity, as `apply`."""
+        self._apply(data, data.qfrc_bias[self._dofs], gripper_action)
+
     def _apply(self, data: mujoco.MjData, torques: Array, gripper_action: float) -> None:
         low, high = self._torque_limits
         data.ctrl[self._arm] = np.minimum(np.maximum(torques, low), high)
@@ -139,17 +143,6 @@ class OSCController:
         """Return the change (2,) of the finger commands in one physics step."""
         change: Array = CLOSING_SIGNS * (GRIPPER_SPEED * np.sign(gripper_action))
         return change
-
-    def advance_from_set_state(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:
-        """Hold the pose of `reset` over physics steps after the arm was set to another pose.
-
-        In the first physics step robosuite's controller still has the pose of its reset, in which it exerts no torque
-        but that against gravity.
-        """
-        self._apply(data, data.qfrc_bias[self._dofs], gripper_action)
-        mujoco.mj_step2(self._model, data)
-        mujoco.mj_step1(self._model, data)
-        self.advance(data, gripper_action, substeps - 1)
 
     def advance(self, data: mujoco.MjData, gripper_action: float, substeps: int) -> None:
         """Hold the goal over physics steps; before and after, ``data`` is in the state that `torques` requires."""

@@ -19,6 +19,7 @@ from lerobot_memobench.sim.controller import CLOSING_SIGNS, make_controller
 from lerobot_memobench.sim.hiding import HiddenObject, HiddenObjects
 from lerobot_memobench.sim.libero.placement import Placer
 from lerobot_memobench.sim.libero.scene import GLOW_OFF, GLOW_ON, get_scene
+from lerobot_memobench.sim.libero.settling import settling_step
 from lerobot_memobench.sim.raster.drawlist import DrawList, Image
 from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
@@ -169,11 +170,7 @@ class Simulation:
     def _set_up(
         self, seed: int, draw: int, settling: Callable[[Callable[[Atom], bool]], None] | None, state: Array | None
     ) -> dict[str, Array]:
-        """Set one draw of the initial state, run the stabilisation steps, and return the objects' places before them.
-
-        In the first of these steps the arm moves from the pose in ``state`` towards `robot.ARM_START`, and then keeps
-        the orientation of this pose, as LIBERO's arm does.
-        """
+        """Set one draw of the initial state, run the stabilisation steps, and return objects' places before them."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[self._arm_qpos] = robot.ARM_START
         self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
@@ -187,10 +184,11 @@ class Simulation:
             self.set_state(state)
         places = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
         for step in range(STABILISATION_STEPS):
-            if state is not None and step == 0:
-                self._controller.advance_from_set_state(self.data, NO_OP[6], SUBSTEPS)
-            else:
+            if state is None:
                 self.step(NO_OP)
+            else:
+                settling_step(self._controller, self.model, self.data, first=step == 0)
+                self._check_physics(self.data.time)
             if settling is not None:
                 settling(self.holds)
         return places

@@ -9,9 +9,8 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-import draccus
 from lerobot.common.train_utils import resolve_resume_checkpoint
-from lerobot.configs import FeatureType, PreTrainedConfig, parser
+from lerobot.configs import FeatureType, parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -20,11 +19,8 @@ from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.policies.convention import trained_convention
-from lerobot_memobench.policies.lerobot_config import overrides
+from lerobot_memobench.policies.lerobot_config import read_lerobots_config
 from lerobot_memobench.sim.convention import convention_of
-
-CHOICES = ["policy", "reward_model"]
-"""Fields for which LeRobot's parser takes a ``path``."""
 
 READ = frozenset(
     {
@@ -38,33 +34,13 @@ READ = frozenset(
 """Fields of LeRobot's configuration that the loop of memory policies reads, itself or through LeRobot's functions."""
 
 
-def read_config(flags: Sequence[str]) -> TrainPipelineConfig:
-    """Return the configuration that the flags set, the policy's from the checkpoint that they name."""
-    for key, package in parser.parse_plugin_args("discover_packages_path", flags).items():
-        parser.load_plugin(package)
-        flags = parser.filter_arg(key, flags)
-    file, rest = parser.parse_arg("config_path", flags), parser.filter_path_args(CHOICES, flags)
-    config: TrainPipelineConfig
-    if file is None:
-        config = draccus.parse(TrainPipelineConfig, args=rest)
-    else:
-        named = parser.extract_path_fields_from_config(file, CHOICES)
-        config = TrainPipelineConfig.from_pretrained(named, cli_args=parser.filter_arg("config_path", rest))
-    path = parser.get_path_arg("policy", flags)
-    if path is not None:
-        given = [*parser.get_yaml_overrides("policy"), *overrides("policy", flags)]
-        config.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=given)
-        config.policy.pretrained_path = Path(path)
-    return config
-
-
 def read_training(flags: Sequence[str]) -> TrainPipelineConfig:
     """Return the complete configuration of a memory policy's training: optimizer, folder of the run, checkpoint.
 
     Raises:
         MemobenchError: settings do not go together.
     """
-    config, now = read_config(flags), dt.datetime.now()
+    config, now = read_lerobots_config(TrainPipelineConfig, flags), dt.datetime.now()
     policy = config.policy
     assert policy is not None
     check_settings(config)
@@ -163,6 +139,8 @@ def check_convention(config: TrainPipelineConfig, meta: Any, features: dict[str,
 def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
     """Refuse evaluations on the benchmark during a training on other cameras, sizes or conventions of pictures.
 
+    The environment receives the plans of the policy, on which holds depend.
+
     Args:
         features: of the dataset.
     """
@@ -177,5 +155,6 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
             "LeRobot's trainer evaluates every XVLA with the processors of LIBERO; leave env out, and evaluate its "
             "checkpoints with `lerobot eval env=memobench`"
         )
+    env.declare_plans(config.policy)
     policy = with_features(config.policy, features)
     check_features(f"that learns from {meta.root}", policy, env_to_policy_features(config.env), config.rename_map)

@@ -29,7 +29,7 @@ from lerobot_memobench.datasets.frames import (
     read_recorded,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, read_info, without_pattern
-from lerobot_memobench.datasets.lerobot_format.reading import check_revision
+from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
@@ -49,6 +49,7 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
 from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
 from lerobot_memobench.policies.memobench_mem.targets import with_targets
 from lerobot_memobench.protocol import OBS_PHASE
+from lerobot_memobench.sim.scene_hash import check_world
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
 from lerobot_memobench.training.sampler import seed_of
 
@@ -129,10 +130,15 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
 
 
 def check_dataset_version(meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset that an earlier version of the benchmark made."""
+    """Refuse a dataset that an earlier version of the benchmark made: of other scenes, goals, prompts or holds."""
     check_clock(meta.features, meta.root)
-    if EPISODE_INFO in meta.features:
-        check_revision(Path(meta.root))
+    if EPISODE_INFO not in meta.features:
+        return
+    places = list_episodes(Path(meta.root))
+    for place in places:
+        if place.record is not None:
+            check_world(place.record.world, f"episode {place.index} of {meta.root}")
+    check_revision(Path(meta.root), places)
 
 
 def check_episodes(episodes: Sequence[int] | None, meta: LeRobotDatasetMetadata) -> None:

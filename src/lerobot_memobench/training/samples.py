@@ -21,6 +21,7 @@ from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.scripts import lerobot_train
 from torch import Tensor
 
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.jobs.processes import lock_refusal
 
 logger = logging.getLogger(__name__)
@@ -94,7 +95,12 @@ def needs_no_pictures(config: TrainPipelineConfig, dataset: Any) -> bool:
 
 
 def open_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
-    """Open LeRobot's datasets of a training and of its held-out episodes; keep them in memory without pictures."""
+    """Open LeRobot's datasets of a training and of its held-out episodes; keep them in memory without pictures.
+
+    LeRobot opens environments without the policy, so those of the benchmark receive its plans here.
+    """
+    if isinstance(config.env, MemobenchEnvConfig):
+        config.env.declare_plans(config.policy)
     datasets: tuple[Any, Any] = make_train_eval_datasets(config)
     if needs_no_pictures(config, datasets[0]):
         for dataset in datasets:

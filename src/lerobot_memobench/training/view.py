@@ -24,6 +24,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from lerobot.configs import FeatureType
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.constants import OBS_IMAGES
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -51,10 +52,11 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
 from lerobot_memobench.policies.checkpoint import trained_names
 from lerobot_memobench.policies.compatibility import keeps_sizes
+from lerobot_memobench.policies.lerobot_config import read_lerobots_config
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 from lerobot_memobench.run.arguments import LerobotArguments
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, OTHER, convention_of
-from lerobot_memobench.training.configuration import check_environment, read_config, with_features
+from lerobot_memobench.training.configuration import check_environment, with_features
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
@@ -137,7 +139,7 @@ def viewed(
     Raises:
         MemobenchError: the dataset lacks the observations, or is streamed from the hub.
     """
-    config = read_config(arguments.for_parser)
+    config = read_lerobots_config(TrainPipelineConfig, arguments.for_parser)
     given, policy = config.dataset, config.policy
     if policy is None:
         return arguments

@@ -47,6 +47,7 @@ class Dialect:
         shared: all connections share one memory, so the server serves one environment at a time.
         buffers: the server receives every frame, in a message before each question (``add_buffer``).
         history: the server receives the whole demonstration prompt with the first question of the execution.
+        queues: the server answers one action and queues the rest of its plan.
     """
 
     protocol: str = OPENPI
@@ -57,6 +58,7 @@ class Dialect:
     shared: bool = False
     buffers: bool = False
     history: bool = False
+    queues: bool = False
 
 
 DIALECTS: dict[str, Dialect] = {
@@ -64,9 +66,8 @@ DIALECTS: dict[str, Dialect] = {
     "openpi": Dialect(image_size=224),
     # RoboMME/robomme_policy_learning: examples/robomme/{eval,utils}.py, serving/websocket_policy_server.py
     "robomme": Dialect(port=8011, shared=True, buffers=True),
-    # vla-eval 0.8: protocol/{messages,numpy_codec,image_codec}.py, connection.py, model_servers/{serve,predict}.py. Its
-    # servers answer one action, and queue the rest of a chunk.
-    "vla_eval": Dialect(protocol=VLA_EVAL, keys=VLA_EVAL_KEYS, n_action_steps=1, history=True),
+    # vla-eval 0.8: protocol/{messages,numpy_codec,image_codec}.py, connection.py, model_servers/{serve,predict}.py
+    "vla_eval": Dialect(protocol=VLA_EVAL, keys=VLA_EVAL_KEYS, n_action_steps=1, history=True, queues=True),
 }
 
 BY_DIALECT: Any = None
@@ -148,6 +149,11 @@ class RemoteConfig(UntrainedConfig):
     def spoken(self) -> Dialect:
         """The server's dialect."""
         return DIALECTS[self.dialect]
+
+    @property
+    def plans_unseen(self) -> bool:
+        """Whether the server executes its plan itself, so that the number of actions is unknown here."""
+        return self.spoken.queues
 
     @property
     def needs_every_frame(self) -> bool:

@@ -164,7 +164,6 @@ def scene_xml(task: Task, visuals: bool) -> str:
     world, assets = root.find("worldbody"), root.find("asset")
     assert world is not None
     assert assets is not None
-    _remove(world, lambda element: element.get("name") == "robot0_link7_collision")  # robosuite 1.4.0 has none
     arena = arena_of(task)
     _place_arm(world, arena)
     room = mjcf.arena(arena.file)
