@@ -7,8 +7,9 @@ observation is always the same. It waits within 5 cm of home, where no hold begi
 the horizon allows. Holds of random length (`protocol.HOLD_MEAN`) blur the steps, but elapsed time grows with each
 event, so no law makes it worthless. The steps are divided into bins; each has one choice or the wait. A random choice
 could not be better: a bin is shorter than an event, so an episode uses it once. Changes of random intervals of bins are
-kept unless the rate falls. The rate is a maximum over such plans, found from several starts: a lower bound of the
-ceiling.
+kept unless the rate falls. The best plan of several starts is rated on other sampled episodes: on its own sample its
+rate is up to six points higher. The rate is a lower bound of what such a policy can reach. Idle trips, each of which
+draws a hold, and open fixtures as marks are not among the choices; with them a clock reaches more.
 """
 
 from __future__ import annotations
@@ -109,14 +110,14 @@ class Clock:
         return best, plan
 
 
-def counting(number: int, law: Holds = holds) -> Clock:
+def counting(number: int, law: Holds = holds, seed: int = 0) -> Clock:
     """Return the task to do an event (0) ``number`` times and then rest (1)."""
-    return Clock([0] * number + [1], REST_STEPS, law)
+    return Clock([0] * number + [1], REST_STEPS, law, seed)
 
 
-def ordering(events: int, law: Holds = holds) -> Clock:
+def ordering(events: int, law: Holds = holds, seed: int = 0) -> Clock:
     """Return the task to do ``events`` different things in order."""
-    return Clock(range(events), EVENT_STEPS, law)
+    return Clock(range(events), EVENT_STEPS, law, seed)
 
 
 @cache
@@ -129,10 +130,16 @@ def main() -> None:
     """Print the rates for the law of the protocol, and without holds."""
     laws: dict[str, Holds] = {"holds": holds, "no holds": lambda rng, count: np.zeros((EPISODES, count))}
     for name, law in laws.items():
-        counts = [counting(number, law).best()[0] for number in (1, 2, 3)]
+        counts = [_fresh(counting, number, law) for number in (1, 2, 3)]
         print(f"{name}: counting {_percent(counts)}, mean {_percent([float(np.mean(counts))])}", flush=True)
-        orders = [ordering(number, law).best()[0] for number in (2, 3)]
+        orders = [_fresh(ordering, number, law) for number in (2, 3)]
         print(f"{name}: ordering of two and three {_percent(orders)}", flush=True)
+
+
+def _fresh(task: Callable[..., Clock], number: int, law: Holds) -> float:
+    """Return the rate of the best plan that was found, on samples that the search did not see."""
+    plan = task(number, law).best()[1]
+    return float(np.mean([task(number, law, seed).rate(plan) for seed in range(1, 11)]))
 
 
 def _percent(rates: Sequence[float]) -> str:
