@@ -228,7 +228,8 @@ def test_lerobots_names_choose_suite_and_tasks() -> None:
 
 
 def test_lerobot_eval_gets_environments_by_suite_and_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["lerobot-eval", "--seed=100", "--eval.n_episodes=5"])
+    line = ["lerobot-eval", "--env.type=memobench", "--policy.type=memobench_random", "--policy.device=cpu"]
+    monkeypatch.setattr("sys.argv", [*line, "--seed=100", "--eval.n_episodes=5"])
     config = MemobenchEnvConfig(task="libero_goal,libero_10", task_ids=[0, 3], log_dir=str(tmp_path))
     found = config.create_envs(2)
     assert {suite: [*envs] for suite, envs in found.items()} == {"libero_goal": [0, 3], "libero_10": [0, 3]}
@@ -237,6 +238,6 @@ def test_lerobot_eval_gets_environments_by_suite_and_id(tmp_path: Path, monkeypa
         (300, "libero", 100),
         (520, "libero", 100),
     ]
-    monkeypatch.setattr("sys.argv", ["lerobot-eval", "--eval.n_episodes=51"])
+    monkeypatch.setattr("sys.argv", [*line, "--eval.n_episodes=51"])
     with pytest.raises(MemobenchError, match="50 initial states"):
         MemobenchEnvConfig(task="libero_goal", log_dir=str(tmp_path)).create_envs(1)
