@@ -115,7 +115,7 @@ def test_refusals_are_one_sentence(
     assert not fake_loop.ran
 
 
-def test_checkpoints_of_liberos_pictures_alone_are_accepted(
+def test_checkpoints_run_on_the_pictures_of_their_training(
     fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]
 ) -> None:
     picture = {"type": "VISUAL", "shape": [3, 256, 256]}
@@ -124,8 +124,9 @@ def test_checkpoints_of_liberos_pictures_alone_are_accepted(
         pictures = {f"observation.images.{camera}": picture for camera in ("image", wrist)}
         features = {"input_features": {**pictures, "observation.state": state}, "output_features": {"action": action}}
         make_checkpoint(Path(name), "act", **features)
-    assert plan_line([*LINE[:1], *LINE[2:], "policy=./mirrored"]).environment.convention == "libero"
-    found = error(capsys, "suite=libero_object", "policy=./upright")
+    for name, convention in (("mirrored", "libero"), ("upright", "upright")):
+        assert plan_line([*LINE[:1], *LINE[2:], f"policy=./{name}"]).environment.convention == convention
+    found = error(capsys, "suite=libero_object", "convention=libero", "policy=./upright")
     assert "expects pictures of convention=upright" in found
     assert "and found libero" in found
 
