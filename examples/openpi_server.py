@@ -40,7 +40,9 @@ from numpy.typing import NDArray
 from websockets.sync.server import Server, ServerConnection, serve
 
 from lerobot_memobench.policies.checkpoint import local_folder
+from lerobot_memobench.policies.convention import trained_convention
 from lerobot_memobench.policies.remote.transports import pack, unpack
+from lerobot_memobench.sim.convention import STATED
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -70,6 +72,8 @@ class ServedPolicy:
         self.before, self.after = make_pre_post_processors(config, folder, preprocessor_overrides=override)
         self._device = torch.device(device)
         self.metadata = {"policy": config.type, "checkpoint": checkpoint}
+        if (convention := trained_convention(folder, config)[0]) is not None:
+            self.metadata[STATED] = convention
         self.begin()
 
     def begin(self) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.utils.import_utils import register_third_party_plugins
 from vla_eval.model_servers.base import SessionContext
@@ -31,9 +32,11 @@ from vla_eval.specs import (
 )
 
 from lerobot_memobench.policies.checkpoint import local_folder
+from lerobot_memobench.policies.convention import trained_convention
 from lerobot_memobench.protocol import EXECUTION, PROMPT
+from lerobot_memobench.sim.convention import CONVENTIONS, STATED, UPRIGHT
 
-CAMERAS = {"agentview": "observation.images.image", "wrist": "observation.images.wrist_image"}
+CAMERAS = {"agentview": "image", "wrist": "wrist_image"}
 
 
 class MemoryPolicyServer(LeRobotModelServer):
@@ -46,8 +49,16 @@ class MemoryPolicyServer(LeRobotModelServer):
 
     def __init__(self, checkpoint: str, policy_type: str = "memobench_mem", **settings: Any) -> None:
         register_third_party_plugins()
-        super().__init__(policy_type, checkpoint, CAMERAS, use_select_action=True, **settings)
+        self._convention = trained_convention(checkpoint, PreTrainedConfig.from_pretrained(checkpoint))[0]
+        names = CONVENTIONS[self._convention or UPRIGHT]
+        self._keys = {theirs: f"observation.images.{names[ours]}" for theirs, ours in CAMERAS.items()}
+        super().__init__(policy_type, checkpoint, self._keys, use_select_action=True, **settings)
         self._episode = ""
+
+    def get_observation_params(self) -> dict[str, Any]:
+        """Return the inputs that it needs, and the convention of pictures that its policy was trained on, if known."""
+        stated = {} if self._convention is None else {STATED: self._convention}
+        return {**super().get_observation_params(), **stated}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """Return the conventions of an action, which are those of our demonstrations."""
@@ -72,7 +83,7 @@ class MemoryPolicyServer(LeRobotModelServer):
         return {"actions": self._act(obs, EXECUTION, now)}
 
     def _act(self, obs: dict[str, Any], phase: int, step: int) -> np.ndarray:
-        frame = {key: np.asarray(obs["images"][name]) for name, key in CAMERAS.items()}
+        frame = {key: np.asarray(obs["images"][name]) for name, key in self._keys.items()}
         frame["observation.state"] = np.asarray(obs["states"], np.float32)
         frame |= {f"observation.{key}": np.array([now], np.float32) for key, now in (("phase", phase), ("step", step))}
         frame = self._preprocess(prepare_observation_for_inference(frame, self._device, task=obs["task_description"]))

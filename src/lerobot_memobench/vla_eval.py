@@ -22,9 +22,10 @@ from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import PIXEL_INPUT
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
+from lerobot_memobench.sim.convention import CONVENTIONS, STATED
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.libero_suites import NUM_STATES
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
@@ -82,12 +83,13 @@ class MEMOBench(StepBenchmark):
         n_action_steps: actions executed per answer, open-loop.
         replan_steps: actions per plan of the server, which may answer one action and queue the rest (its
             ``chunk_size``); default ``n_action_steps``. Strict tasks need it, because holds are longer than a plan.
-        send_wrist_image: whether the wrist camera is sent. The harness sets this and the next two arguments from the
-            hello message of a model server.
+        send_wrist_image: whether the wrist camera is sent. The harness sets this, the next two arguments and
+            ``trained_convention`` from the hello message of a model server.
         send_state: whether the arm's state is sent.
         send_video_history: whether the demonstration prompt is sent.
         log_dir: folder of the episode log for ``memobench report``; None for no log.
         label: name of the model server's policy in the log.
+        trained_convention: of the pictures that the server's policy was trained on: the ``convention``, or refused.
         settings: other fields of `EnvSettings`, such as ``suite``, ``referent``, ``horizon``, ``evidence`` or
             ``convention`` (``libero``: mirrored as the harness does for LIBERO). If the harness's ``max_steps`` is
             lower than the horizon, it ends episodes without a log line.
@@ -114,6 +116,7 @@ class MEMOBench(StepBenchmark):
         send_video_history: bool = True,
         log_dir: str | None = None,
         label: str | None = None,
+        trained_convention: str | None = None,
         **settings: Any,
     ) -> None:
         super().__init__()
@@ -129,6 +132,13 @@ class MEMOBench(StepBenchmark):
                 f"seed {seed} belongs to the sealed test; run it by `memobench test-sealed policy=memobench_remote "
                 "dialect=vla_eval`, which counts its runs"
             )
+        if trained_convention is not None:
+            check_choice(STATED, trained_convention, [*CONVENTIONS])
+            if (asked := settings.setdefault("convention", trained_convention)) != trained_convention:
+                raise MemobenchError(
+                    f"the model server expects pictures of convention={trained_convention}, and found convention="
+                    f"{asked}; leave it out"
+                )
         planned, prompt_in = replan_steps or n_action_steps, STEPS if send_video_history else RESET
         for name in DECIDED.keys() & settings.keys():
             raise MemobenchError(f"{name} is {settings[name]!r}, but follows from other arguments; set {DECIDED[name]}")

@@ -69,6 +69,13 @@ def test_lerobots_features_have_the_names() -> None:
     assert set(pictures) < set(observed)
 
 
+def test_liberos_names_mean_liberos_pictures() -> None:
+    for given in ({}, {"convention": "libero"}):
+        config = MemobenchEnvConfig(camera_name_mapping=MAPPING, **given)
+        assert (config.convention, config.settings.convention) == ("libero", "libero")
+    assert config.settings.changed(camera_name_mapping=None, convention=None).convention == "upright"
+
+
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
@@ -77,7 +84,7 @@ def test_lerobots_features_have_the_names() -> None:
         ({"control_mode": "absolute"}, "control_mode is 'absolute', and actions of this environment are displacements"),
         ({"convention": "libero", "obs_type": "environment_state_agent_pos"}, "is of pictures"),
         ({"observation_height": 360, "obs_type": "environment_state_agent_pos"}, "is of pictures"),
-        ({"camera_name_mapping": MAPPING}, "convention is upright; set convention=libero"),
+        ({"convention": "upright", "camera_name_mapping": MAPPING}, "convention is upright; set convention=libero"),
         *(
             (
                 {"convention": "libero", "camera_name_mapping": bad},

@@ -16,12 +16,14 @@ from vla_eval.recording import NullEpisodeRecorder
 import lerobot_memobench.envs  # noqa: F401 - registers the tasks with gymnasium
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.libero_suites import initial_states, libero_tasks
+from tests.support.libero import record
 
 STOVE = "turn_on_the_stove"
 NUMBER = libero_tasks("libero_goal").index(STOVE)
@@ -112,3 +114,19 @@ def test_both_commands_and_vla_eval_run_the_same_episodes(tmp_path: Path, monkey
     for folder in (ours, theirs, harness):
         assert memobench(["report", str(folder)]) == 0
         assert json.loads((folder / "report.json").read_text())["memory_types"] == {"libero_goal": {"n": 2, "SR": 0.0}}
+
+
+def test_lerobots_environment_observes_what_its_libero_observes() -> None:
+    """Names, types and values after the reset are those that LeRobot's `LiberoEnv` gave on stock LIBERO."""
+    start = "libero_spatial:0.raw.robot_state."
+    kept = {key.removeprefix(start): one for key, one in record("observations").items() if key.startswith(start)}
+    (tasks,) = MemobenchEnvConfig(task="libero_spatial", task_ids=[0], robot_state=True).create_envs(1).values()
+    (made,) = tasks.values()
+    observation, _ = made.reset(seed=[7])
+    found = {f"{group}.{key}": one for group, parts in observation["robot_state"].items() for key, one in parts.items()}
+    assert {key: (one.shape, one.dtype) for key, one in found.items()} == {
+        key: ((1, *one.shape), one.dtype) for key, one in kept.items()
+    }
+    for key, values in kept.items():
+        assert np.abs(found[key][0] - values).max() <= 5e-4, key  # robosuite observes up to 4 ms earlier
+    made.close()

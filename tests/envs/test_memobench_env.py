@@ -35,13 +35,14 @@ from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import failure_of
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.protocol import ENDED, EXECUTION, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
+from lerobot_memobench.protocol import ENDED, EXECUTION, LONGEST_HOLD, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
 from lerobot_memobench.run.card import first_variant_mismatch
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import NOTHING_YET, with_memory
+from lerobot_memobench.tasks.task import STRICT
 from tests.support.short_demonstrations import record_demonstration
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -169,15 +170,23 @@ def test_contract_of_reset_step_log_and_resume(tmp_path: Path, name: str, obs_ty
 
 
 def roll(env: gym.vector.VectorEnv, seeds: list[int], steps: int) -> tuple[list[str], dict[str, Any]]:
+    """Run the episodes to their ends, at most ``steps`` steps."""
     env.reset(seed=seeds, options=NEW_ROLLOUT)
+    ended = np.zeros(len(seeds), bool)
     for plan in np.stack([actions(seed, steps) for seed in seeds], axis=1):
-        observation, *_ = env.step(plan)
+        observation, _, over, cut, _ = env.step(plan)
+        ended |= over | cut
+        if ended.all():
+            break
+    assert ended.all()
     return list(env.call("scene_hash")), preprocess_observation(observation)
 
 
 def check_batches(tmp_path: Path, modes: tuple[bool, ...], steps: int, **settings: Any) -> None:
     """Check that rows of a batch equal single episodes, and that they freeze at their end."""
     settings["horizon"] = steps
+    if settings.get("suite") == STRICT:
+        settings["replan_steps"], steps = 1, steps + 2 * LONGEST_HOLD  # of the start, and of a return home
     alone = vector(tmp_path / "alone", 1, **settings)
     single = [roll(alone, [seed], steps) for seed in SEEDS]
     alone.close()

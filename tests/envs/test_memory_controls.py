@@ -93,7 +93,7 @@ def test_the_prompt_is_shown_again_after_the_corruption(task: str) -> None:
         assert_same_scene(first[number], plain[number])
         assert_same_scene(second[number], plain[number])
     executed, usual = in_phase(again, EXECUTION), in_phase(plain, EXECUTION)
-    assert len(executed) == len(usual) == HORIZON + 1
+    assert len(executed) == len(usual) >= HORIZON + 1, "a strict task is held"
     for one, other in zip(executed, usual, strict=True):
         assert_same_scene(one, other)
 

@@ -202,6 +202,22 @@ def test_wrong_settings_are_named(params: dict[str, Any], named: str) -> None:
         MEMOBench(**params)
 
 
+def test_the_server_states_the_convention_of_its_policy(benchmarks: Make) -> None:
+    """The harness hands it over as an argument, unless the configuration names it too."""
+    server = DigestServer()
+    server.get_observation_params = lambda: {"trained_convention": "libero"}  # type: ignore[method-assign]
+    with vla_eval.serve_background(server) as handle:
+        by_harness(handle.url, tasks=[UNPROMPTED], horizon=1)
+        pictures = server.heard[0][2]["images"]
+        with pytest.raises(MemobenchError, match="expects pictures of convention=libero, and found convention=upright"):
+            by_harness(handle.url, tasks=[UNPROMPTED], horizon=1, convention="upright")
+    first, _ = played(benchmarks(UNPROMPTED, horizon=1))
+    assert all(np.array_equal(pictures[name], first["images"][name][:, ::-1]) for name in ("agentview", "wrist"))
+    assert MEMOBench(trained_convention="upright").get_tasks()
+    with pytest.raises(MemobenchError, match="did you mean 'libero'"):
+        MEMOBench(trained_convention="liberu")
+
+
 def configuration() -> dict[str, Any]:
     """Return the configuration in the guide."""
     text = (ROOT / "docs" / "guides" / "vla_eval.md").read_text()

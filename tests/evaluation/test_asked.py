@@ -153,6 +153,7 @@ RESULTS = {
 DOCTORED: dict[str, Any] = {
     **{"task": "turn_on_the_stove_and_turn_it_off", "memory_type": "spatial", "episode": 1, "seed": 1007, "variant": 1},
     **{"steps": 1201, "checkpoints": [], "difficulty": "hard", "policy": "diffusion 0123"},
+    "camera_name_mapping": {"agentview_image": "front"},
 }
 """Other values than `other_value` finds."""
 

@@ -35,7 +35,7 @@ from lerobot_memobench.policies.checkpoint import (
     checkpoint_type,
     shipped_policies,
 )
-from lerobot_memobench.policies.compatibility import check_features
+from lerobot_memobench.policies.compatibility import cameras_read, check_features
 from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreement, require_statistics
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
@@ -138,6 +138,21 @@ def refused(checkpoint: Path, capsys: pytest.CaptureFixture[str], *more: str) ->
 def test_inputs_that_differ_are_refused(inputs: dict[str, Any], named: str, tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=re.escape(named)):
         check_features(str(tmp_path), config(**inputs), SHOWN, {})
+
+
+@pytest.mark.parametrize(
+    ("cameras", "empty", "read"),
+    [
+        (("camera1", "camera2", "camera3"), 0, 3),
+        (("camera1", "camera2", "camera3"), 1, 2),  # the command of SmolVLA's LIBERO checkpoint has empty_cameras=1
+        (("image", "image2", "empty_camera_0"), 1, 2),
+        (("camera1", "camera2", "camera3", "empty_camera_0"), 1, 3),
+        (("camera1",), 2, 1),
+    ],
+)
+def test_empty_cameras_fill_the_last_pictures(cameras: tuple[str, ...], empty: int, read: int) -> None:
+    policy = config("smolvla", cameras, empty_cameras=empty)
+    assert cameras_read(policy, {}) == [IMAGES + name for name in cameras[:read]]
 
 
 def test_shipped_policies_are_accepted() -> None:

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
+import lerobot_memobench.envs
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.convention import check_convention
-from lerobot_memobench.run.plan import plan_line
+from lerobot_memobench.policies.convention import chosen_convention
+from lerobot_memobench.run.arguments import split_arguments
+from lerobot_memobench.run.plan import plan_line, with_names
+from lerobot_memobench.run.settings import read_settings
 from lerobot_memobench.sim.convention import CONVENTIONS
 from tests.support.fake_loop import make_checkpoint
 
@@ -30,8 +35,14 @@ def features(cameras: tuple[str, ...]) -> dict[str, Any]:
 
 
 def saved(folder: Path, cameras: tuple[str, ...], **training: Any) -> Path:
-    """Write a checkpoint without weights that fit; ``training``: repo_id and root of its dataset, and rename_map."""
+    """Write a checkpoint without weights that fit.
+
+    ``training``: repo_id and root of its dataset, rename_map, and the same of its processor's ``step``.
+    """
     path = make_checkpoint(folder / "act", "act", input_features=features(cameras))
+    if step := training.pop("step", None):
+        steps = [{"registry_name": "rename_observations_processor", "config": {"rename_map": step}}]
+        (path / "policy_preprocessor.json").write_text(json.dumps({"name": "before", "steps": steps}))
     renamed = training.pop("rename_map", {})
     if training or renamed:
         (path / "train_config.json").write_text(json.dumps({"dataset": training, "rename_map": renamed}))
@@ -39,12 +50,11 @@ def saved(folder: Path, cameras: tuple[str, ...], **training: Any) -> Path:
 
 
 def outcome(path: Path, asked: str | None) -> str:
-    """Return "" if a checkpoint may run, else the message."""
+    """Return the convention in which a checkpoint runs, else the message."""
     try:
-        check_convention(str(path), PreTrainedConfig.from_pretrained(path), asked)
+        return str(chosen_convention(str(path), PreTrainedConfig.from_pretrained(path), asked))
     except MemobenchError as error:
         return str(error)
-    return ""
 
 
 @pytest.mark.parametrize(
@@ -53,6 +63,8 @@ def outcome(path: Path, asked: str | None) -> str:
         (THEIRS, {}, "libero"),
         (THEIRS, {"repo_id": "me/kitchen"}, "libero"),
         (NUMBERED, {"repo_id": "me/kitchen", "rename_map": RENAMED_LIBERO}, "libero"),
+        (NUMBERED, {"step": RENAMED_LIBERO}, "libero"),
+        (NUMBERED, {"step": RENAMED}, "upright"),
         (("image", "empty_camera_0"), {"repo_id": "HuggingFaceVLA/libero"}, "libero"),
         (NUMBERED, {"repo_id": "lerobot/libero_object_image"}, "libero"),
         (OURS, {"repo_id": "physical-intelligence/libero"}, "libero"),
@@ -70,11 +82,12 @@ def test_what_a_checkpoint_states(
     tmp_path: Path, cameras: tuple[str, ...], training: dict[str, Any], expected: str | None
 ) -> None:
     path = saved(tmp_path, cameras, **training)
-    accepted = {asked for asked in (None, "upright", "libero") if not outcome(path, asked)}
-    assert accepted == {"libero": {"libero"}, "upright": {None, "upright"}, None: {"upright", "libero"}}[expected]
-    for asked in {None, "upright", "libero"} - accepted:
-        message = outcome(path, asked)
-        for one in [expected] if expected else ["upright", "libero"]:
+    found = {asked: outcome(path, asked) for asked in (None, "upright", "libero")}
+    runs = {asked: convention for asked, convention in found.items() if convention in CONVENTIONS}
+    both = {"upright": "upright", "libero": "libero"}
+    assert runs == ({None: expected, expected: expected} if expected else both)
+    for message in set(found.values()) - {*CONVENTIONS}:
+        for one in [expected] if expected else both:
             assert f"lerobot eval env=memobench policy={path} convention={one}" in message
         assert "lerobot-eval" in message
         assert "--env.convention=" in message
@@ -90,17 +103,17 @@ def test_the_dataset_on_this_machine_decides(tmp_path: Path, convention: str) ->
     info = {"codebase_version": "v3.0", "total_episodes": 1, "features": described}
     (tmp_path / "libero_scenes" / "meta" / "info.json").write_text(json.dumps(info))
     path = saved(tmp_path, ("image",), repo_id="local/libero_scenes", root=str(tmp_path / "libero_scenes"))
-    assert not outcome(path, convention)
-    assert outcome(path, {"upright": "libero", "libero": "upright"}[convention])
+    assert outcome(path, None) == outcome(path, convention) == convention
+    assert "expects pictures" in outcome(path, {"upright": "libero", "libero": "upright"}[convention])
 
 
 def test_no_pictures_no_convention(tmp_path: Path) -> None:
     objects = {"observation.environment_state": {"type": "ENV", "shape": [208]}}
     path = make_checkpoint(tmp_path / "act", "act", input_features=objects)
-    assert not outcome(path, None)
+    assert outcome(path, None) == "None", "that of the environment"
     policy = make_policy_config("memobench_mem", perception="objects", detector="package", device="cpu")
     with pytest.raises(MemobenchError, match="its detector reads them"):
-        check_convention(None, policy, "libero")
+        chosen_convention(None, policy, "libero")
 
 
 def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:
@@ -108,8 +121,9 @@ def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:
     pairs = ({"wrist_image": "image2"}, {"image": "image2", "wrist_image": "image"})
     for names in pairs:
         renamed = {f"observation.images.{old}": f"observation.images.{new}" for old, new in names.items()}
-        with pytest.raises(MemobenchError, match="expects pictures of convention=libero"):
-            plan_line([*line, f"rename_map={json.dumps(renamed)}"])
+        for words in ([], ["convention=libero"]):
+            with pytest.raises(MemobenchError, match="found upright in rename_map, which does not mirror pictures"):
+                plan_line([*line, f"rename_map={json.dumps(renamed)}", *words])
     with pytest.raises(MemobenchError, match="did you mean 'libero'"):
         plan_line([*line, "convention=liberu"])
     ours = saved(tmp_path / "ours", OURS)
@@ -120,14 +134,63 @@ def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:
     assert plan.environment.features_map["pixels/image2"] == "observation.images.image2"
 
 
+def test_the_names_of_a_training_are_those_of_its_evaluation(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Where the environment has them, and no other names were asked for."""
+    names = {
+        f"observation.images.{old}": f"observation.images.{new}" for old, new in zip(THEIRS, NUMBERED, strict=True)
+    }
+    path = saved(tmp_path, NUMBERED, repo_id="lerobot/libero", rename_map=names | {"observation.images.top": "top"})
+    asked = read_settings(split_arguments(["env=memobench", f"policy={path}"]))
+    for convention, expected in (("libero", names), ("upright", dict([*names.items()][:1]))):
+        assert with_names(asked, MemobenchEnvConfig(convention=convention)).rename_map == expected
+    mine = replace(asked, rename_map={"observation.images.image": "mine"})
+    assert with_names(mine, MemobenchEnvConfig(convention="libero")) == mine
+    assert outcome(path, None) == "libero"
+    assert f"pictures have convention=libero, as in the training of {path}" in caplog.text
+
+
+def test_gymnasium(tmp_path: Path) -> None:
+    """A loop of one's own asks for the convention of its checkpoint; LeRobot's `make_policy` compares the names."""
+    for cameras, convention in ((THEIRS, "libero"), (OURS, "upright")):
+        path = saved(tmp_path / convention, cameras)
+        policy = PreTrainedConfig.from_pretrained(path)
+        policy.pretrained_path = path
+        made = chosen_convention(str(path), policy, None)
+        env = gymnasium.make(f"memobench/{STOVE}-v0", convention=made)
+        assert {*env.observation_space["pixels"]} == {*cameras}
+        assert chosen_convention(str(path), policy, env.unwrapped.settings.convention) == convention
+        (other,) = {*CONVENTIONS} - {convention}
+        env = gymnasium.make(f"memobench/{STOVE}-v0", convention=other)
+        with pytest.raises(MemobenchError, match=f"expects pictures of convention={convention}.*, and found {other}"):
+            chosen_convention(str(path), policy, env.unwrapped.settings.convention)
+
+
+@pytest.mark.parametrize("mode", ["ee6d", "auto"])
+def test_lerobots_command_cannot_run_an_xvla(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
+    """It would get LIBERO's pipelines, of absolute poses."""
+    path = make_checkpoint(tmp_path / "xvla", "xvla", input_features=features(THEIRS), action_mode=mode)
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--env.type=memobench", f"--policy.path={path}"])
+    with pytest.raises(MemobenchError, match={"ee6d": "absolute poses", "auto": "run `lerobot eval"}[mode]):
+        MemobenchEnvConfig(tasks=STOVE, log_dir=str(tmp_path / "log")).create_envs(1)
+    if mode == "ee6d":
+        with pytest.raises(MemobenchError, match="absolute poses of two hands"):
+            plan_line(["env=memobench", f"tasks={STOVE}", "episodes=1", f"policy={path}"])
+
+
 def test_camera_name_mapping_of_a_command(tmp_path: Path) -> None:
     """A checkpoint with the names of a LIBERO model card needs no ``rename_map``."""
     names = {"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}
     path = saved(tmp_path, NUMBERED, rename_map=RENAMED_LIBERO)
-    line = ["env=memobench", f"tasks={STOVE}", "episodes=1", f"policy={path}", "convention=libero"]
+    line = ["env=memobench", f"tasks={STOVE}", "episodes=1", f"policy={path}"]
     plan = plan_line([*line, f"camera_name_mapping={json.dumps(names)}"])
     assert plan.settings.portable["env"]["camera_name_mapping"] == names
     assert plan.environment.features_map["pixels/camera2"] == "observation.images.camera2"
+    unclear = saved(tmp_path / "unclear", NUMBERED)
+    mapping = f"camera_name_mapping={json.dumps(names)}"
+    assert plan_line([*line[:3], f"policy={unclear}", mapping]).environment.convention == "libero"
+    ours = saved(tmp_path / "ours", OURS)
+    with pytest.raises(MemobenchError, match=r"expects pictures of convention=upright.*, and found libero"):
+        plan_line([*line[:3], f"policy={ours}", mapping])
     for bad in ("camera1", "[camera1]", "{"):
         with pytest.raises(MemobenchError, match="expected a mapping"):
             plan_line([*line, f"camera_name_mapping={bad}"])
@@ -142,8 +205,16 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
         monkeypatch.setattr(sys, "argv", [command, "--env.type=memobench", f"--policy.path={path}", *flags])
         return MemobenchEnvConfig(tasks=STOVE, log_dir=str(tmp_path / "log"), **settings).create_envs(1)
 
+    assert _shown(envs(theirs)) == {"image", "image2"}
     with pytest.raises(MemobenchError, match=r"--policy\.path=.*--env\.convention=libero"):
-        envs(theirs)
+        envs(theirs, "--env.convention=upright")
+    settings = tmp_path / "settings.yaml"
+    settings.write_text("env: {type: memobench, convention: upright}")
+    with pytest.raises(MemobenchError, match="and found upright"):
+        envs(theirs, f"--config_path={settings}")
+    names = {"observation.images.wrist_image": "observation.images.image2"}
+    with pytest.raises(MemobenchError, match="which does not mirror pictures"):
+        envs(theirs, f"--rename_map={json.dumps(names)}")
     with pytest.raises(MemobenchError, match="may expect upright pictures or mirrored ones"):
         envs(unclear)
     assert _executed(envs(theirs, "--env.convention=libero", convention="libero")) == 100
@@ -165,6 +236,12 @@ def test_lerobots_commands_evaluate_with_the_plans_of_their_policies(
     file.write_text(json.dumps({"dataset": {"repo_id": "local/demos"}, "policy": {"type": "vqbet"}}))
     monkeypatch.setattr(sys, "argv", ["lerobot_train.py", f"--config_path={file}"])
     assert _executed(MemobenchEnvConfig(suite="strict", tasks="10").create_envs(1)) == 5
+
+
+def _shown(suites: Any) -> set[str]:
+    """Return the names of the pictures that environments show."""
+    ((env,),) = (suite.values() for suite in suites.values())
+    return {*env.single_observation_space["pixels"]}
 
 
 def _executed(suites: Any) -> int | None:

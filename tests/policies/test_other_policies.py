@@ -24,7 +24,8 @@ from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.arguments import call_lerobot
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.lerobots_trainer import trainer_in_this_process
-from tests.support.tiny_paligemma import shrink_paligemma, word_tokenizer
+from tests.support.tiny_paligemma import shrink_paligemma
+from tests.support.tiny_smolvlm import tiny_smolvlm
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 STATE, OBJECTS, PRIVILEGED = "observation.state", "observation.environment_state", "privileged.environment_state"
@@ -138,51 +139,17 @@ def test_pi(dataset: Path, tmp_path: Path, name: str) -> None:
     )
 
 
-@pytest.fixture
-def tiny_smolvlm(tmp_path: Path) -> Path:
-    """A folder with the configuration and processor of a small SmolVLM."""
-    from transformers import SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
-
-    folder = tmp_path / "smolvlm"
-    tokenizer = word_tokenizer(
-        get_task(TASK).language,
-        fake_image_token="<fake_token_around_image>",
-        image_token="<image>",
-        end_of_utterance_token="<end_of_utterance>",
-        global_image_token="<global-img>",
-        video_token="<video>",
-    )
-    text = {
-        "hidden_size": 48,
-        "intermediate_size": 64,
-        "num_hidden_layers": 2,
-        "num_attention_heads": 4,
-        "num_key_value_heads": 2,
-        "head_dim": 12,
-        "vocab_size": len(tokenizer),
-        "pad_token_id": tokenizer.pad_token_id,
-        "max_position_embeddings": 512,
-    }
-    vision = {
-        "hidden_size": 32,
-        "intermediate_size": 64,
-        "num_hidden_layers": 1,
-        "num_attention_heads": 2,
-        "image_size": 512,
-        "patch_size": 16,
-    }
-    image = tokenizer.convert_tokens_to_ids("<image>")
-    SmolVLMConfig(text_config=text, vision_config=vision, scale_factor=4, image_token_id=image).save_pretrained(folder)
-    SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor()).save_pretrained(folder)
-    return folder
-
-
 @pytest.mark.slow
-def test_smolvla(dataset: Path, tmp_path: Path, tiny_smolvlm: Path) -> None:
+def test_smolvla(dataset: Path, tmp_path: Path) -> None:
     train_and_roll_out(
         dataset,
         tmp_path,
-        *("policy=smolvla", f"policy.vlm_model_name={tiny_smolvlm}", "policy.num_vlm_layers=2", "policy.num_steps=2"),
+        *(
+            "policy=smolvla",
+            f"policy.vlm_model_name={tiny_smolvlm(tmp_path, get_task(TASK).language)}",
+            "policy.num_vlm_layers=2",
+            "policy.num_steps=2",
+        ),
         *("policy.chunk_size=4", "policy.n_action_steps=4"),
     )
 

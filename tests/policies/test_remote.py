@@ -88,6 +88,22 @@ def test_openpi_questions_hold_the_inputs_of_its_libero_servers() -> None:
     assert np.array_equal(third["video.front"], pictures(4))
 
 
+def test_a_server_states_the_convention_of_its_policy() -> None:
+    libero = batch(0)
+    libero[f"{OBS_IMAGES}.image2"] = libero.pop(f"{OBS_IMAGES}.wrist_image")
+    for stated, runs, refused in (("libero", libero, batch(0)), ("upright", batch(0), libero)):
+        asks_for = f"expects pictures of convention={stated}, and found .*; give convention={stated}"
+        frames: list[Any] = [("hello", {**hello()[0][1], "observation_params": {"trained_convention": stated}})]
+        openpi, scripted = PolicyServer(metadata={"trained_convention": stated}), ScriptedServer(hello=frames)
+        with openpi, scripted:
+            for settings in ({"port": openpi.port}, {"port": scripted.port, "dialect": "vla_eval"}):
+                RemotePolicy(RemoteConfig(**settings)).select_action(runs)  # type: ignore[arg-type]
+                with pytest.raises(MemobenchError, match=asks_for):
+                    RemotePolicy(RemoteConfig(**settings)).select_action(refused)  # type: ignore[arg-type]
+    with PolicyServer(metadata={"trained_convention": ["of", "another", "kind"]}) as server:
+        make(server).select_action(batch(0))
+
+
 def test_each_environment_has_its_own_connection_and_episode() -> None:
     """Row 2 ends and repeats step 1; row 1 begins another episode with the last batch."""
     with PolicyServer(counting) as server:

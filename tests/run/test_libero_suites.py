@@ -115,7 +115,7 @@ def test_refusals_are_one_sentence(
     assert not fake_loop.ran
 
 
-def test_checkpoints_of_liberos_pictures_alone_are_accepted(
+def test_checkpoints_run_on_the_pictures_of_their_training(
     fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]
 ) -> None:
     picture = {"type": "VISUAL", "shape": [3, 256, 256]}
@@ -124,8 +124,9 @@ def test_checkpoints_of_liberos_pictures_alone_are_accepted(
         pictures = {f"observation.images.{camera}": picture for camera in ("image", wrist)}
         features = {"input_features": {**pictures, "observation.state": state}, "output_features": {"action": action}}
         make_checkpoint(Path(name), "act", **features)
-    assert plan_line([*LINE[:1], *LINE[2:], "policy=./mirrored"]).environment.convention == "libero"
-    found = error(capsys, "suite=libero_object", "policy=./upright")
+    for name, convention in (("mirrored", "libero"), ("upright", "upright")):
+        assert plan_line([*LINE[:1], *LINE[2:], f"policy=./{name}"]).environment.convention == convention
+    found = error(capsys, "suite=libero_object", "convention=libero", "policy=./upright")
     assert "expects pictures of convention=upright" in found
     assert "and found libero" in found
 
@@ -227,7 +228,8 @@ def test_lerobots_names_choose_suite_and_tasks() -> None:
 
 
 def test_lerobot_eval_gets_environments_by_suite_and_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["lerobot-eval", "--seed=100", "--eval.n_episodes=5"])
+    line = ["lerobot-eval", "--env.type=memobench", "--policy.type=memobench_random", "--policy.device=cpu"]
+    monkeypatch.setattr("sys.argv", [*line, "--seed=100", "--eval.n_episodes=5"])
     config = MemobenchEnvConfig(task="libero_goal,libero_10", task_ids=[0, 3], log_dir=str(tmp_path))
     found = config.create_envs(2)
     assert {suite: [*envs] for suite, envs in found.items()} == {"libero_goal": [0, 3], "libero_10": [0, 3]}
@@ -236,6 +238,6 @@ def test_lerobot_eval_gets_environments_by_suite_and_id(tmp_path: Path, monkeypa
         (300, "libero", 100),
         (520, "libero", 100),
     ]
-    monkeypatch.setattr("sys.argv", ["lerobot-eval", "--eval.n_episodes=51"])
+    monkeypatch.setattr("sys.argv", [*line, "--eval.n_episodes=51"])
     with pytest.raises(MemobenchError, match="50 initial states"):
         MemobenchEnvConfig(task="libero_goal", log_dir=str(tmp_path)).create_envs(1)

@@ -47,14 +47,21 @@ class PolicyServer:
 
     Args:
         answer: question -> answer; a `str` is sent as text, as a traceback would be. die_at: the question (from 0) over
-            which the server dies. port: 0 for a free one.
+            which the server dies. port: 0 for a free one. metadata: of the server.
 
     Attributes:
         heard: (number of the connection, question), in the order of arrival.
     """
 
-    def __init__(self, answer: Answer = zeros, *, die_at: int | None = None, port: int = 0) -> None:
-        self.answer, self.die_at = answer, die_at
+    def __init__(
+        self,
+        answer: Answer = zeros,
+        *,
+        die_at: int | None = None,
+        port: int = 0,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        self.answer, self.die_at, self.metadata = answer, die_at, metadata or {"served": "zeros"}
         self.heard: list[tuple[int, dict[str, Any]]] = []
         self.connections: list[ServerConnection] = []
         self._server = serve(self._talk, "127.0.0.1", port, compression=None, max_size=None)
@@ -66,7 +73,7 @@ class PolicyServer:
         number = len(self.connections)
         self.connections.append(connection)
         try:
-            connection.send(msgpack.packb({"served": "zeros"}))
+            connection.send(msgpack.packb(self.metadata))
             while True:
                 question = msgpack.unpackb(connection.recv(), object_hook=from_wire)
                 if self.die_at is not None and len(self.heard) >= self.die_at:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy_config
 
@@ -20,10 +23,11 @@ from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS
+from lerobot_memobench.run.arguments import read_arguments, split_arguments
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.training.configuration import check_environment
 from lerobot_memobench.training.features import detections
-from lerobot_memobench.training.view import Choice, write_view
+from lerobot_memobench.training.view import Choice, viewed, write_view
 from tests.support.fake_loop import make_checkpoint
 
 NAMES = ("observation.images.image", "observation.images.image2")
@@ -140,6 +144,49 @@ def test_evaluations_during_a_training_follow_the_dataset(both: dict[str, Path])
             else:
                 with pytest.raises(MemobenchError, match=f"set env.convention={name}"):
                     check_environment(config, meta, meta.features)
+
+
+def test_a_checkpoint_continues_on_pictures_of_its_convention(both: dict[str, Path], tmp_path: Path) -> None:
+    """Also by the loop of memory policies, which makes the same check."""
+    for name, cameras in (("libero", ("image", "image2")), ("upright", ("image", "wrist_image"))):
+        path = checkpoint(tmp_path / name, *cameras)
+        config: Any = SimpleNamespace(
+            policy=PreTrainedConfig.from_pretrained(path), env=None, rename_map={}, resume=False
+        )
+        config.policy.pretrained_path = path
+        for dataset in both:
+            meta = LeRobotDataset("local/data", root=both[dataset]).meta
+            if dataset == name:
+                check_environment(config, meta, meta.features)
+            else:
+                with pytest.raises(
+                    MemobenchError, match=f"convention={name}.*has convention={dataset}.*--convention {name}"
+                ):
+                    check_environment(config, meta, meta.features)
+
+
+def test_names_of_pictures_in_a_continued_training(
+    both: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of the checkpoint's training, where the dataset has them; else the error proposes a map."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path = checkpoint(tmp_path, "camera1", "camera2", "camera3")
+    words = [f"policy={path}", f"dataset={both['libero']}"]
+
+    def renamed() -> Any:
+        found = viewed(read_arguments("train", split_arguments(words)), None, None, lambda note: None)
+        return json.loads(str(found.get("rename_map")))
+
+    names = {
+        f"observation.images.{old}": f"observation.images.camera{k + 1}" for k, old in enumerate(("image", "image2"))
+    }
+    with pytest.raises(MemobenchError, match=re.escape(f"rename_map='{json.dumps(names)}'")):
+        renamed()
+    training = {"dataset": {"repo_id": "lerobot/libero"}, "rename_map": names | {"observation.images.top": "top"}}
+    (path / "train_config.json").write_text(json.dumps(training))
+    assert renamed() == names
+    words.append(f"rename_map={json.dumps(dict(zip(names, [*names.values()][::-1], strict=True)))}")
+    assert renamed() != names
 
 
 def test_a_detector_reads_upright_pictures(both: dict[str, Path]) -> None:

@@ -23,7 +23,7 @@ from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
-from lerobot_memobench.policies.convention import check_convention, trained_convention
+from lerobot_memobench.policies.convention import chosen_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.arguments import SHORT_FORMS, policy_config, read_arguments, split_arguments
@@ -213,7 +213,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
         raise MemobenchError(f"{raw.root} has no {CLOCK[0]}; name a dataset of `memobench generate`, or none")
     path = config.pretrained_path
     if path is not None:
-        check_convention(str(path), config, convention_of(raw.meta.features))
+        chosen_convention(str(path), config, convention_of(raw.meta.features))
         check_weights(path, config)
     whole, numbers = TrainPipelineConfig(DatasetConfig(repository, root=root), policy=config), np.arange(raw.num_frames)
     torch.manual_seed(0)

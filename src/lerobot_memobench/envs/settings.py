@@ -121,11 +121,11 @@ class EnvSettings:
     obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
     convention: str = setting(
         None,
-        "pictures upright, or mirrored and named as in LIBERO's data; the default follows the suite",
+        "pictures upright, or mirrored and named as in LIBERO's data; the default follows suite and names",
         [*CONVENTIONS],
     )
     camera_name_mapping: dict[str, str] | None = setting(  # noqa: RUF009 - its default is None
-        None, "with convention=libero: LIBERO's name of each camera -> name of its picture"
+        None, "LIBERO's name of each camera -> name of its picture; means convention=libero"
     )
     observation_height: int = setting(IMAGE_SIZE, "height of pictures, pixels", least=SMALLEST)
     observation_width: int = setting(IMAGE_SIZE, "width of pictures, pixels", least=SMALLEST)
@@ -282,9 +282,10 @@ class EnvSettings:
     def usual(self) -> dict[str, Any]:
         """Defaults that follow from other settings."""
         limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
+        named = self.suite in limits or self.camera_name_mapping is not None
         return {
             "horizon": limits.get(self.suite, self.degree.horizon),
-            "convention": MIRRORED if self.suite in limits else UPRIGHT,
+            "convention": MIRRORED if named else UPRIGHT,  # as in LeRobot's environment `libero`
         }
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
@@ -18,12 +18,15 @@ if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
 CONFIG_FILE = "config.json"
+TRAIN_CONFIG = "train_config.json"
 WEIGHTS_FILE = "model.safetensors"
 ADAPTER_FILE = "adapter_model.safetensors"
 CHECKPOINTS, LAST = "checkpoints", "last"
 """LeRobot's folder of a training run's checkpoints, and its link to the last one."""
 PREPROCESSOR_FILE = "policy_preprocessor.json"
 POSTPROCESSOR_FILE = "policy_postprocessor.json"
+RENAMING = "rename_observations_processor"
+"""LeRobot's processor step that gives observations the names of a policy."""
 RANDOM_IF_MISSING = ("pi0", "pi05", "pi0_fast")
 """LeRobot's policies that act with random weights if there are none."""
 ADVICE = "copy or train the checkpoint again"
@@ -43,10 +46,11 @@ class Feature(TypedDict, total=False):
 
 
 class StepConfig(TypedDict, total=False):
-    """Settings of a normalising step."""
+    """Settings of a normalising or a renaming step."""
 
     norm_map: dict[str, str]
     features: dict[str, Feature]
+    rename_map: dict[str, str]
 
 
 class Step(TypedDict, total=False):
@@ -408,22 +412,41 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
 
 
 def statistics_shapes(path: str | Path, revision: str | None = None) -> dict[str, tuple[int, ...]]:
-    """Return the observations and actions of a checkpoint's training data with their shapes; {} without statistics.
+    """Return the observations and actions that a policy was trained on with their shapes; {} without statistics.
 
-    They come from the statistics, because the configuration of a policy that began with another checkpoint may list
-    that checkpoint's features.
+    They come from the statistics of its data, because the configuration of a policy that began with another checkpoint
+    may list that checkpoint's features. LeRobot saves them by the names of the data.
     """
     file = _file_of(path, PREPROCESSOR_FILE, revision)
     if file is None:
         return {}
     states = [_file_of(path, file_name(name, f"state_file in {file}"), revision) for name in _state_files(file)]
+    renamed = trained_names(path, revision)
     return {
-        name.rpartition(".")[0]: shape
+        renamed.get(name.rpartition(".")[0], name.rpartition(".")[0]): shape
         for state in states
         if state is not None
         for name, shape in _shapes(state).items()
         if not name.endswith(".count")
     }
+
+
+def training_of(path: str | Path, revision: str | None = None) -> dict[str, Any]:
+    """Return the settings of a checkpoint's training (`TrainConfig`); {} if they are not there or not readable."""
+    with suppress(MemobenchError):
+        if (file := checkpoint_file(path, TRAIN_CONFIG, revision)) is not None:
+            return read_json(file, TrainConfig)
+    return {}
+
+
+def trained_names(path: str | Path, revision: str | None = None) -> dict[str, str]:
+    """Return the ``rename_map`` of a checkpoint's training: names in its data -> names of the policy."""
+    if found := training_of(path, revision).get("rename_map"):
+        return dict(found)
+    file = _file_of(path, PREPROCESSOR_FILE, revision)
+    steps = [] if file is None else read_json(file, Processor).get("steps", [])
+    configs = [step.get("config", {}) for step in steps if step.get("registry_name") == RENAMING]
+    return {old: new for config in configs for old, new in config.get("rename_map", {}).items()}
 
 
 def _state_files(preprocessor: Path) -> Iterator[str]:

@@ -49,6 +49,20 @@ def cure(missing: str, observed: Collection[str]) -> str:
     return f"it has {cameras or 'none'}. Map its names with --rename_map."
 
 
+def check_actions(path: str, policy: Any) -> None:
+    """Refuse a policy whose actions are not those of the environment whatever their number.
+
+    Raises:
+        MemobenchError: it is an XVLA of absolute poses.
+    """
+    if policy.type == "xvla" and policy.action_mode == "ee6d":
+        raise MemobenchError(
+            f"the policy {path} predicts absolute poses of two hands (action_mode=ee6d, as LIBERO's XVLA), and the "
+            "environment takes relative motions of one; train it with policy.action_mode=auto on a dataset of this "
+            "environment"
+        )
+
+
 def check_features(
     path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
 ) -> None:
@@ -66,12 +80,7 @@ def check_features(
     Raises:
         MemobenchError: an input differs.
     """
-    if policy.type == "xvla" and policy.action_mode == "ee6d":
-        raise MemobenchError(
-            f"the policy {path} predicts absolute poses of two hands (action_mode=ee6d, as LIBERO's XVLA), and the "
-            "environment takes relative motions of one; train it with policy.action_mode=auto on a dataset of this "
-            "environment"
-        )
+    check_actions(path, policy)
     if getattr(policy, "perception", None) == "any" or not policy.input_features:
         return
     trained = statistics_shapes(path)
@@ -102,14 +111,15 @@ def cameras_read(policy: Any, trained: Mapping[str, Any]) -> list[str]:
     """Return the cameras that a policy needs.
 
     A policy that fills missing pictures may list cameras of the checkpoint that its training began with; it needs those
-    of its training data, which its statistics name.
+    of its training data, which its statistics name. Without such names, LeRobot's ``policy.empty_cameras`` fills the
+    last ones.
     """
     cameras = list(policy.image_features)
     if not hasattr(policy, "empty_cameras"):
         return cameras
-    return [name for name in cameras if name in trained] or [
-        name for name in cameras if not name.startswith(EMPTY_CAMERA)
-    ]
+    named = [name for name in cameras if not name.startswith(EMPTY_CAMERA)]
+    filled = max(0, policy.empty_cameras - (len(cameras) - len(named)))
+    return [name for name in cameras if name in trained] or named[: max(1, len(named) - filled)]
 
 
 def _check_cameras(

@@ -1,4 +1,4 @@
-"""Refuse a checkpoint in pictures of another convention (`sim.convention`) than those of its training.
+"""Choose the convention of pictures (`sim.convention`) for a checkpoint: that of its training; refuse any other.
 
 The names of the cameras in its training data decide, then the dataset on this machine, then its repository. They do not
 depend on the ``rename_map`` of an evaluation.
@@ -6,23 +6,30 @@ depend on the ``rename_map`` of an evaluation.
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import yaml
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_info
+from lerobot_memobench.envs.observations import policy_features, policy_names
 from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.policies.checkpoint import TrainConfig, checkpoint_file, read_json, statistics_shapes
-from lerobot_memobench.policies.compatibility import cameras_read
+from lerobot_memobench.policies.checkpoint import statistics_shapes, trained_names, training_of
+from lerobot_memobench.policies.compatibility import cameras_read, check_actions
 from lerobot_memobench.policies.lerobot_config import quiet, read_lerobots_config
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
+
+logger = logging.getLogger(__name__)
 
 OF_LIBERO = ("lerobot/", "HuggingFaceVLA/", "physical-intelligence/")
 """Owners of LIBERO's data on the hub. Other datasets of that name may be of this package."""
@@ -33,14 +40,10 @@ LEROBOTS_COMMANDS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalP
 
 def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
     """Return the convention of a checkpoint (folder or repository), None if it is unclear, and what shows it."""
-    training: dict[str, Any] = {}
-    with suppress(MemobenchError):
-        file = checkpoint_file(path, "train_config.json")
-        training = {} if file is None else read_json(file, TrainConfig)
-    in_data = {new: old for old, new in (training.get("rename_map") or {}).items()}
+    in_data = {new: old for old, new in trained_names(path).items()}
     cameras = [in_data.get(name, name) for name in cameras_read(policy, statistics_shapes(path))]
     has = {convention: f"{OBS_IMAGES}.{wrist}" in cameras for convention, wrist in WRIST.items()}
-    given = training.get("dataset") or {}
+    given = training_of(path).get("dataset") or {}
     root, name = given.get("root") or "", given.get("repo_id") or ""
     why = f"cameras {', '.join(cameras)}; dataset {name or 'unknown'}"
     if has[MIRRORED]:
@@ -54,23 +57,29 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
     return (UPRIGHT if has[UPRIGHT] else None), why
 
 
-def check_convention(path: str | None, policy: Any, asked: str | None, usual: str = UPRIGHT) -> None:
-    """Refuse pictures of another convention than a policy's, and the suite's by default if its own is unclear.
+def chosen_convention(
+    path: str | None, policy: Any, asked: str | None, rename_map: Mapping[str, str] | None = None
+) -> str | None:
+    """Return the convention of the pictures for a policy: the one that was asked for, else that of its training.
+
+    None if none was and the policy reads no pictures, or has no checkpoint.
 
     Args:
         path: folder or repository of its checkpoint, or None. policy: its configuration.
-        asked: the convention that was named; None: none was, and pictures are as is usual in the suite.
-        usual: convention of the suite.
+        asked: the convention that was named, None if none was.
+        rename_map: of the evaluation. It may name the wrist camera of a convention, but it does not mirror pictures.
 
     Raises:
-        MemobenchError: naming the commands that run it.
+        MemobenchError: another one than the policy's was asked for, or none was and the policy's is unclear; it names
+            the commands that run it.
     """
-    check_choice("convention", asked or usual, [*WRIST])
+    if asked is not None:
+        check_choice("convention", asked, [*WRIST])
     found: str | None = UPRIGHT
     if getattr(policy, "uses_detector", False):
         why = "its detector reads them"
     elif path is None or not policy.image_features:
-        return
+        return asked
     else:
         found, why = trained_convention(path, policy)
     name = path or policy.type
@@ -80,28 +89,55 @@ def check_convention(path: str | None, policy: Any, asked: str | None, usual: st
             f"the policy {name} may expect upright pictures or mirrored ones as LIBERO's ({why}); run "
             f"`{command}{UPRIGHT}` or `{command}{MIRRORED}`, with lerobot-eval --env.convention="
         )
-    if found not in (None, asked or usual):
-        raise MemobenchError(
-            f"the policy {name} expects pictures of convention={found} ({why}), and found {asked or usual}; run "
-            f"`{command}{found}`, or `lerobot-eval --env.type=memobench --policy.path={name} --env.convention={found}`"
-        )
+    mapped = [convention for convention, wrist in WRIST.items() if f"{OBS_IMAGES}.{wrist}" in (rename_map or {})]
+    for other in (asked, *mapped):
+        if found is not None and other not in (None, found):
+            where = "" if other == asked else " in rename_map, which does not mirror pictures"
+            raise MemobenchError(
+                f"the policy {name} expects pictures of convention={found} ({why}), and found {other}{where}; run "
+                f"`{command}{found}`, or `lerobot-eval --env.type=memobench --policy.path={name} "
+                f"--env.convention={found}`"
+            )
+    if asked is None and found != UPRIGHT:
+        logger.warning("pictures have convention=%s, as in the training of %s (%s)", found, name, why)
+    return asked or found
 
 
-def check_lerobots_command(environment: Any) -> PreTrainedConfig | None:
+def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
     """Return the configuration of the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, else None.
 
-    The checkpoint of an evaluation is checked; a training may begin with any.
+    Set the convention for the checkpoint of an evaluation; a training may begin with any.
+
+    Raises:
+        MemobenchError: as of `chosen_convention`; or LeRobot's command would run the policy in LIBERO's pipelines.
     """
     command = Path(sys.argv[0]).name.replace("_", "-")
     kind = next((kind for name, kind in LEROBOTS_COMMANDS.items() if command.startswith(name)), None)
     if kind is None:
         return None
     with quiet():
-        policy = read_lerobots_config(kind, sys.argv[1:]).policy
-    path = parser.get_path_arg("policy")
-    if kind is TrainPipelineConfig or path is None:
+        config = read_lerobots_config(kind, sys.argv[1:])
+    path, policy = parser.get_path_arg("policy"), config.policy
+    if not isinstance(config, EvalPipelineConfig) or policy is None or path is None:
         return policy
-    usual = environment.settings.usual["convention"]
-    named = parser.parse_arg("env.convention") is not None or environment.convention != usual
-    check_convention(path, policy, environment.convention if named else None, usual)
+    check_actions(path, policy)
+    if policy.type == "xvla":
+        raise MemobenchError(
+            "lerobot-eval runs every XVLA with the processors of LIBERO, which mirror a picture and convert actions; "
+            f"run `lerobot eval env=memobench policy={path}`"
+        )
+    asked = _named_convention() or (MIRRORED if environment.camera_name_mapping else None)
+    found = chosen_convention(path, policy, asked, config.rename_map)
+    if found not in (None, environment.convention):  # with the names of its pictures
+        names = {"features": policy_features(), "features_map": policy_names()}
+        vars(environment).update(vars(replace(environment, **names, convention=found)))
     return policy
+
+
+def _named_convention() -> str | None:
+    """Return the convention that LeRobot's command line, or the file of its ``config_path``, names; None without it."""
+    file = parser.parse_arg("config_path")
+    found: Any = yaml.safe_load(Path(file).read_bytes()) if file and Path(file).is_file() else None
+    for part in ("env", "convention"):
+        found = found.get(part) if isinstance(found, dict) else None
+    return parser.parse_arg("env.convention") or found

@@ -23,7 +23,14 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.io import file_hash, files_below, read_json, write_file
 from lerobot_memobench.jobs.threads import cores, cpu_model
-from lerobot_memobench.policies.checkpoint import ADAPTER_FILE, WEIGHTS_FILE, TrainConfig, local_folder, portable_path
+from lerobot_memobench.policies.checkpoint import (
+    ADAPTER_FILE,
+    TRAIN_CONFIG,
+    WEIGHTS_FILE,
+    TrainConfig,
+    local_folder,
+    portable_path,
+)
 from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, tree_hash
 from lerobot_memobench.run.plan import EvaluationPlan
 
@@ -146,7 +153,7 @@ def training_facts(folder: Path) -> dict[str, Any] | None:
     digest of every episode that `memobench generate` made.
     """
     try:
-        config = read_json(folder / "train_config.json", TrainConfig, "it is ignored")
+        config = read_json(folder / TRAIN_CONFIG, TrainConfig, "it is ignored")
     except (FileNotFoundError, MemobenchError):
         return None
     dataset = config["dataset"]

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
 from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
-from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP, EnvSettings
+from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint
+from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
 from lerobot_memobench.policies.compatibility import check_features
-from lerobot_memobench.policies.convention import check_convention
+from lerobot_memobench.policies.convention import chosen_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import (
     EVALUATION_EPISODES,
@@ -35,6 +35,7 @@ from lerobot_memobench.protocol import (
     VALIDATION,
 )
 from lerobot_memobench.run.arguments import RUN_OPTIONS, Arguments, is_true, joined, split_arguments
+from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.tasks.libero_suites import NUM_STATES
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
@@ -158,16 +159,17 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
         check_choice("split", options.split, EVALUATED)
     asked = with_device(with_policy(asked), options)
     policy = policy_of(asked)
-    suite = asked.env.get("suite", PUBLISHED)
-    check_expert(policy, suite)
-    check_convention(asked.policy_path, policy, asked.env.get("convention"), EnvSettings(suite=suite).convention)
+    check_expert(policy, asked.env.get("suite", PUBLISHED))
+    named = asked.env.get("convention") or (MIRRORED if asked.env.get("camera_name_mapping") else None)
+    convention = chosen_convention(asked.policy_path, policy, named, asked.rename_map)
+    asked = asked if convention is None else replace(asked, env={**asked.env, "convention": convention})
     output = _output(asked, options, policy)
     log = Path(asked.env.get("log_dir") or output)
     asked = with_salt(with_batch_size(with_protocol(asked, options, policy), options, log, policy), options, log)
     environment = MemobenchEnvConfig(**{**asked.env, "log_dir": None, "resume": False})
     for name, value in vars(environment.settings_for(policy)).items():
         setattr(environment, name, value)
-    asked = replace(asked, env={**asked.env, **environment.gym_kwargs})
+    asked = with_names(replace(asked, env={**asked.env, **environment.gym_kwargs}), environment)
     grid = make_grid(asked, environment)
     plan = EvaluationPlan(asked, policy, environment, grid, output, log, options, tuple(command))
     check_policy_fits(plan)
@@ -354,6 +356,15 @@ def with_protocol(asked: EvaluationSettings, options: RunOptions, policy: PreTra
     if policy.type in SCRIPTED:
         asked = asked.env_default(**{SCRIPTED[policy.type]: True})
     return asked.env_default(videos=0 if asked.env.get("obs_type") == OBJECTS else VIDEO_EPISODES)
+
+
+def with_names(asked: EvaluationSettings, environment: MemobenchEnvConfig) -> EvaluationSettings:
+    """Return settings with the ``rename_map`` of the policy's training, as far as the environment has its names."""
+    if asked.policy_path is None or asked.rename_map:
+        return asked
+    observed = environment.features_map.values()
+    names = {old: new for old, new in trained_names(asked.policy_path).items() if old in observed}
+    return replace(asked, rename_map=names)
 
 
 def with_salt(asked: EvaluationSettings, options: RunOptions, log: Path) -> EvaluationSettings:

@@ -18,6 +18,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import check_features
+from lerobot_memobench.policies.convention import trained_convention
 from lerobot_memobench.policies.lerobot_config import read_lerobots_config
 from lerobot_memobench.sim.convention import convention_of
 
@@ -117,6 +118,24 @@ def with_features(policy: Any, features: dict[str, Any]) -> Any:
     return made
 
 
+def check_convention(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
+    """Refuse to continue a checkpoint's training on pictures of another convention.
+
+    Args:
+        features: of the dataset.
+    """
+    policy, stated = config.policy, convention_of(features)
+    if policy is None or policy.pretrained_path is None or config.resume or stated is None or not policy.image_features:
+        return
+    found, why = trained_convention(str(policy.pretrained_path), policy)
+    if found not in (None, stated):
+        raise MemobenchError(
+            f"the policy {policy.pretrained_path} was trained on pictures of convention={found} ({why}), and "
+            f"{meta.root} has convention={stated}; mirror them: `memobench view {meta.root} --convention {found} --out "
+            "<folder>`"
+        )
+
+
 def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
     """Refuse evaluations on the benchmark during a training on other cameras, sizes or conventions of pictures.
 
@@ -125,6 +144,7 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
     Args:
         features: of the dataset.
     """
+    check_convention(config, meta, features)
     if config.policy is None or getattr(config.env, "type", None) != "memobench":
         return
     env: Any = config.env

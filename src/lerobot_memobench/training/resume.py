@@ -15,6 +15,7 @@ import yaml
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import (
     LAST,
+    TRAIN_CONFIG,
     check_as_begun,
     check_processors,
     checkpoint_folder,
@@ -34,8 +35,6 @@ from lerobot_memobench.run.arguments import (
     whole_number,
 )
 
-TRAIN_CONFIG = "train_config.json"
-"""LeRobot's file of a training's configuration, in each checkpoint."""
 TRAINING_STEP = Path("training_state") / "training_step.json"
 OF_OPTIMIZER = ("optimizer.", "policy.optimizer_")
 """Beginnings of settings that a saved optimizer overrides."""

@@ -50,6 +50,7 @@ from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
+from lerobot_memobench.policies.checkpoint import trained_names
 from lerobot_memobench.policies.compatibility import keeps_sizes
 from lerobot_memobench.policies.lerobot_config import read_lerobots_config
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
@@ -150,8 +151,12 @@ def viewed(
     choice = choice_for(policy, meta.features, prompt_frames, obs_type)
     kept = choice.columns(meta.features)
     features = {new: meta.features[name] for name, new in kept.items()}
+    if policy.pretrained_path is not None and not config.rename_map and not arguments.has("rename_map"):
+        names = trained_names(policy.pretrained_path)
+        config.rename_map = {old: new for old, new in names.items() if old in features}
+        arguments = arguments.default("rename_map", json.dumps(config.rename_map))
     check_environment(config, meta, features)
-    check_inputs(policy, meta, features)
+    check_inputs(policy, meta, features, config.rename_map)
     sizes = [tuple(features[name]["shape"][:2]) for name in cameras_of(features)]
     if _is_ours(meta.features) and keeps_sizes(policy) and any(size != (IMAGE_SIZE, IMAGE_SIZE) for size in sizes):
         height, width = sizes[0]
@@ -192,9 +197,17 @@ def viewed(
     return completed.changed("dataset.root", folder).changed("dataset.repo_id", given.repo_id)
 
 
-def check_inputs(policy: Any, meta: Any, features: dict[str, Any]) -> None:
+def check_inputs(policy: Any, meta: Any, features: dict[str, Any], renamed: Mapping[str, str]) -> None:
     """Refuse inputs that a policy cannot have, such as two cameras of VQ-BeT; LeRobot does after opening the data."""
     made = with_features(policy, features)
+    read, there = [*made.image_features], {renamed.get(name, name): name for name in cameras_of(features)}
+    missing, free = ([name for name in one if name not in other] for one, other in ((read, there), (there, read)))
+    if missing and free:
+        guess = json.dumps(dict(zip((there[name] for name in free), missing, strict=False)))
+        raise MemobenchError(
+            f"the policy {policy.pretrained_path or policy.type} reads {', '.join(read)}, and {meta.root} has "
+            f"{', '.join(there.values())}; map its names, for example by rename_map='{guess}'"
+        )
     try:
         made.validate_features()
     except ValueError as error:

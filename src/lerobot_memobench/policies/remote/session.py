@@ -29,7 +29,7 @@ from lerobot_memobench.policies.remote.configuration_remote import (
 from lerobot_memobench.policies.remote.transports import ServerAway, Websocket
 from lerobot_memobench.policies.remote.vla_eval import VlaEval, episode_start, observation, png_map
 from lerobot_memobench.protocol import ACTION_DIM
-from lerobot_memobench.sim.convention import CONVENTIONS
+from lerobot_memobench.sim.convention import CONVENTIONS, STATED, WRIST
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +58,7 @@ class Session:
         self._speaks_vla_eval = self._dialect.protocol == VLA_EVAL
         self._transport = (VlaEval if self._speaks_vla_eval else Websocket)(address, config.timeout)
         self._connected = False
+        self._trained = ""  # the convention that the server states
         self._used = False  # whether the connection has served an episode
         self._frames: list[dict[str, Any]] = []  # by our names, not sent yet
         self._seen, self._execution_starts = 0, 0
@@ -71,12 +72,22 @@ class Session:
             MemobenchError: the server does not answer within ``connect_timeout``.
         """
         if not self._connected:
-            logger.info("connected with the policy server at %s: %s", self.address, short(self._open()))
-            self._connected = True
+            found = self._open()
+            logger.info("connected with the policy server at %s: %s", self.address, short(found))
+            self._connected, self._trained = True, str(found.get(STATED))
 
     def begin(self, row: Row) -> None:
-        """Start an episode on a connection of its own; the server's memory is cleared."""
+        """Start an episode on a connection of its own; the server's memory is cleared.
+
+        Raises:
+            MemobenchError: the server does not answer, or states another convention of pictures.
+        """
         self.connect()
+        if row.convention is not None and self._trained in WRIST and self._trained != row.convention:
+            raise MemobenchError(
+                f"the policy server at {self.address} expects pictures of convention={self._trained}, and found "
+                f"{row.convention}; give convention={self._trained}"
+            )
         if self._used:
             self._open()
         self._used, self._frames, self._seen, self._execution_starts = True, [], 0, 0
@@ -221,6 +232,11 @@ class Row:
         """Return an observation that is one integer, None if the environment has no such observation."""
         value = self.batch.get(f"{OBS_STR}.{name}")
         return None if value is None else round(float(value[self.number].reshape(-1)[0]))
+
+    @property
+    def convention(self) -> str | None:
+        """The convention of the pictures by the name of the wrist camera, None if it is unknown."""
+        return next((one for one, name in WRIST.items() if f"{OBS_IMAGES}.{name}" in self.batch), None)
 
     @property
     def blank(self) -> bool:

@@ -21,6 +21,7 @@ from websockets.exceptions import ConnectionClosed
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import short
 from lerobot_memobench.policies.remote.transports import ServerAway, Websocket, last_line, reason
+from lerobot_memobench.sim.convention import STATED
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +51,7 @@ class VlaEval(Websocket):
         self._number, self._in_episode, self._warned = 0, False, False
 
     def greet(self, patience: float) -> dict[str, Any]:
-        """Send hello, and return the server's name and version from its answer."""
+        """Send hello; return the server's name and version from its answer, and the convention that it states."""
         hello = {"harness_version": VERSION, "protocol_version": PROTOCOL, "benchmark": "MEMOBench"}
         self._say(HELLO, hello)
         kind, found = self._hear(patience)
@@ -64,7 +65,9 @@ class VlaEval(Websocket):
         if not self._warned and (others := other_formats(found)):
             logger.warning("the policy server at %s works with %s", self.address, "; ".join(others))
         self._warned = True
-        return {name: found[name] for name in ("model_server", "harness_version") if name in found}
+        asked = found.get("observation_params")
+        stated = {STATED: asked[STATED]} if isinstance(asked, dict) and STATED in asked else {}
+        return stated | {name: found[name] for name in ("model_server", "harness_version") if name in found}
 
     def exchange(self, question: dict[str, Any]) -> dict[str, Any]:
         """Send a question and return the payload of the answer."""
