@@ -68,7 +68,7 @@ def test_success_ends_an_episode(env: gymnasium.Env[Any, Any]) -> None:
 def test_horizon_truncates(env: gymnasium.Env[Any, Any]) -> None:
     env.reset(seed=9)
     assert [env.step(NOTHING)[2:4] for _ in range(3)] == [(False, False), (False, False), (False, True)]
-    assert env.unwrapped.record()["failure"] == "execution_failure"  # type: ignore[attr-defined]
+    assert env.unwrapped.record()["failure"] == "cut_off"  # type: ignore[attr-defined]
 
 
 def test_object_slots_are_refused() -> None:
@@ -104,7 +104,7 @@ def test_both_commands_and_vla_eval_run_the_same_episodes(tmp_path: Path, monkey
         benchmark.reset({**task, "episode_idx": number})
         while not (last := benchmark.step({"actions": NOTHING})).done:
             pass
-        assert benchmark.get_step_result(last) == {"success": False, "failure": "execution_failure"}
+        assert benchmark.get_step_result(last) == {"success": False, "failure": "cut_off"}
     with pytest.raises(MemobenchError, match="no initial state 50"):
         benchmark.reset({**task, "episode_idx": 50})
     benchmark.cleanup()

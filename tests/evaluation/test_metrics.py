@@ -228,6 +228,9 @@ def test_a_horizon_below_the_protocols_is_no_failure_of_memory() -> None:
     assert classify_failure(task, [40, None], False) == "stale_memory"
     assert classify_failure(task, [40, 50], False, cut_off=True) == "execution_failure"
     assert classify_failure(task, [40, 50], True, cut_off=True) is None
+    basket = get_task(task_names(suite="libero_object")[0])
+    assert classify_failure(basket, [], False, cut_off=True) == "cut_off", "it has no checkpoints"
+    assert classify_failure(basket, [], False) == "execution_failure"
     bowl = get_task(DEMO_TASK)
     assert classify_failure(bowl, [None], False, drift=True, cut_off=True) == "reference_drift", "what is known counts"
     procedure = get_task(PROCEDURES[0])

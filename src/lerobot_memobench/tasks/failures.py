@@ -62,7 +62,7 @@ def classify_failure(
         return found
     if task.memory_type == "procedural" and asks_order(task.goal) and _out_of_order(first_steps):
         return WRONG_ORDER
-    if cut_off and None in first_steps:
+    if cut_off and (not first_steps or None in first_steps):
         return CUT_OFF
     return HAND if None in first_steps and _memory_served(task, first_steps, ordered) else found
 
