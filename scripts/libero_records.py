@@ -87,8 +87,12 @@ def task_files() -> dict[str, Path]:
 # --- stock LIBERO ---
 
 
-def prepare() -> None:
-    """Import LIBERO, cache its last compiled model, and register boxes for the authors' scans."""
+COMPILED: dict[str, mujoco.MjModel] = {}
+"""XML -> LIBERO's last compiled model, before LIBERO moves its fixtures."""
+
+
+def cache_compiled() -> None:
+    """Let robosuite compile equal models in a row once, and without numba."""
     import copy
 
     import robosuite.macros as macros
@@ -96,15 +100,18 @@ def prepare() -> None:
     macros.ENABLE_NUMBA = False
     from robosuite.utils.binding_utils import MjSim
 
-    compiled: dict[str, mujoco.MjModel] = {}
-
     def from_xml_string(cls: type, xml: str) -> Any:
-        if xml not in compiled:
-            compiled.clear()
-            compiled[xml] = mujoco.MjModel.from_xml_string(xml)
-        return cls(copy.copy(compiled[xml]))
+        if xml not in COMPILED:
+            COMPILED.clear()
+            COMPILED[xml] = mujoco.MjModel.from_xml_string(xml)
+        return cls(copy.copy(COMPILED[xml]))
 
     MjSim.from_xml_string = classmethod(from_xml_string)
+
+
+def prepare() -> None:
+    """Import LIBERO, and register boxes for the authors' scans."""
+    cache_compiled()
     from libero.libero.envs.base_object import OBJECTS_DICT
 
     for folder in sorted(OWN_OBJECTS.iterdir()):

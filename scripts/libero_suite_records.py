@@ -27,9 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scripts.libero_records import (
+    COMPILED,
     NO_OP,
     RECORDS,
     STABILISATION_STEPS,
+    cache_compiled,
     fields,
     fingerprint,
     fixture_poses,
@@ -108,28 +110,6 @@ ALL = [Place(suite, index) for suite, count in SUITES.items() for index in range
 
 
 # --- stock LIBERO ---
-
-
-def prepare() -> None:
-    """Import LIBERO, and cache its last compiled model."""
-    import copy
-
-    import robosuite.macros as macros
-
-    macros.ENABLE_NUMBA = False
-    from robosuite.utils.binding_utils import MjSim
-
-    def from_xml_string(cls: type, xml: str) -> Any:
-        if xml not in COMPILED:
-            COMPILED.clear()
-            COMPILED[xml] = mujoco.MjModel.from_xml_string(xml)
-        return cls(copy.copy(COMPILED[xml]))
-
-    MjSim.from_xml_string = classmethod(from_xml_string)
-
-
-COMPILED: dict[str, mujoco.MjModel] = {}
-"""XML -> model, before LIBERO moves its fixtures."""
 
 
 def suite_of(place: Place) -> Any:
@@ -400,7 +380,7 @@ KINDS: dict[str, tuple[Callable[[Place, Any], Arrays], list[Place]]] = {
 
 def record(kinds: list[str], out: Path) -> None:
     """Make the missing records of some kinds, task by task."""
-    prepare()
+    cache_compiled()
     for place in ALL:
         missing = [kind for kind in kinds if place in KINDS[kind][1] and not (out / kind / place.file).exists()]
         env = None

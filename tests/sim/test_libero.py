@@ -20,7 +20,7 @@ from lerobot_memobench.sim.libero.scene import get_scene
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
-from tests.support.libero import RECORDS, record, simulate, some_of_all
+from tests.support.libero import RECORDS, record, recorded_answers, simulate, some_of_all
 from tests.support.scripts import load_script
 
 SCRIPT = load_script("libero_records")
@@ -102,13 +102,7 @@ def test_a_reset_settles_as_stock_libero(name: str) -> None:
 @pytest.mark.parametrize("name", SCRIPT.PREDICATES)
 def test_predicates_are_stock_liberos(name: str) -> None:
     sim, kept = simulate(name), record("predicates")
-    atoms = [Atom(word, tuple(names)) for word, *names in (str(one).split() for one in kept[f"{name}:atoms"])]
-    fixtures = dict(zip(sim.fixture_poses(), kept[f"{name}:fixtures"], strict=True))
-    state, found = np.zeros(sim.state_dim), []
-    for qpos in kept[f"{name}:qpos"]:
-        state[1 : 1 + sim.model.nq] = qpos / 1e6
-        sim.set_state(state, fixtures)
-        found.append([sim.holds(atom) for atom in atoms])
+    atoms, found = recorded_answers(sim, kept, name)
     differ = {
         str(atom): int(count) for atom, count in zip(atoms, (found != kept[f"{name}:answers"]).sum(axis=0), strict=True)
     }

@@ -17,9 +17,8 @@ from lerobot_memobench.sim.libero.classes import CLASSES, SUITE_CLASSES
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.libero_suites import LIBERO_SUITES, get_libero_task, initial_states, libero_tasks
-from tests.support.libero import record
+from tests.support.libero import record, recorded_answers
 from tests.support.scripts import load_script
 
 RECORDED = "3.3.7"
@@ -66,15 +65,8 @@ def test_a_reset_to_an_initial_state_equals_stock_libero(name: str) -> None:
 @pytest.mark.parametrize("name", SOME)
 def test_atoms_of_goals_equal_stock_libero(name: str) -> None:
     sim, kept = Simulation(get_libero_task(name)), record("suites")
-    atoms = [Atom(word, tuple(names)) for word, *names in (str(one).split() for one in kept[f"{name}:atoms"])]
-    fixtures = dict(zip(sim.fixture_poses(), kept[f"{name}:fixtures"], strict=True))
-    state, found = np.zeros(sim.state_dim), []
-    for qpos in kept[f"{name}:qpos"]:
-        state[1 : 1 + sim.model.nq] = qpos / 1e6
-        sim.set_state(state, fixtures)
-        held = [sim.holds(atom) for atom in atoms]
-        found.append([*held, all(held)])
-    assert np.array_equal(found, kept[f"{name}:answers"])
+    _, found = recorded_answers(sim, kept, name)
+    assert np.array_equal([[*held, all(held)] for held in found], kept[f"{name}:answers"])
     assert kept[f"{name}:answers"].any()
 
 

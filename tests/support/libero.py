@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.formula import Atom
 
 RECORDS = Path(__file__).parents[1] / "sim/libero"
 
@@ -21,6 +22,18 @@ def record(kind: str) -> dict[str, NDArray[Any]]:
     """Return what `scripts/libero_records.py` has recorded of a kind."""
     with np.load(RECORDS / f"{kind}.npz", allow_pickle=False) as stored:
         return dict(stored)
+
+
+def recorded_answers(sim: Simulation, kept: dict[str, NDArray[Any]], name: str) -> tuple[list[Atom], list[list[bool]]]:
+    """Return a task's recorded atoms, and their values in the simulator in each recorded state."""
+    atoms = [Atom(word, tuple(names)) for word, *names in (str(one).split() for one in kept[f"{name}:atoms"])]
+    fixtures = dict(zip(sim.fixture_poses(), kept[f"{name}:fixtures"], strict=True))
+    state, found = np.zeros(sim.state_dim), []
+    for qpos in kept[f"{name}:qpos"]:
+        state[1 : 1 + sim.model.nq] = qpos / 1e6
+        sim.set_state(state, fixtures)
+        found.append([sim.holds(atom) for atom in atoms])
+    return atoms, found
 
 
 KINDS_OF_SCENES = (

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.tasks.formula import (
@@ -87,6 +88,12 @@ class Problem:
     init: tuple[Atom, ...]
     goal: Formula
     unplaced: dict[Region, str] = field(default_factory=dict)
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """Return the attributes of `task.Task` that the file alone states."""
+        names = ("objects", "fixtures", "regions", "init", "objects_of_interest", "goal")
+        return {name: getattr(self, name) for name in names}
 
     def entity_kind(self, name: str) -> str | None:
         """Return "object", "fixture", "region" or None."""
