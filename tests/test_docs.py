@@ -34,6 +34,7 @@ from lerobot_memobench.run.command_line import (
     read_words,
     resolve_recipe,
     spelled,
+    typed,
 )
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.settings import read_settings
@@ -364,7 +365,8 @@ def check_lerobot(command: str, line: list[str]) -> None:
         given = take_training_options(resolve_recipe(given))[-1]
         given = {"dataset.repo_id": "none", **given}
     if HELP not in given:
-        read_words(command, given).build()
+        asked = read_words(command, given)
+        typed(asked.config, asked.settings)
 
 
 def is_place(pair: str) -> bool:

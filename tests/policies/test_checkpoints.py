@@ -321,7 +321,7 @@ FILES = {
     "train_config.json": {"dataset": {"repo_id": "me/it", "root": None, "episodes": None}, "steps": 5},
 }
 RECIPE = """# A recipe.
-policy: {type: act, chunk_size: 50}
+policy: {type: act, chunk_size: 100}
 dataset:
   repo_id: me/it
 steps: 100

@@ -565,16 +565,19 @@ def value_of(key: str, annotation: Any, value: Any) -> Any:
         raise MemobenchError(
             f"{key}={str(value)[:80]}: {key} holds settings; expected one of them, such as {key}.{next(iter(fields))}="
         )
-    if not isinstance(value, str):
-        return str(value) if kind is str and type(value) in (int, float) else value
-    optional = type(None) in typing.get_args(annotation)
-    if optional and (value in NULLS or (kind in PLAIN and value.lower() == "none")):  # `align=none` is a text
+    text = value.lower() if isinstance(value, str) else value
+    is_null = value is None or value in NULLS or (kind in PLAIN and text == "none")  # `align=none` is a text
+    if is_null and type(None) in typing.get_args(annotation):
         return None
     if kind in PLAIN:
+        if isinstance(value, bool) and kind is not bool:
+            raise MemobenchError(f"{key}={value}: expected {PLAIN[kind]}")
         try:
-            return draccus.decode(kind, value.lower())
-        except DecodingError:
-            raise MemobenchError(f"{key}={value}: expected {PLAIN[kind]}") from None
+            return draccus.decode(kind, text)
+        except (DecodingError, TypeError):
+            raise MemobenchError(f"{key}={str(value)[:80]}: expected {PLAIN[kind]}") from None
+    if not isinstance(value, str):
+        return str(value) if kind is str and type(value) in (int, float) else value
     if is_literal(kind) or is_enum(kind):
         return _listed(key, kind, value)
     if kind in (str, Path):

@@ -344,9 +344,12 @@ def _checked(known: Mapping[str, Any], name: str, value: Any) -> Any:
         raise _refused(key, value, "no card sets it")
     if any(part in (str, Path, Any, object) for part in parts):
         raise _refused(key, value, "it may name a file or a repository")
-    if isinstance(value, str) and not (kind in PLAIN or is_enum(kind) or is_literal(kind)):
+    if not (kind in PLAIN or is_enum(kind) or is_literal(kind)):
         try:
-            checked(parsed(value), bool | float | list[bool | float | list[bool | float]])
+            checked(
+                parsed(value) if isinstance(value, str) else value,
+                bool | float | list[bool | float | list[bool | float]],
+            )
         except Malformed:
             raise _refused(key, value, "expected numbers") from None
     return value_of(key, known[name], value)

@@ -168,4 +168,5 @@ def policy_of(asked: EvaluationSettings) -> PreTrainedConfig:
         MemobenchError: the type is not known, or a value cannot be read. Others are the configuration's own.
     """
     found: PreTrainedConfig = build(PreTrainedConfig, asked.policy, "policy")
+    found.pretrained_path = None  # it does not depend on the place of the checkpoint
     return found
