@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import sys
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from datetime import datetime
 from functools import partial
@@ -45,7 +46,7 @@ from lerobot_memobench.tasks.catalogue import (
     task_folder,
     task_index,
 )
-from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.libero_suites import check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
@@ -58,6 +59,20 @@ UNKNOWN_PLAN = (
     "is unknown here; set {}, to 1 for a policy that plans at every step"
 )
 """Message of a refusal, without the setting's name."""
+
+
+@contextmanager
+def ending_lerobots_command() -> Iterator[None]:
+    """End ``lerobot-eval`` and ``lerobot-train`` with the message of a `MemobenchError`, as this package's commands."""
+    try:
+        yield
+    except MemobenchError as error:
+        command = Path(sys.argv[0]).stem.replace("_", "-")
+        if command not in ("lerobot-eval", "lerobot-train"):
+            raise
+        print(f"{command}: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
 
 _TYPES = typing.get_type_hints(EnvSettings)
 # LeRobot reads `--env.<name>` into fields of the configuration itself.
@@ -99,6 +114,7 @@ class MemobenchEnvConfig(_WithSettings):
     features: dict[str, PolicyFeature] = field(default_factory=policy_features)
     features_map: dict[str, str] = field(default_factory=policy_names)
 
+    @ending_lerobots_command()
     def __post_init__(self) -> None:
         suites, self.tasks = lerobots_choice(self.task, self.task_ids, self.suite, self.tasks)
         self.__dict__.update(suite=suites[0])
@@ -163,6 +179,7 @@ class MemobenchEnvConfig(_WithSettings):
             )
         return found
 
+    @ending_lerobots_command()
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return ``{memory type: {task id: vector env}}``; the first reset of an env starts its simulation.
 
@@ -200,15 +217,14 @@ class MemobenchEnvConfig(_WithSettings):
         """
         if self.suite not in LIBERO_SUITES or "eval" not in Path(sys.argv[0]).name:
             return
-        if parser.parse_arg("env.seed_base") is None:
-            from lerobot.configs.eval import EvalPipelineConfig
+        from lerobot.configs.default import EvalConfig
+        from lerobot.configs.eval import EvalPipelineConfig
 
-            self.__dict__.update(seed_base=int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0))
-        if (episodes := int(parser.parse_arg("eval.n_episodes") or 0)) > NUM_STATES:
-            raise MemobenchError(
-                f"found eval.n_episodes={episodes}; tasks of {self.suite} have {NUM_STATES} initial states: ask for at "
-                f"most {NUM_STATES}"
-            )
+        seed = int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0)
+        if parser.parse_arg("env.seed_base") is None:
+            self.__dict__.update(seed_base=seed)
+        episodes = int(parser.parse_arg("eval.n_episodes") or EvalConfig.n_episodes)
+        check_states(self.suite, seed - self.seed_base, episodes)
 
     def declare_plans(self, policy: Any) -> None:
         """Set the actions and frames of a plan from a policy's configuration; the rest is the user's.

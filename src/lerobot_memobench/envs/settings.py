@@ -85,6 +85,7 @@ UPSTREAM_ONLY = {
 LIBERO_ONLY = {
     **{"difficulty": STANDARD, "protocol": BY_PAPER, "referent": REFERENTS[0], "oracle_memory": False},
     **{"evidence": False, "salt": None, "expert_action": False, "blind_action": False, "obs_type": PIXELS},
+    "demonstration_prompt": True,
     **MEMORY_CONTROLS,
 }
 """Settings with a fixed value in LIBERO's suites. Their tasks have no checkpoints, prompts, variants and expert, and
@@ -175,7 +176,7 @@ class EnvSettings:
                 f"control_mode out, and evaluate a policy of control_mode={RELATIVE}"
             )
         if self.suite in LIBERO_SUITES:
-            self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
+            self._require(LIBERO_ONLY, f"suite={self.suite}, without memory checkpoints, prompts, variants and expert,")
         self._check_pictures()
         if self.suite == STRICT:
             self._set(referent=DRAWN)
@@ -266,7 +267,7 @@ class EnvSettings:
             if asked != value:
                 raise MemobenchError(
                     f"{name} is {str(asked).lower()}, but {reason} requires "
-                    f"{name}={str(value).lower()}; leave one of the two out"
+                    f"{name}={str(value).lower()}; leave {name} out"
                 )
 
     def _set(self, **values: Any) -> None:

@@ -125,7 +125,7 @@ def _section(run: Run) -> Section:
     """Return the section of one evaluation, without a title."""
     summary = run.summary
     inputs = inputs_sentence(summary.inputs)
-    prefixes = () if summary.of_libero else (prefix_table(summary),)
+    prefixes = (prefix_table(summary),) if any(summary.prefix.values()) else ()
     made = (memory_types_table(summary), tasks_table(summary), *prefixes, failures_table(summary))
     return Section(
         "",
