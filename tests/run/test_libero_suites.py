@@ -95,6 +95,7 @@ def test_published_settings_are_as_before(fake_loop: FakeLoop) -> None:
         (["task=libero_object,strict"], "run them by two commands, the second with suite=strict"),
         (["task=spatial,libero_object"], "run them by two commands, the second with tasks=spatial"),
         (["suite=libero_long"], "LIBERO-Long is 'libero_10'"),
+        (["suite=libero_object", "policy=memobench_strict"], "suite=libero_object has pictures alone"),
         (["task=libero_object", "task_ids=0"], "expected ids of LIBERO's tasks in a list"),
         (["task=libero_object", "suite=libero_goal"], "both given"),
         (["task=libero_object", "task_ids=[0]", "tasks=1"], "both given"),

@@ -71,7 +71,7 @@ def ending_lerobots_command() -> Iterator[None]:
         if command not in ("lerobot-eval", "lerobot-train"):
             raise
         print(f"{command}: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        raise SystemExit(2) from error
 
 
 _TYPES = typing.get_type_hints(EnvSettings)
@@ -108,9 +108,9 @@ class MemobenchEnvConfig(_WithSettings):
     log_dir: str | None = None
     resume: bool = False
     fps: int = CONTROL_HZ
-    check_policy: ClassVar[Callable[[MemobenchEnvConfig], Any]] = lambda config: None
-    """Checks and returns the configuration of the policy of LeRobot's own commands, None if unknown; set by
-    `registration`, because policies depend on environments."""
+    check_policy: ClassVar[Callable[[MemobenchEnvConfig], tuple[Any, Acting]]] = lambda config: (None, UNKNOWN_POLICY)
+    """Checks the policy of LeRobot's own commands; returns its configuration, None if unknown, and its description for
+    the log. Set by `registration`, because policies depend on environments."""
     features: dict[str, PolicyFeature] = field(default_factory=policy_features)
     features_map: dict[str, str] = field(default_factory=policy_names)
 
@@ -184,15 +184,16 @@ class MemobenchEnvConfig(_WithSettings):
         """Return ``{memory type: {task id: vector env}}``; the first reset of an env starts its simulation.
 
         A suite of LIBERO replaces the memory type, as in LeRobot's environment ``libero``. LeRobot's own commands call
-        this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
+        this; ``prompt_in=auto`` then means `STEPS`.
         """
         if self.task is not None:
             return self._envs_of_suites(self.task.split(","), n_envs, use_async_envs)
         self._number_as_lerobot()
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
-        self.declare_plans(type(self).check_policy(self))
-        opened = self.opener(None, UNKNOWN_POLICY, self.resolved_log_dir())
+        policy, by = type(self).check_policy(self)
+        self.declare_plans(policy)
+        opened = self.opener(None, by, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
             suites.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)

@@ -176,7 +176,7 @@ class EnvSettings:
                 f"control_mode out, and evaluate a policy of control_mode={RELATIVE}"
             )
         if self.suite in LIBERO_SUITES:
-            self._require(LIBERO_ONLY, f"suite={self.suite}, without memory checkpoints, prompts, variants and expert,")
+            self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
         self._check_pictures()
         if self.suite == STRICT:
             self._set(referent=DRAWN)

@@ -22,11 +22,12 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_info
-from lerobot_memobench.envs.observations import policy_features, policy_names
+from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, Acting
+from lerobot_memobench.envs.observations import check_obs_type, policy_features, policy_names
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import statistics_shapes, trained_names, training_of
 from lerobot_memobench.policies.compatibility import cameras_read, check_actions
-from lerobot_memobench.policies.lerobot_config import quiet, read_lerobots_config
+from lerobot_memobench.policies.lerobot_config import acting, quiet, read_lerobots_config
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
 
 logger = logging.getLogger(__name__)
@@ -103,23 +104,28 @@ def chosen_convention(
     return asked or found
 
 
-def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
-    """Return the configuration of the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, else None.
+def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None, Acting]:
+    """Return the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, and its description for the log.
 
-    Set the convention for the checkpoint of an evaluation; a training may begin with any.
+    The configuration is None elsewhere; the description is known in evaluations. Set the convention for the checkpoint
+    of an evaluation; a training may begin with any.
 
     Raises:
-        MemobenchError: as of `chosen_convention`; or LeRobot's command would run the policy in LIBERO's pipelines.
+        MemobenchError: as of `chosen_convention` and `check_obs_type`; or LeRobot's command would run the policy in
+            LIBERO's pipelines.
     """
     command = Path(sys.argv[0]).name.replace("_", "-")
     kind = next((kind for name, kind in LEROBOTS_COMMANDS.items() if command.startswith(name)), None)
     if kind is None:
-        return None
+        return None, UNKNOWN_POLICY
     with quiet():
         config = read_lerobots_config(kind, sys.argv[1:])
     path, policy = parser.get_path_arg("policy"), config.policy
-    if not isinstance(config, EvalPipelineConfig) or policy is None or path is None:
-        return policy
+    if not isinstance(config, EvalPipelineConfig) or policy is None:
+        return policy, UNKNOWN_POLICY
+    check_obs_type(policy, environment.obs_type, environment.suite)
+    if path is None:
+        return policy, acting(policy, None, None, environment.settings)
     check_actions(path, policy)
     if policy.type == "xvla":
         raise MemobenchError(
@@ -131,7 +137,7 @@ def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
     if found not in (None, environment.convention):  # with the names of its pictures
         names = {"features": policy_features(), "features_map": policy_names()}
         vars(environment).update(vars(replace(environment, **names, convention=found)))
-    return policy
+    return policy, acting(policy, path, None, environment.settings)
 
 
 def _named_convention() -> str | None:

@@ -218,7 +218,7 @@ def check_policy_fits(plan: EvaluationPlan) -> None:
     policy, path = plan.policy, plan.policy_path
     if path is not None:
         check_checkpoint(path)
-    check_obs_type(policy, plan.environment.obs_type)
+    check_obs_type(policy, plan.environment.obs_type, plan.environment.suite)
     if path is not None:
         with quiet():
             check_as_trained(path, policy)
@@ -348,7 +348,7 @@ def with_protocol(asked: EvaluationSettings, options: RunOptions, policy: PreTra
     if asked.episodes is None:
         asked = replace(asked, episodes=EVIDENCE_EPISODES if asked.env.get("evidence") else EVALUATION_EPISODES)
     asked = asked.env_default(seed_base=asked.seed)  # episodes are counted from the first
-    if (observed := obs_type_of(policy)) not in (None, PIXELS):
+    if (observed := obs_type_of(policy)) not in (None, PIXELS) and asked.env.get("suite") not in LIBERO_SUITES:
         asked = asked.env_default(obs_type=observed)
     if policy.type in SCRIPTED:
         asked = asked.env_default(**{SCRIPTED[policy.type]: True})

@@ -204,7 +204,7 @@ def complete_training(arguments: LerobotArguments, notify: Callable[[str], None]
             notify(f"note: '{path}' was trained with {was}; this training continues from its weights with {now}")
     environment: Any = env_config(arguments)
     if environment is not None and environment.type == "memobench":
-        check_obs_type(policy, environment.obs_type)
+        check_obs_type(policy, environment.obs_type, environment.suite)
     steps = whole_number(arguments.get("steps"))
     if steps is not None and steps < SHORT_TRAINING and arguments.get("resume") != "true":
         arguments = arguments.default("log_freq", max(1, steps // 10))
