@@ -232,6 +232,15 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
     assert envs(unclear, "--env.convention=upright")
 
 
+def test_several_suites_take_the_convention_of_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = ["--env.type=memobench", f"--policy.path={saved(tmp_path, OURS)}", "--eval.n_episodes=1"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *flags])
+    config = MemobenchEnvConfig(task="libero_object,libero_goal", task_ids=[0], log_dir=str(tmp_path / "log"))
+    for suite, envs in config.create_envs(1).items():
+        assert _shown({suite: envs}) == {*OURS}
+    assert {key for key in config.features_map if key.startswith("pixels/")} == {f"pixels/{name}" for name in OURS}
+
+
 @pytest.mark.parametrize(("policy", "executed"), [("--policy.type=act", 100), ("--policy.type=vqbet", 5), ("", 100)])
 def test_lerobots_commands_evaluate_with_the_plans_of_their_policies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str, executed: int

@@ -208,6 +208,7 @@ class MemobenchEnvConfig(_WithSettings):
             own = asdict(self.settings.changed(suite=suite))
             one = replace(self, task=None, log_dir=str(folder / suite), **own)
             found |= one.create_envs(n_envs, use_async_envs)
+            self.features, self.features_map = one.features, one.features_map  # of the checkpoint's convention
         return found
 
     def _number_as_lerobot(self) -> None:

@@ -531,7 +531,7 @@ def comparison_phrase(found: Comparison) -> str:
 def comparison_csv(found: Comparison) -> str:
     """Return all differences of a comparison as CSV, one a row."""
     entries = [_entry(row) for row in found.differences]
-    header = list(max(entries, key=len))
+    header = list(dict.fromkeys(name for entry in entries for name in entry))
     return csv_text([[entry.get(name) for name in header] for entry in entries], header)
 
 
