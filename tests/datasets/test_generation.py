@@ -286,5 +286,5 @@ def test_held_frames_are_part_of_the_estimate(recorded, tmp_path, monkeypatch):
     assert str(refused.value).startswith("2 demonstrations of about 1,060 frames and 7,800 held ones, in about 1 min")
     assert "about 23.4 MiB" in str(refused.value)
     with pytest.raises(MemobenchError, match=r"about 828\.1 KiB"):
-        generate([task], 2, tmp_path / "ds", images=False)
+        generate([task], 2, tmp_path / "other", images=False)
     assert recorded == []

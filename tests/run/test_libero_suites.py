@@ -12,6 +12,7 @@ import pytest
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line
 from lerobot_memobench.tasks.libero_suites import libero_tasks
@@ -206,6 +207,15 @@ def test_tables_hold_ids_in_liberos_order(fake_loop: FakeLoop, capsys: pytest.Ca
     assert [(row["scope"], row["id"]) for row in rows] == [("libero_object", ""), (chosen[0], "2"), (chosen[1], "7")]
 
 
+def test_replan_intervals_are_drawn(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=out"]) == 0
+    for steps in (1, 5):
+        write_episodes(Path(f"k{steps}"), [{**line, "replan_steps": steps} for line in read_episodes(Path("out"))])
+    assert memobench(["report", "A=k1", "A=k5", "--figures", "figures"]) == 0
+    assert {path.name for path in Path("figures").glob("*.png")} == {"outcomes.png", "replan.png"}
+    assert "Suites by replan" in capsys.readouterr().out
+
+
 def test_suites_are_averaged(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
     line = ["eval", *RANDOM, "episodes=2", "task_ids=[0]"]
     assert lerobot([*line, "task=libero_10,libero_spatial", "output_dir=a"]) == 0
@@ -226,7 +236,12 @@ def test_suites_are_averaged(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[
     shown = capsys.readouterr().out
     assert "| evaluation | inputs | k | libero\\_spatial SR | libero\\_10 SR | average SR |".replace("\\", "") in shown
     assert "| B | not recorded | – | **50.0** | **100.0** | **75.0** |" in shown
+    assert memobench(["report", "A=a", "B=long", "B=spatial"]) == 0
+    shown = capsys.readouterr().out
+    assert ["spat.", "10", "aver."] in [line.split() for line in shown.splitlines()]
+    assert "Evaluation in spatial, long." in shown
     assert memobench(["compare", "A=a", "B=long"]) == 2
+    assert memobench(["compare", "A=a", "B=a/libero_10"]) == 2
     for words in (["a", "long"], ["A=a/libero_10", "A=long", "A=spatial"]):
         assert memobench(["report", *words]) == 2
         assert "are of the suite libero_10" in capsys.readouterr().err

@@ -7,7 +7,6 @@ joined to one, whose average is the mean over suites.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -227,7 +226,7 @@ def _joined(parts: Sequence[Run]) -> Run:
     return replace(
         parts[0],
         name="+".join(dict.fromkeys(part.name for part in parts)),
-        folder=Path(os.path.commonpath([part.folder for part in parts])),
+        folder=parts[0].folder.parent,
         records=[record for part in parts for record in part.records],
         protocol={**protocol, "tasks": sorted(name for part in parts for name in part.protocol["tasks"])},
         notes=[f"{part.suites[0]}: {note}" for part in parts for note in part.notes],

@@ -112,7 +112,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     for run in runs:
         section = _section(run)
         if len(runs) > 1:  # their rates by task are joined
-            where = f"Evaluation in {run.folder}."
+            where = f"Evaluation in {', '.join(str(each.folder) for each in run.evaluations)}."
             tables = tuple(table for table in section.tables if table.key != "tasks")
             section = replace(section, title=run.name, tables=tables, sentences=(where, *section.sentences))
         found += [section, *_evidence(run)]

@@ -7,16 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from lerobot_memobench.envs.episode_log import with_omitted
 from lerobot_memobench.envs.settings import PICTURES
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import (
-    MEMORY_TYPE,
-    METRICS,
-    SUITE,
-    Rate,
-    Row,
-    Summary,
-    percent,
-    policy_inputs,
-)
+from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, METRICS, SUITE, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,

@@ -412,7 +412,8 @@ def terminal_table(table: Table) -> RichTable | Unbroken:
     )
     for column, (title, name) in enumerate(zip(table.titles, table.header, strict=True)):
         # Rates are so narrow that the title of a long group does not fit over them.
-        short = title if len(title) <= 4 else f"{title[:4]}."
+        short = title.removeprefix("libero_")
+        short = short if len(short) <= 4 else f"{short[:4]}."
         header = f"{short}\n{name}" if title else name
         result.add_column(header, justify="left" if table.is_text(column) else "right", overflow="fold")
     for index in range(len(table.rows)):

@@ -102,11 +102,7 @@ def initial_states(name: str) -> NDArray[np.float64]:
 
 
 def check_states(suite: str, first: int, episodes: int) -> None:
-    """Check that the tasks of a suite have an initial state for each of ``episodes`` episodes from ``first`` on.
-
-    Raises:
-        MemobenchError: they have not.
-    """
+    """Raise `MemobenchError` unless the tasks of a suite have the initial states of ``episodes`` from ``first`` on."""
     if not 0 <= first <= first + episodes <= NUM_STATES:
         raise MemobenchError(
             f"found the initial states {first} to {first + episodes - 1}, and tasks of {suite} have {NUM_STATES} "

@@ -83,13 +83,12 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
     reads: list[dict[int, list[Chunk]]] = []
     evaluations = read_runs(folders)
     for run, slug in zip(evaluations, _slugs([run.name for run in evaluations]), strict=True):
-        found, read, notes = dict[int, Path](), dict[int, list[Chunk]](), list[str]()
-        first = 0
+        found, read, notes, first = dict[int, Path](), dict[int, list[Chunk]](), list[str](), 0
         for each in run.evaluations:
             videos, misfits = find_videos(each.folder, each.records)
-            reads_of, others = find_reads(each.folder, each.records, each.protocol)
+            own_reads, others = find_reads(each.folder, each.records, each.protocol)
             found |= {first + k: video for k, video in videos.items()}
-            read |= {first + k: chunks for k, chunks in reads_of.items()}
+            read |= {first + k: chunks for k, chunks in own_reads.items()}
             notes += [*misfits, *others]
             first += len(each.records)
         names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}{VIDEO}" for k in found}
