@@ -68,7 +68,7 @@ def nearest(given: str, known: Iterable[str], count: int = 3) -> str:
     if not words:
         return "there is none"
     likeness = {word: difflib.SequenceMatcher(None, word, given).ratio() for word in words}
-    least = max(0.4, max(likeness.values()) - 0.15)  # a word that is much nearer is the only one
+    least = max(0.4, 3 * max(likeness.values()) - 2)  # a word that is much nearer is the only one
     close = sorted((word for word in words if likeness[word] >= least), key=lambda word: -likeness[word])[:count]
     if close:
         return "did you mean " + " or ".join(repr(word) for word in close) + "?"

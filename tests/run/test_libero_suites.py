@@ -95,6 +95,8 @@ def test_published_settings_are_as_before(fake_loop: FakeLoop) -> None:
         (["task=libero_object", "task_ids=[0,"], "expected ids of LIBERO's tasks in a list"),
         (["task=libero_object,strict"], "run them by two commands, the second with suite=strict"),
         (["task=spatial,libero_object"], "run them by two commands, the second with tasks=spatial"),
+        (["task=published,strict", "policy=memobench_random"], "'published' is a suite, no task; set suite=published"),
+        (["suite=libero_object", "tasks=pick_up_the_mil_and_place_it_in_the_basket"], "place_it_in_the_basket'?"),
         (["suite=libero_long"], "LIBERO-Long is 'libero_10'"),
         (["suite=libero_object", "policy=memobench_strict"], "suite=libero_object has pictures alone"),
         (["task=libero_object", "task_ids=0"], "expected ids of LIBERO's tasks in a list"),
@@ -124,6 +126,7 @@ def test_refusals_are_one_sentence(
     found = error(capsys, *words)
     assert expected in found
     assert found.count("\n") == 0
+    assert "' or 'pick_up_the_butter" not in found, "a near name hides others"
     assert not fake_loop.ran
 
 

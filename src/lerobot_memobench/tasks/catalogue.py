@@ -208,7 +208,7 @@ def lerobots_choice(task: str | None, task_ids: Any, suite: str, tasks: str) -> 
             check_choice("task", each, LIBERO_SUITES)
         if suite not in (PUBLISHED, suites[0]):
             raise MemobenchError(f"task={task} and suite={suite} are both given; leave one of them out")
-    elif words and suite not in words:
+    elif words and {*words} != {suite}:
         if tasks != "all":
             raise MemobenchError(f"env.task={task} and env.tasks={tasks} are both given; remove env.task")
         tasks = str(task)
