@@ -53,18 +53,23 @@ def check_choice(name: str, value: object, known: Sequence[str]) -> None:
         raise MemobenchError(f"{name} is {value!r}; {nearest(str(value), known)}")
 
 
-REMOVED = {"world": "it was removed: LIBERO's scenes are the only ones"}
-"""Setting of earlier versions -> the reason of its absence."""
+HINTS = {
+    "world": "it was removed: LIBERO's scenes are the only ones",
+    "libero_long": "LIBERO-Long is 'libero_10'",
+}
+"""Word of an earlier version or of a paper -> the hint in place of near words."""
 
 
 def nearest(given: str, known: Iterable[str], count: int = 3) -> str:
     """Return a hint that names the known words nearest to ``given``, or all of them if there are few."""
-    if given.rpartition(".")[2] in REMOVED:
-        return REMOVED[given.rpartition(".")[2]]
+    if given.rpartition(".")[2] in HINTS:
+        return HINTS[given.rpartition(".")[2]]
     words = sorted(known)
     if not words:
         return "there is none"
-    close = difflib.get_close_matches(given, words, n=count, cutoff=0.4)
+    likeness = {word: difflib.SequenceMatcher(None, word, given).ratio() for word in words}
+    least = max(0.4, 3 * max(likeness.values()) - 2)  # a word that is much nearer is the only one
+    close = sorted((word for word in words if likeness[word] >= least), key=lambda word: -likeness[word])[:count]
     if close:
         return "did you mean " + " or ".join(repr(word) for word in close) + "?"
     if len(words) <= 12:

@@ -114,6 +114,8 @@ def test_both_commands_and_vla_eval_run_the_same_episodes(tmp_path: Path, monkey
     for folder in (ours, theirs, harness):
         assert memobench(["report", str(folder)]) == 0
         assert json.loads((folder / "report.json").read_text())["memory_types"] == {"libero_goal": {"n": 2, "SR": 0.0}}
+    assert (theirs / "report.md").read_text().startswith("# memobench_random")
+    assert len({record["policy"] for folder in (ours, theirs) for record in read_episodes(folder)}) == 1
 
 
 def test_lerobots_environment_observes_what_its_libero_observes() -> None:

@@ -117,7 +117,8 @@ def test_texts_are_the_tasks_own(tmp_path: Path) -> None:
     stove = data["tasks"][STOVE]
     assert stove["language"] == get_task(STOVE).language
     assert stove["variants"]["0"]["checkpoints"][1]["texts"] == list(get_task(STOVE).checkpoints[1].language)
-    assert data["tasks"]["task_of_mine"] == {"memory_type": "temporal", "language": "task of mine", "variants": {}}
+    own = {"memory_type": "temporal", "id": None, "language": "task of mine", "variants": {}}
+    assert data["tasks"]["task_of_mine"] == own
     assert data["operations"]["U"]["colour"] == "#{:02x}{:02x}{:02x}".format(*OPERATION_COLOURS["U"])
 
 

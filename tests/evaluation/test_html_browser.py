@@ -455,5 +455,10 @@ def test_a_suite_of_libero_shows_success_alone(browser: Any, tmp_path: Path) -> 
     shown = browser.js("document.querySelector('#overview').innerText")
     assert "50.0" in shown
     assert not {word for word in ("MSR", "Average", "Checkpoints", "undefined") if word in shown}
+    assert "0 · Pick up the alphabet soup" in shown
     show(browser, tmp_path / "made" / "index.html", f"view=episodes&ep={SOUP}.1")
-    assert "Checkpoint" not in browser.js("document.querySelector('#detail').innerText")
+    browser.js("document.querySelector('#keys').showModal()")
+    everything = browser.js("document.body.innerText + document.querySelector('#detail').innerText").lower()
+    memory = ("checkpoint", "memory", "subgoal", "operation", "storage", "msr", "stale", "first held", "undefined")
+    assert not {word for word in memory if word in everything.replace("memobench", "")}
+    assert "the goal was not reached within the step limit" in everything

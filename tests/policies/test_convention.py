@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -165,12 +168,20 @@ def test_gymnasium(tmp_path: Path) -> None:
             chosen_convention(str(path), policy, env.unwrapped.settings.convention)
 
 
+@contextmanager
+def refused(message: str) -> Iterator[None]:
+    """Expect that LeRobot's command ends with one sentence."""
+    with pytest.raises(SystemExit) as stop:
+        yield
+    assert re.search(message, str(stop.value.__cause__))
+
+
 @pytest.mark.parametrize("mode", ["ee6d", "auto"])
 def test_lerobots_command_cannot_run_an_xvla(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
     """It would get LIBERO's pipelines, of absolute poses."""
     path = make_checkpoint(tmp_path / "xvla", "xvla", input_features=features(THEIRS), action_mode=mode)
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--env.type=memobench", f"--policy.path={path}"])
-    with pytest.raises(MemobenchError, match={"ee6d": "absolute poses", "auto": "run `lerobot eval"}[mode]):
+    with refused({"ee6d": "absolute poses", "auto": "run `lerobot eval"}[mode]):
         MemobenchEnvConfig(tasks=STOVE, log_dir=str(tmp_path / "log")).create_envs(1)
     if mode == "ee6d":
         with pytest.raises(MemobenchError, match="absolute poses of two hands"):
@@ -206,19 +217,28 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
         return MemobenchEnvConfig(tasks=STOVE, log_dir=str(tmp_path / "log"), **settings).create_envs(1)
 
     assert _shown(envs(theirs)) == {"image", "image2"}
-    with pytest.raises(MemobenchError, match=r"--policy\.path=.*--env\.convention=libero"):
+    with refused(r"--policy\.path=.*--env\.convention=libero"):
         envs(theirs, "--env.convention=upright")
     settings = tmp_path / "settings.yaml"
     settings.write_text("env: {type: memobench, convention: upright}")
-    with pytest.raises(MemobenchError, match="and found upright"):
+    with refused("and found upright"):
         envs(theirs, f"--config_path={settings}")
     names = {"observation.images.wrist_image": "observation.images.image2"}
-    with pytest.raises(MemobenchError, match="which does not mirror pictures"):
+    with refused("which does not mirror pictures"):
         envs(theirs, f"--rename_map={json.dumps(names)}")
-    with pytest.raises(MemobenchError, match="may expect upright pictures or mirrored ones"):
+    with refused("may expect upright pictures or mirrored ones"):
         envs(unclear)
     assert _executed(envs(theirs, "--env.convention=libero", convention="libero")) == 100
     assert envs(unclear, "--env.convention=upright")
+
+
+def test_several_suites_take_the_convention_of_the_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = ["--env.type=memobench", f"--policy.path={saved(tmp_path, OURS)}", "--eval.n_episodes=1"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *flags])
+    config = MemobenchEnvConfig(task="libero_object,libero_goal", task_ids=[0], log_dir=str(tmp_path / "log"))
+    for suite, envs in config.create_envs(1).items():
+        assert _shown({suite: envs}) == {*OURS}
+    assert {key for key in config.features_map if key.startswith("pixels/")} == {f"pixels/{name}" for name in OURS}
 
 
 @pytest.mark.parametrize(("policy", "executed"), [("--policy.type=act", 100), ("--policy.type=vqbet", 5), ("", 100)])

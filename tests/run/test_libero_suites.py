@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
+import draccus
 import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line
 from lerobot_memobench.tasks.libero_suites import libero_tasks
@@ -85,6 +88,17 @@ def test_published_settings_are_as_before(fake_loop: FakeLoop) -> None:
         (["task=libero_object,libero_goa"], "did you mean 'libero_goal'"),
         (["suite=libero_objct"], "did you mean 'libero_object'"),
         (["task=libero_object", "task_ids=[10]", "policy=memobench_random"], "numbered 0 to 9"),
+        (["task=libero_object,libero_90", "task_ids=[10]"], "tasks of the libero_object suite are numbered 0 to 9"),
+        (["suite=libero_90", "tasks=90"], "`memobench tasks --suite libero_90` lists them"),
+        (["task=libero_object", "task_ids=[-1]"], "expected ids of LIBERO's tasks in a list"),
+        (["task=libero_object", "task_ids=[]"], "expected ids of LIBERO's tasks in a list"),
+        (["task=libero_object", "task_ids=[0,"], "expected ids of LIBERO's tasks in a list"),
+        (["task=libero_object,strict"], "run them by two commands, the second with suite=strict"),
+        (["task=spatial,libero_object"], "run them by two commands, the second with tasks=spatial"),
+        (["task=published,strict", "policy=memobench_random"], "'published' is a suite, no task; set suite=published"),
+        (["suite=libero_object", "tasks=pick_up_the_mil_and_place_it_in_the_basket"], "place_it_in_the_basket'?"),
+        (["suite=libero_long"], "LIBERO-Long is 'libero_10'"),
+        (["suite=libero_object", "policy=memobench_strict"], "suite=libero_object has pictures alone"),
         (["task=libero_object", "task_ids=0"], "expected ids of LIBERO's tasks in a list"),
         (["task=libero_object", "suite=libero_goal"], "both given"),
         (["task=libero_object", "task_ids=[0]", "tasks=1"], "both given"),
@@ -112,6 +126,7 @@ def test_refusals_are_one_sentence(
     found = error(capsys, *words)
     assert expected in found
     assert found.count("\n") == 0
+    assert "' or 'pick_up_the_butter" not in found, "a near name hides others"
     assert not fake_loop.ran
 
 
@@ -175,6 +190,69 @@ def test_evaluations_are_compared(fake_loop: FakeLoop, capsys: pytest.CaptureFix
     assert "MSR" not in capsys.readouterr().out
 
 
+def test_tables_hold_ids_in_liberos_order(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    chosen = [libero_tasks("libero_object")[number] for number in (2, 7)]
+    assert sorted(chosen) == chosen[::-1], "the order of ids is not that of names"
+    line = ["eval", *RANDOM, "task=libero_object", "task_ids=[2,7]", "episodes=2"]
+    assert lerobot([*line, "output_dir=a"]) == 0
+    assert [words.split()[:2] for words in capsys.readouterr().out.splitlines() if "_and_place_it_" in words][-2:] == [
+        ["2", chosen[0]],
+        ["7", chosen[1]],
+    ]
+    assert f"| 2 | `{chosen[0]}` | 2 | 50.0 " in Path("a/report.md").read_text()
+    assert lerobot([*line, "output_dir=b"]) == 0
+    assert memobench(["report", "a", "b", "--format", "markdown", "--format", "csv", "--out", "both"]) == 0
+    assert memobench(["compare", "a", "b", "--format", "markdown", "--format", "csv", "--out", "both"]) == 0
+    assert f"| 7 | `{chosen[1]}` | 50.0 | 50.0 |" in Path("both/report.md").read_text()
+    assert f"| 7 | `{chosen[1]}` | SR | 2 | 50.0 | 50.0 |" in Path("both/compare.md").read_text()
+    assert f"\n7,{chosen[1]},50.0," in Path("both/tables/joined.csv").read_text()
+    rows = [*csv.DictReader(Path("both/compare.csv").read_text().splitlines())]
+    assert [(row["scope"], row["id"]) for row in rows] == [("libero_object", ""), (chosen[0], "2"), (chosen[1], "7")]
+
+
+def test_replan_intervals_are_drawn(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    assert lerobot([*COMMAND, "output_dir=out"]) == 0
+    for steps in (1, 5):
+        write_episodes(Path(f"k{steps}"), [{**line, "replan_steps": steps} for line in read_episodes(Path("out"))])
+    assert memobench(["report", "A=k1", "A=k5", "--figures", "figures"]) == 0
+    assert {path.name for path in Path("figures").glob("*.png")} == {"outcomes.png", "replan.png"}
+    assert "Suites by replan" in capsys.readouterr().out
+
+
+def test_suites_are_averaged(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ["eval", *RANDOM, "episodes=2", "task_ids=[0]"]
+    assert lerobot([*line, "task=libero_10,libero_spatial", "output_dir=a"]) == 0
+    fake_loop.changed = {"success": True, "failure": None}
+    assert lerobot([*line, "task=libero_10", "output_dir=long"]) == 0
+    fake_loop.changed = {}
+    assert lerobot([*line, "task=libero_spatial", "output_dir=spatial"]) == 0
+    for words in (["a"], ["pi=a/libero_10", "pi=a/libero_spatial"], ["a/libero_spatial", "a/libero_10"]):
+        assert memobench(["report", *words, "--format", "csv", "--out", "out", "--html", "page"]) == 0
+        rows = [*csv.DictReader(Path("out/tables/memory-types.csv").read_text().splitlines())]
+        assert [(row["suite"], row["n"], row["SR"]) for row in rows] == [
+            ("libero_spatial", "2", "50.0"),
+            ("libero_10", "2", "50.0"),
+            ("average of suites", "4", "50.0"),
+        ]
+        assert '"average":{"SR":[50.0,' in Path("page/index.html").read_text()
+    assert memobench(["report", "A=a", "B=long", "B=spatial", "--format", "markdown"]) == 0
+    shown = capsys.readouterr().out
+    assert "| evaluation | inputs | k | libero\\_spatial SR | libero\\_10 SR | average SR |".replace("\\", "") in shown
+    assert "| B | not recorded | – | **50.0** | **100.0** | **75.0** |" in shown
+    assert memobench(["report", "A=a", "B=long", "B=spatial"]) == 0
+    shown = capsys.readouterr().out
+    assert ["spat.", "10", "aver."] in [line.split() for line in shown.splitlines()]
+    assert "Evaluation in spatial, long." in shown
+    assert memobench(["compare", "A=a", "B=long"]) == 2
+    assert memobench(["compare", "A=a", "B=a/libero_10"]) == 2
+    for words in (["a", "long"], ["A=a/libero_10", "A=long", "A=spatial"]):
+        assert memobench(["report", *words]) == 2
+        assert "are of the suite libero_10" in capsys.readouterr().err
+    assert lerobot(["eval", "env=memobench", "tasks=1", "episodes=1", "output_dir=memory"]) == 0
+    assert memobench(["report", "spatial", "memory"]) == 2
+    assert "report each suite by itself" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("ending", [["shards=2", "workers=1"], ["resume=true"]])
 def test_parts_and_resumed_runs_equal_a_whole_run(
     fake_loop: FakeLoop, monkeypatch: pytest.MonkeyPatch, ending: list[str]
@@ -208,7 +286,10 @@ def test_suites_are_evaluated_one_after_another(fake_loop: FakeLoop, capsys: pyt
     line = ["eval", *RANDOM, "task=libero_goal,libero_10", "task_ids=[2]", "episodes=2", "output_dir=out"]
     assert lerobot(line) == 0
     assert [made.environment.settings.horizon for made in fake_loop.plans] == [300, 520]
-    assert "SR: libero_goal 50.0, libero_10 50.0; mean of 2 suites 50.0" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert [line.split()[:5] for line in shown.splitlines() if "average of suites" in line] == [
+        ["average", "of", "suites", "4", "50.0"]
+    ]
     assert {*Path("out").iterdir()} == {Path("out/libero_goal"), Path("out/libero_10")}
     assert lerobot([*line, "resume=true"]) == 0
     assert len(fake_loop.ran) == 4
@@ -227,7 +308,9 @@ def test_lerobots_names_choose_suite_and_tasks() -> None:
         MemobenchEnvConfig(task_ids=[1])
 
 
-def test_lerobot_eval_gets_environments_by_suite_and_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lerobot_eval_gets_environments_by_suite_and_id(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     line = ["lerobot-eval", "--env.type=memobench", "--policy.type=memobench_random", "--policy.device=cpu"]
     monkeypatch.setattr("sys.argv", [*line, "--seed=100", "--eval.n_episodes=5"])
     config = MemobenchEnvConfig(task="libero_goal,libero_10", task_ids=[0, 3], log_dir=str(tmp_path))
@@ -239,5 +322,35 @@ def test_lerobot_eval_gets_environments_by_suite_and_id(tmp_path: Path, monkeypa
         (520, "libero", 100),
     ]
     monkeypatch.setattr("sys.argv", [*line, "--eval.n_episodes=51"])
-    with pytest.raises(MemobenchError, match="50 initial states"):
+    with pytest.raises(SystemExit):
         MemobenchEnvConfig(task="libero_goal", log_dir=str(tmp_path)).create_envs(1)
+    assert "50 initial states" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--env.task=libero_object", "--env.task_ids=[99]"], "found 99 among the tasks; tasks of the libero_object"),
+        (["--env.task=libero_objct"], "task is 'libero_objct'; did you mean 'libero_object'?"),
+        (["--env.task=libero_object,strict"], "the second with suite=strict"),
+        (["--env.task=libero_object", "--env.obs_type=both"], "requires obs_type=pixels_agent_pos; leave obs_type out"),
+        (["--env.task=libero_object", "--env.seed_base=3"], "found the initial states 997 to 1046"),
+        (["--env.task=object,temporl"], "did you mean 'temporal'?"),
+    ],
+)
+def test_lerobot_eval_refuses_in_one_sentence(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    expected: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["lerobot-eval", *words])
+    with pytest.raises(SystemExit) as stop:
+        draccus.parse(MemobenchEnvConfig, args=[word.replace("env.", "") for word in words]).create_envs(1)
+    assert stop.value.code == 2
+    found = capsys.readouterr().err
+    assert found.startswith("lerobot-eval: ")
+    assert expected in found
+    assert found.count("\n") == 1

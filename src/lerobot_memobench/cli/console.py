@@ -16,7 +16,7 @@ from urllib.error import URLError
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
@@ -115,7 +115,13 @@ class Count:
 @contextmanager
 def counting(screen: Console, unit: str, total: int | None = None) -> Iterator[Count]:
     """Show the progress of a run; call the yielded `Count` after every piece of work."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     quiet = not screen.is_terminal
     with Progress(*columns, console=screen, disable=quiet, speed_estimate_period=SPEED_PERIOD) as progress:
         yield Count(progress, unit, total)

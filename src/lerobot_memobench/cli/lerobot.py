@@ -11,10 +11,13 @@ import shlex
 import sys
 import threading
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import yaml
 
 from lerobot_memobench.cli.console import WITH_PARENT, console, counting, note, run_command, say
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -128,22 +131,22 @@ def evaluate(words: Mapping[str, str]) -> int:
 def evaluate_suites(suites: Sequence[str], words: Mapping[str, str]) -> int:
     """Run an evaluation of each of several suites of LIBERO, in a folder of its name; return the highest status."""
     from lerobot_memobench.envs.episode_log import has_log
-    from lerobot_memobench.evaluation.records import read_run
-    from lerobot_memobench.evaluation.tables import figure
+    from lerobot_memobench.evaluation.records import read_runs
+    from lerobot_memobench.evaluation.report_tables import memory_types_table
+    from lerobot_memobench.evaluation.tables import terminal_table
 
     named = words.get("output_dir")
     if named is None and "resume" not in words:
         named = f"outputs/eval/{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
-    status, rates = 0, dict[str, float]()
+    status, folders = 0, list[Path]()
     for suite in suites:
         folder = None if named is None else Path(named) / suite
         place = {} if folder is None else {"output_dir": str(folder)}
         status = max(status, evaluate(without(words, "env.task") | {"task": suite} | place))
-        if folder is not None and has_log(folder):
-            rates[suite] = read_run(folder).summary.average["SR"].value or 0.0
-    if len(rates) > 1:
-        each = ", ".join(f"{suite} {figure(rate)}" for suite, rate in rates.items())
-        say(f"SR: {each}; mean of {len(rates)} suites {figure(sum(rates.values()) / len(rates))}")
+        folders += [folder] if folder is not None and has_log(folder) else []
+    if folders:
+        (run,) = read_runs(folders)
+        console().print(terminal_table(memory_types_table(run.summary)), crop=False)
     return status
 
 
@@ -153,7 +156,10 @@ def check_tasks(words: Mapping[str, str]) -> tuple[str, ...]:
     task = words.get("task") or words.get("env.task")
     suite = words.get("suite") or words.get("env.suite") or PUBLISHED
     elsewhere = any(words.get(key) for key in (CONFIG_FILE, "task_dir", "env.task_dir"))
-    suites, tasks = lerobots_choice(task, None, suite, "all" if tasks is None else tasks)
+    ids = None if elsewhere else words.get("task_ids") or words.get("env.task_ids")
+    with suppress(yaml.YAMLError):
+        ids = yaml.safe_load(ids or "null")
+    suites, tasks = lerobots_choice(task, ids, suite, "all" if tasks is None else tasks)
     if not elsewhere:
         for each in suites:
             resolve_tasks(tasks, each)

@@ -80,7 +80,8 @@ def report(
 
     runs = read_runs(folders)
     for run in runs:
-        _write_next_to_log(run)
+        for each in run.evaluations:
+            _write_next_to_log(each)
     show_report(build(runs, with_ is Published.PAPER), "report", format_, out)
     if figures is not None:
         from lerobot_memobench.evaluation.plots import draw_figures

@@ -32,7 +32,7 @@ from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, 
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
-from lerobot_memobench.tasks.task import Task, referent_text
+from lerobot_memobench.tasks.task import STRICT, Task, referent_text
 
 NEEDS = Needs(cores=1, memory_gb=4)
 """Resources of one job on Slurm, which makes one episode after another."""
@@ -40,12 +40,14 @@ FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
 }
-"""Mean frames of a demonstration, prompt included, in the full runs (results/demonstrations.md). Rest
-and held frames are not counted: they take little time and room."""
-FRAME_BYTES, IMAGES_BYTES = 800, 5_400
-"""Bytes of a frame without images, and of both cameras' videos per frame at 256 × 256."""
-FRAME_SECONDS, IMAGES_SECONDS = 0.0045, 0.011
-"""Seconds of one core to make a frame, and to draw and encode both cameras at 256 × 256."""
+"""Mean frames of a demonstration, prompt included, in the full runs (results/demonstrations.md), without rest and
+held frames."""
+HELD = {"temporal": 3_900, "spatial": 600, "object": 600, "procedural": 600}
+"""Mean held frames of a strict demonstration. Only their images take time and room."""
+FRAME_BYTES, IMAGES_BYTES, HELD_BYTES = 800, 5_400, 2_300
+"""Bytes of a frame without images, and of both cameras' videos per frame and held frame at 256 × 256."""
+FRAME_SECONDS, IMAGES_SECONDS, HELD_SECONDS = 0.0045, 0.011, 0.002
+"""Seconds of one core to make a frame, to draw and encode both cameras at 256 × 256, and to encode them in a hold."""
 
 
 def generate(
@@ -269,10 +271,10 @@ def _versions() -> dict[str, str]:
 # --- size and time ---
 
 
-def run_size(frames: int, image_size: int | None) -> int:
-    """Return the approximate bytes of a number of frames; ``image_size`` is None without images."""
+def run_size(frames: int, image_size: int | None, held: int = 0) -> int:
+    """Return the approximate bytes of numbers of frames and held frames; ``image_size`` is None without images."""
     area = 0.0 if image_size is None else (image_size / IMAGE_SIZE) ** 2
-    return round(frames * (FRAME_BYTES + IMAGES_BYTES * area))
+    return round(frames * FRAME_BYTES + (frames * IMAGES_BYTES + held * HELD_BYTES) * area)
 
 
 def check_room(out: Path, size: int, there: int, notify: Callable[[str], None], work: str, extra: int = 0) -> None:
@@ -309,12 +311,19 @@ def _report_size(
     frames, left = (
         sum(FRAMES[job.task.suite].get(job.task.memory_type, 600) for job in some) for some in (jobs, missing)
     )
-    seconds = left * (FRAME_SECONDS + IMAGES_SECONDS * ((side or 0) / IMAGE_SIZE) ** 2)
+    held, held_left = (
+        sum(HELD.get(job.task.memory_type, 0) for job in some if job.task.suite == STRICT) for some in (jobs, missing)
+    )
+    area = ((side or 0) / IMAGE_SIZE) ** 2
+    seconds = left * FRAME_SECONDS + (left * IMAGES_SECONDS + held_left * HELD_SECONDS) * area
     minutes = seconds / 60 / max(min(workers, cores()), 1)
     time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
-    size = run_size(frames, side)
-    work = f"{len(missing)} demonstrations of about {left:,} frames, in about {time} with {workers} at a time"
-    check_room(out, size, size - run_size(left, side), notify, work)
+    size, extent = (
+        run_size(frames, side, held),
+        f"{left:,} frames{f' and {held_left:,} held ones' if held_left else ''}",
+    )
+    work = f"{len(missing)} demonstrations of about {extent}, in about {time} with {workers} at a time"
+    check_room(out, size, size - run_size(left, side, held_left), notify, work)
 
 
 # --- the outcome ---

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import sys
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from datetime import datetime
 from functools import partial
@@ -45,7 +46,7 @@ from lerobot_memobench.tasks.catalogue import (
     task_folder,
     task_index,
 )
-from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.libero_suites import check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
@@ -58,6 +59,20 @@ UNKNOWN_PLAN = (
     "is unknown here; set {}, to 1 for a policy that plans at every step"
 )
 """Message of a refusal, without the setting's name."""
+
+
+@contextmanager
+def ending_lerobots_command() -> Iterator[None]:
+    """End ``lerobot-eval`` and ``lerobot-train`` with the message of a `MemobenchError`, as this package's commands."""
+    try:
+        yield
+    except MemobenchError as error:
+        command = Path(sys.argv[0]).stem.replace("_", "-")
+        if command not in ("lerobot-eval", "lerobot-train"):
+            raise
+        print(f"{command}: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+
 
 _TYPES = typing.get_type_hints(EnvSettings)
 # LeRobot reads `--env.<name>` into fields of the configuration itself.
@@ -93,12 +108,13 @@ class MemobenchEnvConfig(_WithSettings):
     log_dir: str | None = None
     resume: bool = False
     fps: int = CONTROL_HZ
-    check_policy: ClassVar[Callable[[MemobenchEnvConfig], Any]] = lambda config: None
-    """Checks and returns the configuration of the policy of LeRobot's own commands, None if unknown; set by
-    `registration`, because policies depend on environments."""
+    check_policy: ClassVar[Callable[[MemobenchEnvConfig], tuple[Any, Acting]]] = lambda config: (None, UNKNOWN_POLICY)
+    """Checks the policy of LeRobot's own commands; returns its configuration, None if unknown, and its description for
+    the log. Set by `registration`, because policies depend on environments."""
     features: dict[str, PolicyFeature] = field(default_factory=policy_features)
     features_map: dict[str, str] = field(default_factory=policy_names)
 
+    @ending_lerobots_command()
     def __post_init__(self) -> None:
         suites, self.tasks = lerobots_choice(self.task, self.task_ids, self.suite, self.tasks)
         self.__dict__.update(suite=suites[0])
@@ -163,19 +179,21 @@ class MemobenchEnvConfig(_WithSettings):
             )
         return found
 
+    @ending_lerobots_command()
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """Return ``{memory type: {task id: vector env}}``; the first reset of an env starts its simulation.
 
         A suite of LIBERO replaces the memory type, as in LeRobot's environment ``libero``. LeRobot's own commands call
-        this. Their log does not name the policy, and ``prompt_in=auto`` means `STEPS`.
+        this; ``prompt_in=auto`` then means `STEPS`.
         """
         if self.task is not None:
             return self._envs_of_suites(self.task.split(","), n_envs, use_async_envs)
         self._number_as_lerobot()
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
-        self.declare_plans(type(self).check_policy(self))
-        opened = self.opener(None, UNKNOWN_POLICY, self.resolved_log_dir())
+        policy, by = type(self).check_policy(self)
+        self.declare_plans(policy)
+        opened = self.opener(None, by, self.resolved_log_dir())
         suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
             suites.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
@@ -190,6 +208,7 @@ class MemobenchEnvConfig(_WithSettings):
             own = asdict(self.settings.changed(suite=suite))
             one = replace(self, task=None, log_dir=str(folder / suite), **own)
             found |= one.create_envs(n_envs, use_async_envs)
+            self.features, self.features_map = one.features, one.features_map  # of the checkpoint's convention
         return found
 
     def _number_as_lerobot(self) -> None:
@@ -200,15 +219,14 @@ class MemobenchEnvConfig(_WithSettings):
         """
         if self.suite not in LIBERO_SUITES or "eval" not in Path(sys.argv[0]).name:
             return
-        if parser.parse_arg("env.seed_base") is None:
-            from lerobot.configs.eval import EvalPipelineConfig
+        from lerobot.configs.default import EvalConfig
+        from lerobot.configs.eval import EvalPipelineConfig
 
-            self.__dict__.update(seed_base=int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0))
-        if (episodes := int(parser.parse_arg("eval.n_episodes") or 0)) > NUM_STATES:
-            raise MemobenchError(
-                f"found eval.n_episodes={episodes}; tasks of {self.suite} have {NUM_STATES} initial states: ask for at "
-                f"most {NUM_STATES}"
-            )
+        seed = int(parser.parse_arg("seed") or EvalPipelineConfig.seed or 0)
+        if parser.parse_arg("env.seed_base") is None:
+            self.__dict__.update(seed_base=seed)
+        episodes = int(parser.parse_arg("eval.n_episodes") or EvalConfig.n_episodes)
+        check_states(self.suite, seed - self.seed_base, episodes)
 
     def declare_plans(self, policy: Any) -> None:
         """Set the actions and frames of a plan from a policy's configuration; the rest is the user's.

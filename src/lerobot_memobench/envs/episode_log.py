@@ -58,7 +58,7 @@ POLICY = "policy"
 
 @dataclass(frozen=True)
 class Acting:
-    """The policy of an evaluation, as the log names it. LeRobot's own commands leave it unknown.
+    """The policy of an evaluation, as the log names it. It is unknown in gymnasium and in LeRobot's trainings.
 
     Attributes:
         policy: ``type``, ``identity`` and, for a checkpoint in a folder, ``sha256``; {} if unknown.

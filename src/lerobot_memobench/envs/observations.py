@@ -25,6 +25,7 @@ from lerobot_memobench.protocol import (
 )
 from lerobot_memobench.sim.convention import shown
 from lerobot_memobench.sim.object_layout import BOUNDS, FIELDS, SIZE, SLOTS
+from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
@@ -77,12 +78,13 @@ def _ignores_objects(policy: Any) -> bool:
     return type(policy).__module__.startswith("lerobot.") and policy.type not in READ_OBJECTS
 
 
-def check_obs_type(policy: Any, obs_type: str) -> None:
+def check_obs_type(policy: Any, obs_type: str, suite: str = PUBLISHED) -> None:
     """Check that an ``obs_type`` contains the inputs of a policy.
 
     Args:
         policy: configuration of the policy.
         obs_type: setting of the environment.
+        suite: of the tasks; those of LIBERO have pictures alone.
 
     Raises:
         MemobenchError: pictures or objects are missing.
@@ -91,6 +93,11 @@ def check_obs_type(policy: Any, obs_type: str) -> None:
     if needed is not None and obs_type not in (needed, BOTH):
         wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
         named = "" if needed == PIXELS else f" ({PRIVILEGED})"
+        if suite in LIBERO_SUITES:
+            raise MemobenchError(
+                f"{policy.type} reads more than pictures{named}, and suite={suite} has pictures alone; evaluate it in "
+                "memory tasks, or name a policy that reads pictures"
+            )
         raise MemobenchError(f"env.obs_type is {obs_type}, which lacks inputs of the policy{named}; set it to {wanted}")
 
 

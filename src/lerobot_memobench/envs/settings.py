@@ -85,6 +85,7 @@ UPSTREAM_ONLY = {
 LIBERO_ONLY = {
     **{"difficulty": STANDARD, "protocol": BY_PAPER, "referent": REFERENTS[0], "oracle_memory": False},
     **{"evidence": False, "salt": None, "expert_action": False, "blind_action": False, "obs_type": PIXELS},
+    "demonstration_prompt": True,
     **MEMORY_CONTROLS,
 }
 """Settings with a fixed value in LIBERO's suites. Their tasks have no checkpoints, prompts, variants and expert, and
@@ -266,7 +267,7 @@ class EnvSettings:
             if asked != value:
                 raise MemobenchError(
                     f"{name} is {str(asked).lower()}, but {reason} requires "
-                    f"{name}={str(value).lower()}; leave one of the two out"
+                    f"{name}={str(value).lower()}; leave {name} out"
                 )
 
     def _set(self, **values: Any) -> None:

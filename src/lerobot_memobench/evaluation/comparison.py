@@ -21,7 +21,9 @@ from lerobot_memobench.evaluation.agreement import SCENES
 from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed, published_table
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
+    MEMORY_TYPE,
     METRICS,
+    SUITE,
     Record,
     by_task,
     operations,
@@ -33,7 +35,7 @@ from lerobot_memobench.evaluation.metrics import (
     varies,
 )
 from lerobot_memobench.evaluation.records import APART, Run, other_draws, other_hashes, other_physics
-from lerobot_memobench.evaluation.report_tables import AVERAGE, inputs_phrase
+from lerobot_memobench.evaluation.report_tables import inputs_phrase
 from lerobot_memobench.evaluation.statistics import (
     DRAWS,
     PERMUTATIONS,
@@ -58,9 +60,11 @@ from lerobot_memobench.evaluation.tables import (
     Table,
     csv_text,
     figure,
+    with_ids,
 )
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
+from lerobot_memobench.tasks.libero_suites import libero_id
 from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES
 
 ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
@@ -126,7 +130,7 @@ def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str
 
 # --- differences ---
 
-Kind = Literal["average", "memory type", "task", "family"]
+Kind = Literal["average", "memory type", "suite", "task", "family"]
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,7 @@ class Difference:
 
     Attributes:
         kind: of the scope.
-        scope: the average, a memory type, a task, or a family of tasks.
+        scope: the average, a memory type or suite of LIBERO, a task, or a family of tasks.
         metric: SR, MSR, MUR or MCR; of a task also c1, c2, …, prefix completion.
         n: pairs.
         a: rate of the first evaluation.
@@ -339,18 +343,18 @@ Scope = tuple[Kind, str, list[list[_Task]]]
 
 
 def _scopes(tasks: Sequence[_Task]) -> list[Scope]:
-    """Return the average, each memory type, each task and each family, in the report's order.
+    """Return the average, each memory type or suite of LIBERO, each task and each family, in the report's order.
 
-    Of a suite of LIBERO, the average is that of the suite, and there are neither memory types nor families.
+    Of a single suite of LIBERO, the average is that of the suite. LIBERO's tasks have no families.
     """
     types = [[task for task in tasks if task.memory_type == name] for name in GROUPS]
     families = {task.family: [other for other in tasks if other.family == task.family] for task in tasks if task.family}
     types = [group for group in types if group]
-    if (suite := tasks[0].memory_type) in LIBERO_SUITES:
-        return [("average", suite, types), *(("task", task.name, [[task]]) for task in tasks)]
+    kind: Kind = SUITE if tasks[0].memory_type in LIBERO_SUITES else MEMORY_TYPE
+    alone = kind == SUITE and len(types) == 1
     return [
-        ("average", AVERAGE, types),
-        *(("memory type", group[0].memory_type, [group]) for group in types),
+        ("average", tasks[0].memory_type if alone else f"average of {kind}s", types),
+        *((kind, group[0].memory_type, [group]) for group in types if not alone),
         *(("task", task.name, [[task]]) for task in tasks),
         *(("family", str(name), [group]) for name, group in families.items()),
     ]
@@ -456,7 +460,7 @@ NOTE = (
     "difference that so many pairs would show with 80 % power at 5 %."
 )
 TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
-    ("difference", "Average and memory types", ("average", "memory type")),
+    ("difference", "Average and memory types", ("average", "memory type", "suite")),
     ("difference-tasks", "Tasks", ("task",)),
     ("difference-families", "Families of tasks", ("family",)),
 )
@@ -493,8 +497,8 @@ def comparison_section(found: Comparison, overall: bool = False) -> Section:
     """
     kinds = {row.kind for row in found.differences}
     tables = [_table(found, *each) for each in TABLES[: 1 if overall else None] if kinds & {*each[2]}]
-    if "memory type" not in kinds:
-        tables[0] = replace(tables[0], title="Suite")
+    if MEMORY_TYPE not in kinds:
+        tables[0] = replace(tables[0], title="Average and suites" if SUITE in kinds else "Suite")
     sentence = f"{count_of(found.pairs, 'episode')} in both, paired by task, episode and referent."
     meaning = [found.control.meaning] if found.control else []
     return Section(found.title, tuple(tables), (sentence, *meaning, NOTE), found.notes)
@@ -527,7 +531,8 @@ def comparison_phrase(found: Comparison) -> str:
 def comparison_csv(found: Comparison) -> str:
     """Return all differences of a comparison as CSV, one a row."""
     entries = [_entry(row) for row in found.differences]
-    return csv_text([list(entry.values()) for entry in entries], list(entries[0]))
+    header = list(dict.fromkeys(name for entry in entries for name in entry))
+    return csv_text([[entry.get(name) for name in header] for entry in entries], header)
 
 
 def _table(found: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
@@ -550,7 +555,7 @@ def _table(found: Comparison, key: str, title: str, kinds: Collection[Kind]) -> 
     inputs = "; ".join(
         f"{name}: {inputs_phrase(words)}" for name, words in zip((found.a, found.b), found.inputs, strict=True)
     )
-    return Table(key, title, tuple(header), cells, note=f"{inputs}.", rules=frozenset(starts) - {0})
+    return with_ids(Table(key, title, tuple(header), cells, note=f"{inputs}.", rules=frozenset(starts) - {0}))
 
 
 def _row(row: Difference, of_tasks: bool, closes: bool, first: bool) -> tuple[Cell, ...]:
@@ -597,9 +602,11 @@ def _p(value: float | None) -> Numbers:
 
 def _entry(row: Difference) -> dict[str, Any]:
     """Return a difference as JSON values; rates in per cent, p as they are."""
+    number = libero_id(row.scope)
     entry = {
         "kind": row.kind,
         "scope": row.scope,
+        **({} if number is None else {"id": number}),
         "metric": row.metric,
         "pairs": row.n,
         "a": round(100 * row.a, 2),

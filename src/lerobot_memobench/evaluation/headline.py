@@ -47,11 +47,11 @@ def policy_name(run: Run) -> str:
 
 def protocol_phrases(run: Run) -> list[str]:
     """Return suite, scenes, referent, seeds, episodes per task, replan interval and controls of an evaluation."""
-    records, suite = run.records, of_all(run.records, "suite")
+    records, suites = run.records, ", ".join(run.suites)
     return [
-        f"own tasks, suite={suite}"
+        f"own tasks, suite={suites}"
         if run.card.get("settings", {}).get("env", {}).get("task_dir")
-        else f"{suite} suite",
+        else f"{suites} suite{'s' * (len(run.suites) > 1)}",
         *(["scenes that version 0.2 modelled in code"] if of_all(records, WORLD) == FORMER else []),
         *(
             f"{key} {value}"
@@ -59,7 +59,7 @@ def protocol_phrases(run: Run) -> list[str]:
             if (value := of_all(records, key)) != OMITTED[key]
         ),
         *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),
-        *([] if suite in LIBERO_SUITES else [_referent(records)]),
+        *([] if run.suites[0] in LIBERO_SUITES else [_referent(records)]),
         *_seeds(run),
         extent_phrase(records),
         *([] if run.missing is None else ["incomplete"]),

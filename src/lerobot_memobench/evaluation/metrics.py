@@ -11,12 +11,13 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
+from lerobot_memobench.tasks.libero_suites import libero_id
 from lerobot_memobench.tasks.task import LIBERO_SUITES, MEMORY_TYPES, OPERATIONS, PUBLISHED, STRICT_FAILURES
 
 Record = Mapping[str, Any]
@@ -47,7 +48,7 @@ def prefix(values: Sequence[bool]) -> list[bool]:
 
 
 def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Group records by task, in the order of memory types or suites of LIBERO, and then of names.
+    """Group records by task, in the order of memory types and names, or of LIBERO's suites and ids.
 
     Raises:
         MemobenchError: rollouts of one task differ in its memory type or operations.
@@ -71,7 +72,8 @@ def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
                 + ", ".join(MEMORY_TYPES)
             )
     order = {memory_type: k for k, memory_type in enumerate(GROUPS)}
-    return dict(sorted(grouped.items(), key=lambda item: (order[item[1][0]["memory_type"]], item[0])))
+    ids = {name: libero_id(name) or 0 for name in grouped}
+    return dict(sorted(grouped.items(), key=lambda item: (order[item[1][0]["memory_type"]], ids[item[0]], item[0])))
 
 
 # --- protocol of rollouts ---
@@ -379,6 +381,11 @@ def failure_counts(records: Iterable[Record]) -> dict[str, int]:
 # --- every figure of a set of rollouts ---
 
 
+MEMORY_TYPE: Final = "memory type"
+SUITE: Final = "suite"
+"""Values of `Summary.grouping`."""
+
+
 @dataclass(frozen=True)
 class Summary:
     """All figures of a set of rollouts.
@@ -413,9 +420,15 @@ class Summary:
     inputs: str
 
     @property
-    def of_libero(self) -> bool:
-        """Whether the rollouts are of a suite of LIBERO, whose tasks have no checkpoints."""
-        return bool({*self.memory_types} & {*LIBERO_SUITES})
+    def grouping(self) -> str:
+        """The groups of tasks: memory types, or suites of LIBERO, whose tasks have no checkpoints."""
+        return SUITE if {*self.memory_types} & {*LIBERO_SUITES} else MEMORY_TYPE
+
+    @property
+    def means(self) -> dict[str, Row]:
+        """The average under its name; {} for a single suite of LIBERO, which it would repeat."""
+        alone = self.grouping == SUITE and len(self.memory_types) == 1
+        return {} if alone else {f"average of {self.grouping}s": self.average}
 
     @property
     def rollouts(self) -> int:

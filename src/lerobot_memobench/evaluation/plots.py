@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
 from lerobot_memobench.evaluation.gaps import GROUPS, success_by_gap
-from lerobot_memobench.evaluation.metrics import METRICS, Rate
+from lerobot_memobench.evaluation.metrics import Rate
 from lerobot_memobench.evaluation.records import Run, sweeps
 from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.io import draft_of
@@ -222,14 +222,15 @@ Curve = Mapping[int, Rate]
 
 
 def draw_replan(runs: Sequence[Run]) -> Figure:
-    """Draw SR, MSR, MUR and MCR on average over replan intervals, a line per method, with Wilson's intervals."""
+    """Draw each metric on average over replan intervals, a line per method, with Wilson's intervals."""
     from matplotlib.lines import Line2D
 
+    metrics = [*runs[0].summary.average]
     methods = {name: _curves(group) for name, group in sweeps(runs).items()}
     styles = {name: line_style(number, published=False) for number, name in enumerate(methods)}
     with paper_style():
-        figure = new_figure(7.4, 2.5)
-        for metric, place in zip(METRICS, figure.subplots(1, len(METRICS)), strict=True):
+        figure = new_figure(1.25 + 1.55 * len(metrics), 2.5)
+        for metric, place in zip(metrics, figure.subplots(1, len(metrics), squeeze=False)[0], strict=True):
             for name, found in methods.items():
                 _draw_curve(place, found[metric], styles[name])
             place.set_title(f"{metric} ({METRIC_NAMES[metric]})", fontsize=7.5)
@@ -252,7 +253,7 @@ def _curves(runs: Sequence[Run]) -> dict[str, Curve]:
             for run in runs
             if (rate := run.summary.average[metric]).value is not None and run.replan_steps is not None
         }
-        for metric in METRICS
+        for metric in runs[0].summary.average
     }
 
 

@@ -1,7 +1,8 @@
 """Evaluations read back from their folders: result card, protocol, rollouts, names.
 
 An evaluation is given as its folder, or as ``NAME=FOLDER``. Evaluations of the same name are one method at several
-replan intervals; without names, those of the same policy are.
+replan intervals; without names, those of the same policy are. Evaluations of one policy in several suites of LIBERO are
+joined to one, whose average is the mean over suites.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from lerobot_memobench.envs.episode_log import (
     OMITTED,
     POLICY,
     differences,
+    has_log,
     notes_on_not_run,
     read_episodes,
     read_log,
@@ -33,6 +36,8 @@ from lerobot_memobench.evaluation.evidence import FoundEvidence, evidence_of, ra
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import count_of
 from lerobot_memobench.sim.scene_hash import FORMER, WORLD
+from lerobot_memobench.tasks.catalogue import GROUPS
+from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 # --- the protocol ---
 
@@ -110,6 +115,7 @@ class Run:
         name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
         notes: warnings for the reader, such as unreadable lines.
         missing: a sentence on the episodes that its file asks for and its log lacks; None without such episodes.
+        parts: evaluations of single suites of LIBERO that are joined in it.
     """
 
     name: str
@@ -119,6 +125,17 @@ class Run:
     protocol: Mapping[str, Any]
     notes: Sequence[str] = field(default_factory=tuple)
     missing: str | None = None
+    parts: Sequence[Run] = ()
+
+    @property
+    def evaluations(self) -> Sequence[Run]:
+        """The evaluations with a folder of their own: its parts, else itself."""
+        return self.parts or (self,)
+
+    @property
+    def suites(self) -> tuple[str, ...]:
+        """The suites of its rollouts."""
+        return tuple(of_all(each.records, "suite") for each in self.evaluations)
 
     @cached_property
     def summary(self) -> Summary:
@@ -132,8 +149,8 @@ class Run:
 
     @cached_property
     def card(self) -> dict[str, Any]:
-        """What reports take from its card, {} where it has none."""
-        return read_evaluation(self.folder)
+        """What reports take from its card, of the first where several are joined; {} where it has none."""
+        return read_evaluation(self.evaluations[0].folder)
 
     @cached_property
     def replan_steps(self) -> int | None:
@@ -148,7 +165,7 @@ class Run:
 
 
 def read_runs(words: Sequence[str | Path]) -> list[Run]:
-    """Read evaluations given as ``FOLDER`` or ``NAME=FOLDER``.
+    """Read evaluations given as ``FOLDER`` or ``NAME=FOLDER``; a folder may hold one for each suite of LIBERO.
 
     Raises:
         MemobenchError: a folder holds no rollouts or is given twice, one method has two results at one interval, or
@@ -158,17 +175,64 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     if not given:
         raise MemobenchError("no evaluation was given; expected folders that evaluations have written")
     names = folder_names([folder for _, folder in given])
-    runs = [read_run(folder, name, label or "") for (label, folder), name in zip(given, names, strict=True)]
+    runs = [_read_suites(folder, name, label or "") for (label, folder), name in zip(given, names, strict=True)]
     for key in APART:
-        values = [of_all(run.records, key) for run in runs]
+        values = [of_all(run.evaluations[0].records, key) for run in runs]
         for run, value in zip(runs, values, strict=True):
-            if value != values[0]:
+            if value != values[0] and not {value, values[0]} <= {*LIBERO_SUITES}:
                 raise MemobenchError(
                     f"{runs[0].folder} is an evaluation of {key}={values[0]} and {run.folder} one of {key}={value}, "
                     f"whose figures do not compare; report each {key} by itself"
                     f"{f' (world={FORMER}: scenes that version 0.2 modelled in code)' if key == WORLD else ''}"
                 )
-    return _with_methods(runs)
+    return _with_methods(_with_suites_joined(runs))
+
+
+def _read_suites(folder: Path, name: str, method: str) -> Run:
+    """Return the evaluation in a folder; those in subfolders with names of LIBERO's suites are joined."""
+    suites = [] if has_log(folder) else [suite for suite in LIBERO_SUITES if has_log(folder / suite)]
+    return _joined([read_run(folder / suite, name, method) for suite in suites] or [read_run(folder, name, method)])
+
+
+def _with_suites_joined(runs: Sequence[Run]) -> Sequence[Run]:
+    """Join the evaluations of one policy, or of one given name, where evaluations are of different suites of LIBERO."""
+    if len({run.suites for run in runs}) == 1:
+        return runs
+    groups: dict[Any, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(run.method or (*_policy(run), run.replan_steps), []).extend(run.evaluations)
+    return [_joined(group) for group in groups.values()]
+
+
+def _joined(parts: Sequence[Run]) -> Run:
+    """Return evaluations of one policy, each in another suite of LIBERO, as one.
+
+    Raises:
+        MemobenchError: they are of several policies, or two are of one suite.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    parts = sorted(parts, key=lambda part: GROUPS.index(part.suites[0]))
+    for one, other in pairwise(parts):
+        if one.suites == other.suites or _policy(one) != _policy(other):
+            same = f"the suite {one.suites[0]}" if one.suites == other.suites else "other policies"
+            raise MemobenchError(
+                f"{one.folder} and {other.folder} are of {same}, and an average over suites of LIBERO is of one policy "
+                "and each suite once; give the folders of each policy one name: A=FOLDER A=FOLDER B=FOLDER"
+            )
+    values = {key: [part.protocol.get(key) for part in parts] for part in parts for key in part.protocol}
+    protocol = {key: found[0] if found.count(found[0]) == len(parts) else found for key, found in values.items()}
+    missing = [f"{part.suites[0]}: {part.missing}" for part in parts if part.missing is not None]
+    return replace(
+        parts[0],
+        name="+".join(dict.fromkeys(part.name for part in parts)),
+        folder=parts[0].folder.parent,
+        records=[record for part in parts for record in part.records],
+        protocol={**protocol, "tasks": sorted(name for part in parts for name in part.protocol["tasks"])},
+        notes=[f"{part.suites[0]}: {note}" for part in parts for note in part.notes],
+        missing="; ".join(missing) or None,
+        parts=parts,
+    )
 
 
 def unlike(runs: Sequence[Run]) -> list[str]:

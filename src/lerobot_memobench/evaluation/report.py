@@ -112,7 +112,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
     for run in runs:
         section = _section(run)
         if len(runs) > 1:  # their rates by task are joined
-            where = f"Evaluation in {run.folder}."
+            where = f"Evaluation in {', '.join(str(each.folder) for each in run.evaluations)}."
             tables = tuple(table for table in section.tables if table.key != "tasks")
             section = replace(section, title=run.name, tables=tables, sentences=(where, *section.sentences))
         found += [section, *_evidence(run)]
@@ -125,7 +125,7 @@ def _section(run: Run) -> Section:
     """Return the section of one evaluation, without a title."""
     summary = run.summary
     inputs = inputs_sentence(summary.inputs)
-    prefixes = () if summary.of_libero else (prefix_table(summary),)
+    prefixes = (prefix_table(summary),) if any(summary.prefix.values()) else ()
     made = (memory_types_table(summary), tasks_table(summary), *prefixes, failures_table(summary))
     return Section(
         "",

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from lerobot_memobench.envs.episode_log import with_omitted
 from lerobot_memobench.envs.settings import PICTURES
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, Summary, percent, policy_inputs
+from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, METRICS, SUITE, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,
@@ -19,6 +19,7 @@ from lerobot_memobench.evaluation.tables import (
     Table,
     best_in_columns,
     figure,
+    with_ids,
 )
 from lerobot_memobench.io import count_of
 from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
@@ -64,17 +65,18 @@ def failure_line(summary: Summary) -> str:
 
 # --- tables of one evaluation ---
 
-AVERAGE = "average of memory types"
+AVERAGE = f"average of {MEMORY_TYPE}s"
 
-HOW_TO_READ = (
-    "SR is success, MSR, MUR and MCR the rates at which checkpoints of Storage, Update and Compression were satisfied "
-    "at some step. Per cent, with the Wilson 95 % interval; n counts rollouts; – is not applicable."
-)
-SR_ALONE = "SR is success, per cent, with the Wilson 95 % interval; n counts rollouts."
+HOW_TO_READ = {
+    MEMORY_TYPE: "SR is success, MSR, MUR and MCR the rates at which checkpoints of Storage, Update and Compression "
+    "were satisfied at some step. Per cent, with the Wilson 95 % interval; n counts rollouts; – is not applicable.",
+    SUITE: "SR is success, per cent, with the Wilson 95 % interval; n counts rollouts.",
+}
+"""`Summary.grouping` -> note under a table of rates."""
 
 
 def rates_table(summary: Summary) -> Table:
-    """Return one table of all tasks, each memory type's after them, and the average; LIBERO's suites have none."""
+    """Return one table of all tasks, each memory type's or suite's rates after them, and the average."""
     rows: list[tuple[Cell, ...]] = []
     strong, rules = [], []
     for memory_type, row in summary.memory_types.items():
@@ -84,27 +86,26 @@ def rates_table(summary: Summary) -> Table:
         rows += [rate_row(Name(name), summary.tasks[name]) for name in names]
         strong.append(len(rows))
         rows.append(rate_row(f"{memory_type} ({count_of(len(names), 'task')})", row))
-    if not summary.of_libero:
+    for name, row in summary.means.items():
         rules.append(len(rows))
         strong.append(len(rows))
-        rows.append(rate_row(AVERAGE, summary.average))
+        rows.append(rate_row(name, row))
     header = ("task", "n", *summary.average)
-    return Table("rates", "", header, tuple(rows), strong=frozenset(strong), rules=frozenset(rules))
+    return with_ids(Table("rates", "", header, tuple(rows), strong=frozenset(strong), rules=frozenset(rules)))
 
 
 def memory_types_table(summary: Summary) -> Table:
-    """Return one row per memory type, and the average; of LIBERO the row of its suite."""
-    rows = [rate_row(name, row) for name, row in summary.memory_types.items()]
-    if summary.of_libero:
-        return Table("memory-types", "Rate of the suite", ("suite", "n", *summary.average), tuple(rows), note=SR_ALONE)
+    """Return one row per memory type or suite, and the average."""
+    rows = [rate_row(name, row) for name, row in (summary.memory_types | summary.means).items()]
+    last = frozenset({len(summary.memory_types)})
     return Table(
         "memory-types",
-        "Rates by memory type",
-        ("memory type", "n", *METRICS),
-        (*rows, rate_row(AVERAGE, summary.average)),
-        note=HOW_TO_READ,
-        strong=frozenset({len(rows)}),
-        rules=frozenset({len(rows)}),
+        f"Rates by {summary.grouping}",
+        (summary.grouping, "n", *summary.average),
+        tuple(rows),
+        note=HOW_TO_READ[summary.grouping],
+        strong=last,
+        rules=last,
     )
 
 
@@ -112,13 +113,9 @@ def tasks_table(summary: Summary) -> Table:
     """Return one row per task."""
     names = list(summary.tasks)
     types = [summary.memory_type_of[name] for name in names]
-    return Table(
-        "tasks",
-        "Rates by task",
-        ("task", "n", *summary.average),
-        tuple(rate_row(Name(name), summary.tasks[name]) for name in names),
-        rules=frozenset(k for k in range(1, len(types)) if types[k] != types[k - 1]),
-    )
+    rows = tuple(rate_row(Name(name), summary.tasks[name]) for name in names)
+    rules = frozenset(k for k in range(1, len(types)) if types[k] != types[k - 1])
+    return with_ids(Table("tasks", "Rates by task", ("task", "n", *summary.average), rows, rules=rules))
 
 
 def rate_row(name: Cell, row: Row) -> tuple[Cell, ...]:
@@ -146,14 +143,15 @@ def prefix_table(summary: Summary) -> Table:
     )
 
 
-FAILURES_NOTE = (
-    "A failed rollout is named after the first checkpoint that was never satisfied: Storage, Update (stale memory) or "
-    "Compression; reference drift where another answer than the prompt's took the place; execution failure where all "
-    "checkpoints were satisfied."
-)
+FAILURES_NOTES = {
+    MEMORY_TYPE: "A failed rollout is named after the first checkpoint that was never satisfied: Storage, Update "
+    "(stale memory) or Compression; reference drift where another answer than the prompt's took the place; execution "
+    "failure where all checkpoints were satisfied.",
+    SUITE: "Execution failure: the goal was not reached within the step limit of the suite.",
+}
 FURTHER_NOTES = {
     "wrong_order": " Wrong order: steps or events were done in another order than asked for.",
-    "cut_off": " Cut off: the horizon is shorter than the protocol's, so the memory may have worked.",
+    "cut_off": " Cut off: the goal was not reached, and the horizon is shorter than the protocol's.",
     "miscount": " Miscount: the event was done too seldom or too often.",
     "wrong_place": " Wrong place: the thing was looked for where it is not.",
     "hand": " Hand: events, order and place were right as far as they had to be remembered; the motion failed.",
@@ -166,20 +164,20 @@ FURTHER_NOTES = {
 def failures_table(summary: Summary) -> Table:
     """Return how rollouts ended, in all and by memory type."""
     counts: dict[str, Mapping[str, int]] = {"all": outcomes(summary, summary.tasks)}
-    for memory_type in () if summary.of_libero else summary.memory_types:
+    for memory_type in summary.memory_types if len(summary.memory_types) > 1 else ():
         counts[memory_type] = outcomes(summary, _tasks_of(summary, memory_type))
     total = summary.rollouts
     rows: list[tuple[Cell, ...]] = []
     for outcome in ("success", *summary.failures):
         found = [Count(column[outcome]) for column in counts.values()]
         rows.append((outcome.replace("_", " "), *found, Rate(found[0] / total, total)))
-    note = FAILURES_NOTE + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
+    note = FAILURES_NOTES[summary.grouping] + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
     return Table(
         "failures",
         "Outcomes of rollouts",
         ("outcome", "rollouts", *list(counts)[1:], "of all"),
         tuple(rows),
-        note="" if summary.of_libero else note,
+        note=note,
         rules=frozenset({1}),
     )
 
@@ -206,29 +204,32 @@ NOTE = "inputs: of the policy; k: the replan interval."
 
 def overview(runs: Sequence[Run]) -> Table:
     """Return one row per evaluation; the note names the settings in which they differ."""
-    rows = tuple(run_row(run) for run in runs)
+    columns = columns_of(runs)
+    rows = tuple(run_row(run, columns) for run in runs)
     note, first = " ".join([NOTE, *unlike(runs)]), runs[0].summary
-    columns, metrics = columns_of(first), first.average
     return wide_table(
-        "overview", "Evaluations", rows, note=note, best=best_in_columns(rows), columns=columns, metrics=metrics
+        "overview", "Evaluations", rows, note=note, best=best_in_columns(rows), columns=columns, metrics=first.average
     )
 
 
-def run_row(run: Run) -> tuple[Cell, ...]:
+def run_row(run: Run, columns: Sequence[str] = PAPER_COLUMNS) -> tuple[Cell, ...]:
     """Return the row of an evaluation."""
-    return (run.name, run.summary.inputs, run.replan_steps, *all_rates(run.summary))
+    return (run.name, run.summary.inputs, run.replan_steps, *all_rates(run.summary, columns))
 
 
-def all_rates(summary: Summary) -> list[Rate]:
-    """Return the metrics of every memory type and of the average, in the paper's order, or of LIBERO's suite."""
+def all_rates(summary: Summary, columns: Sequence[str]) -> list[Rate]:
+    """Return the metrics of memory types or suites and of the average, in the order of ``columns``."""
     absent = dict.fromkeys(summary.average, Rate(None, 0))
-    found = {**summary.memory_types, "average": summary.average}
-    return [rate for name in columns_of(summary) for rate in found.get(name, absent).values()]
+    found = {**summary.memory_types, **dict.fromkeys(PAPER_COLUMNS[-1:] * len(summary.means), summary.average)}
+    return [rate for name in columns for rate in found.get(name, absent).values()]
 
 
-def columns_of(summary: Summary) -> tuple[str, ...]:
-    """Return the groups of columns of a wide table."""
-    return tuple(summary.memory_types) if summary.of_libero else PAPER_COLUMNS
+def columns_of(runs: Sequence[Run]) -> tuple[str, ...]:
+    """Return the groups of columns of a wide table: the paper's, or the suites of LIBERO and their average."""
+    if runs[0].summary.grouping == MEMORY_TYPE:
+        return PAPER_COLUMNS
+    there = {name for run in runs for name in run.summary.memory_types}
+    return tuple(name for name in GROUPS if name in there) + PAPER_COLUMNS[-1:] * (len(there) > 1)
 
 
 def wide_table(
@@ -279,10 +280,10 @@ def joined_table(runs: Sequence[Run]) -> Table:
         strong.append(len(rows))
         add(memory_type, (run.summary.memory_types.get(memory_type, absent) for run in runs))
         rules.append(len(rows))
-    if not runs[0].summary.of_libero:
+    for name in dict.fromkeys(name for run in runs for name in run.summary.means):
         strong.append(len(rows))
-        add(AVERAGE, (run.summary.average for run in runs))
-    return Table(
+        add(name, (run.summary.means.get(name, absent) for run in runs))
+    table = Table(
         "joined",
         "Rates by task",
         ("task", *(run.name for _ in metrics for run in runs)),
@@ -293,6 +294,7 @@ def joined_table(runs: Sequence[Run]) -> Table:
         rules=frozenset(rules),
         intervals=False,
     )
+    return with_ids(table)
 
 
 # --- one method at several replan intervals ---
@@ -301,7 +303,8 @@ def joined_table(runs: Sequence[Run]) -> Table:
 def sweep(method: str, runs: Sequence[Run]) -> Section:
     """Return the tables of one method at several replan intervals, and which interval is best for what."""
     averages = tuple((run.replan_steps, *rate_row(None, run.summary.average)[1:]) for run in runs)
-    types = tuple((run.replan_steps, *all_rates(run.summary)) for run in runs)
+    columns = columns_of(runs)
+    types = tuple((run.replan_steps, *all_rates(run.summary, columns)) for run in runs)
     first = runs[0].summary
     inputs = inputs_sentence(policy_inputs([record for run in runs for record in run.records]))
     slug = "-".join("".join(c if c.isalnum() and c.isascii() else " " for c in method).split()) or "policy"
@@ -311,17 +314,17 @@ def sweep(method: str, runs: Sequence[Run]) -> Section:
             f"Average by replan interval: {method}",
             ("replan interval", "n", *first.average),
             averages,
-            note=f"{SR_ALONE if first.of_libero else HOW_TO_READ} {inputs}",
+            note=f"{HOW_TO_READ[first.grouping]} {inputs}",
             best=best_in_columns(averages),
         ),
         wide_table(
             f"replan-types-{slug}",
-            f"Memory types by replan interval: {method}",
+            f"{first.grouping.capitalize()}s by replan interval: {method}",
             types,
             leading=("replan interval",),
             note=inputs,
             best=best_in_columns(types),
-            columns=columns_of(first),
+            columns=columns,
             metrics=first.average,
         ),
     )

@@ -19,6 +19,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lerobot_memobench.evaluation.metrics import Rate, percent
+from lerobot_memobench.tasks.libero_suites import libero_id
 
 NOT_APPLICABLE = "–"
 
@@ -132,6 +133,20 @@ def _words(cell: Cell, interval: str | None, escape: Callable[[str], str] = str)
     if interval is None or cell.interval is None:
         return value
     return value + interval.format(*map(figure, cell.interval))
+
+
+def with_ids(table: Table) -> Table:
+    """Return a table with LIBERO's id of each task before its name in the first column, where any task has one."""
+    ids = [libero_id(row[0]) if isinstance(row[0], Name) else None for row in table.rows]
+    if all(number is None for number in ids):
+        return table
+    return replace(
+        table,
+        header=("id", *table.header),
+        rows=tuple((Numbers("" if k is None else k), *row) for k, row in zip(ids, table.rows, strict=True)),
+        groups=(("", 1), *table.groups) if table.groups else (),
+        best=frozenset((row, column + 1) for row, column in table.best),
+    )
 
 
 def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, int]]:
@@ -397,7 +412,8 @@ def terminal_table(table: Table) -> RichTable | Unbroken:
     )
     for column, (title, name) in enumerate(zip(table.titles, table.header, strict=True)):
         # Rates are so narrow that the title of a long group does not fit over them.
-        short = title if len(title) <= 4 else f"{title[:4]}."
+        short = title.removeprefix("libero_")
+        short = short if len(short) <= 4 else f"{short[:4]}."
         header = f"{short}\n{name}" if title else name
         result.add_column(header, justify="left" if table.is_text(column) else "right", overflow="fold")
     for index in range(len(table.rows)):

@@ -14,6 +14,8 @@ from lerobot_memobench.errors import MemobenchError
 if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
 
+    from lerobot_memobench.envs.episode_log import Acting
+
 PREFIX = "lerobot-"
 
 
@@ -56,29 +58,36 @@ def call_lerobot(command: str, flags: Sequence[str]) -> int:
     return 1
 
 
-def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
-    """Return the configuration of the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, else None.
+def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None, Acting]:
+    """Return the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, and its description for the log.
 
-    Set the convention for the checkpoint of an evaluation; a training may begin with any.
+    The configuration is None elsewhere; the description is known in evaluations. Set the convention for the checkpoint
+    of an evaluation; a training may begin with any.
 
     Raises:
-        MemobenchError: as of `chosen_convention`; or LeRobot's command would run the policy in LIBERO's pipelines.
+        MemobenchError: as of `chosen_convention` and `check_obs_type`; or LeRobot's command would run the policy in
+            LIBERO's pipelines.
     """
-    from lerobot_memobench.envs.observations import policy_features, policy_names
+    from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY
+    from lerobot_memobench.envs.observations import check_obs_type, policy_features, policy_names
     from lerobot_memobench.policies.compatibility import check_actions
     from lerobot_memobench.policies.convention import chosen_convention
+    from lerobot_memobench.policies.lerobot_config import acting
     from lerobot_memobench.run.command_line import PATH, parse_words, read_words
     from lerobot_memobench.sim.convention import MIRRORED
 
     name = Path(sys.argv[0]).name.replace("_", "-")
     command = next((one for one in ("train", "eval") if name.startswith(f"{PREFIX}{one}")), None)
     if command is None:
-        return None
+        return None, UNKNOWN_POLICY
     asked = read_words(command, parse_words(sys.argv[1:]))
     policy: PreTrainedConfig | None = asked.build_field("policy")
     path = asked.get(f"policy.{PATH}")
-    if command == "train" or policy is None or path is None:
-        return policy
+    if command == "train" or policy is None:
+        return policy, UNKNOWN_POLICY
+    check_obs_type(policy, environment.obs_type, environment.suite)
+    if path is None:
+        return policy, acting(policy, None, None, environment.settings)
     check_actions(path, policy)
     if policy.type == "xvla":
         raise MemobenchError(
@@ -91,4 +100,4 @@ def prepare_lerobots_command(environment: Any) -> PreTrainedConfig | None:
     if found not in (None, environment.convention):  # with the names of its pictures
         names = {"features": policy_features(), "features_map": policy_names()}
         vars(environment).update(vars(replace(environment, **names, convention=found)))
-    return policy
+    return policy, acting(policy, path, None, environment.settings)

@@ -36,7 +36,7 @@ from lerobot_memobench.protocol import (
 )
 from lerobot_memobench.run.command_line import RUN_OPTIONS, parse_words, spelled, value_of, without
 from lerobot_memobench.sim.convention import MIRRORED
-from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.libero_suites import NUM_STATES, check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ def check_policy_fits(plan: EvaluationPlan) -> None:
     policy, path = plan.policy, plan.policy_path
     if path is not None:
         check_checkpoint(path)
-    check_obs_type(policy, plan.environment.obs_type)
+    check_obs_type(policy, plan.environment.obs_type, plan.environment.suite)
     if path is not None:
         with quiet():
             check_as_trained(path, policy)
@@ -307,11 +307,8 @@ def check_scenes(plan: EvaluationPlan) -> None:
         MemobenchError: no scene would be complete, or one would be run twice.
     """
     grid = plan.grid
-    if plan.environment.suite in LIBERO_SUITES and not 0 <= grid.first <= grid.first + grid.runs <= NUM_STATES:
-        raise MemobenchError(
-            f"found episodes {grid.first} to {grid.first + grid.runs - 1}; tasks of {plan.environment.suite} have "
-            f"{NUM_STATES} initial states: ask for at most episodes={NUM_STATES}, and leave seed_base out"
-        )
+    if plan.environment.suite in LIBERO_SUITES:
+        check_states(plan.environment.suite, grid.first, grid.runs)
     if not plan.environment.evidence:
         return
     variants = plan.variants
@@ -351,7 +348,7 @@ def with_protocol(asked: EvaluationSettings, options: RunOptions, policy: PreTra
     if asked.episodes is None:
         asked = replace(asked, episodes=EVIDENCE_EPISODES if asked.env.get("evidence") else EVALUATION_EPISODES)
     asked = asked.env_default(seed_base=asked.seed)  # episodes are counted from the first
-    if (observed := obs_type_of(policy)) not in (None, PIXELS):
+    if (observed := obs_type_of(policy)) not in (None, PIXELS) and asked.env.get("suite") not in LIBERO_SUITES:
         asked = asked.env_default(obs_type=observed)
     if policy.type in SCRIPTED:
         asked = asked.env_default(**{SCRIPTED[policy.type]: True})

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
 from lerobot_memobench.tasks.gap import gaps
 from lerobot_memobench.tasks.libero_suites import FOLDER as LIBERO_FOLDER
-from lerobot_memobench.tasks.libero_suites import get_libero_task, libero_suite_of, libero_tasks
+from lerobot_memobench.tasks.libero_suites import get_libero_task, libero_id, libero_suite_of, libero_tasks
 from lerobot_memobench.tasks.metadata import Metadata, read_text
 from lerobot_memobench.tasks.task import (
     BDDL_FILE,
@@ -110,8 +110,8 @@ def task_names(memory_types: str | Iterable[str] | None = None, suite: str | Non
 
 def task_index(name: str) -> int:
     """Return the stable index of a task: its position in ``task_names(suite=None)``, or LIBERO's id."""
-    suite = libero_suite_of(name)
-    return libero_tasks(suite).index(name) if suite else list(_folders()).index(task_folder(name).name)
+    found = libero_id(name)
+    return list(_folders()).index(task_folder(name).name) if found is None else found
 
 
 def first_number(suite: str) -> int:
@@ -181,14 +181,12 @@ def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str
             raise MemobenchError(
                 f"found {word!r} among the tasks, expected 'all', "
                 f"{f'a memory type ({", ".join(types)}), ' if types else ''}or a task's name or number "
-                f"(`memobench tasks{'' if suite == PUBLISHED else f' --suite {suite}'}` lists them), {hint}"
+                f"(`{_listing(suite)}` lists them), {hint}"
             )
     return list(dict.fromkeys(chosen))
 
 
-def lerobots_choice(
-    task: str | None, task_ids: Sequence[int] | None, suite: str, tasks: str
-) -> tuple[tuple[str, ...], str]:
+def lerobots_choice(task: str | None, task_ids: Any, suite: str, tasks: str) -> tuple[tuple[str, ...], str]:
     """Return suites and ``tasks`` for LeRobot's settings ``task`` and ``task_ids``, next to ``suite`` and ``tasks``.
 
     Args:
@@ -199,13 +197,18 @@ def lerobots_choice(
         MemobenchError: both names of one setting are given, or ids with another suite than LIBERO's.
     """
     words = [] if task is None else [word.strip() for word in task.split(",")]
-    suites = tuple(dict.fromkeys(words)) if {*words} & {*LIBERO_SUITES} else (suite,)
+    suites = tuple(dict.fromkeys(words)) if any(word.startswith("libero") for word in words) else (suite,)
     if suites != (suite,):
+        if others := [word for word in words if word in (*SUITES, *MEMORY_TYPES)]:
+            raise MemobenchError(
+                f"task={task} names suites of LIBERO and {' and '.join(others)}, of memory tasks; run them by two "
+                f"commands, the second with {f'suite={others[0]}' if others[0] in SUITES else f'tasks={others[0]}'}"
+            )
         for each in suites:
             check_choice("task", each, LIBERO_SUITES)
         if suite not in (PUBLISHED, suites[0]):
             raise MemobenchError(f"task={task} and suite={suite} are both given; leave one of them out")
-    elif words and suite not in words:
+    elif words and {*words} != {suite}:
         if tasks != "all":
             raise MemobenchError(f"env.task={task} and env.tasks={tasks} are both given; remove env.task")
         tasks = str(task)
@@ -215,7 +218,7 @@ def lerobots_choice(
         raise MemobenchError(f"task_ids={task_ids} and tasks={tasks} are both given; leave one of them out")
     if not {*suites} <= {*LIBERO_SUITES}:
         raise MemobenchError(f"task_ids={task_ids} are ids of LIBERO's suites, and suite={suite}; name tasks by tasks=")
-    if not isinstance(task_ids, list) or not all(type(each) is int for each in task_ids):
+    if not isinstance(task_ids, list) or not task_ids or not all(type(each) is int and each >= 0 for each in task_ids):
         raise MemobenchError(f"task_ids is {task_ids!r}; expected ids of LIBERO's tasks in a list, such as [0,1]")
     return suites, ",".join(map(str, task_ids))
 
@@ -243,13 +246,18 @@ def _expand(word: str, suite: str) -> list[str]:
             problem = "this is not a complete range; " if numbers is None else reversed_range
             raise MemobenchError(
                 f"found {word} among the tasks; {problem}tasks of the {suite} suite are numbered {lowest} to "
-                f"{lowest + len(names) - 1}, an example of a range is 3-7 (`memobench tasks` lists them)"
+                f"{lowest + len(names) - 1}, an example of a range is 3-7 (`{_listing(suite)}` lists them)"
             )
         return names[first - lowest : last - lowest + 1]
     own = suite_of(word)
     if own not in (None, suite):
         raise MemobenchError(f"{word!r} is a task of the {own} suite; set suite={own}, or --suite {own}")
     return [] if own is None else [word]
+
+
+def _listing(suite: str) -> str:
+    """Return the command that lists the tasks of a suite."""
+    return "memobench tasks" if suite == PUBLISHED else f"memobench tasks --suite {suite}"
 
 
 def task_record(task: Task, state_dim: int) -> dict[str, Any]:

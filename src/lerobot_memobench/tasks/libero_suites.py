@@ -50,6 +50,12 @@ def libero_suite_of(name: str) -> LiberoSuite | None:
     return next((suite for suite in LIBERO_SUITES if name in _names(suite)), None)
 
 
+def libero_id(name: str) -> int | None:
+    """Return LIBERO's id of a task, its index in its suite; None for a task that is not LIBERO's."""
+    suite = libero_suite_of(name)
+    return None if suite is None else _names(suite).index(name)
+
+
 @cache
 def get_libero_task(name: str) -> Task:
     """Return a LIBERO task.
@@ -93,6 +99,15 @@ def initial_states(name: str) -> NDArray[np.float64]:
             raise _damaged(suite, f"the initial states of {name} are {states.dtype} of shape {states.shape}")
     states.flags.writeable = False
     return states
+
+
+def check_states(suite: str, first: int, episodes: int) -> None:
+    """Raise `MemobenchError` unless the tasks of a suite have the initial states of ``episodes`` from ``first`` on."""
+    if not 0 <= first <= first + episodes <= NUM_STATES:
+        raise MemobenchError(
+            f"found the initial states {first} to {first + episodes - 1}, and tasks of {suite} have {NUM_STATES} "
+            f"initial states, 0 to {NUM_STATES - 1}: ask for at most {NUM_STATES} episodes, and leave seed_base out"
+        )
 
 
 def language(name: str) -> str:

@@ -211,7 +211,7 @@ def complete_training(asked: Asked, notify: Callable[[str], None] = print) -> tu
             was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
             notify(f"note: '{path}' was trained with {was}; this training continues from its weights with {now}")
     if getattr(config.env, "type", None) == "memobench":
-        check_obs_type(policy, config.env.obs_type)
+        check_obs_type(policy, config.env.obs_type, config.env.suite)
     if config.steps < SHORT_TRAINING and asked.get("log_freq") is None:
         config.log_freq = max(1, config.steps // 10)
     if asked.get("batch_size") is None and getattr(policy, "decodes_no_video", False):

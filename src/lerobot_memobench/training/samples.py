@@ -24,6 +24,7 @@ from lerobot.scripts import lerobot_train
 from torch import Tensor
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import lock_refusal
 from lerobot_memobench.run.command_line import register_plugins
 
@@ -121,6 +122,8 @@ def main() -> None:
     lerobot_train.make_train_eval_datasets = open_datasets
     try:
         lerobot_train.train(config)
+    except MemobenchError as error:
+        sys.exit(f"lerobot: {error}")
     except OSError as error:
         if (refusal := lock_refusal(error)) is None:
             raise

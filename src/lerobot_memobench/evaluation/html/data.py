@@ -16,11 +16,12 @@ from lerobot_memobench.evaluation.comparison import comparison_phrase, controls_
 from lerobot_memobench.evaluation.evidence import evidence_phrase
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
+    SUITE,
     Rate,
     Record,
     Row,
     Summary,
-    failure_counts,
+    by_task,
     failure_of,
     operations,
     percent,
@@ -33,8 +34,8 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.memory_reads import Chunk
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.catalogue import GROUPS, find_tasks, get_task, load_task, suite_of
-from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.formula import format_formula
+from lerobot_memobench.tasks.libero_suites import libero_id
 from lerobot_memobench.tasks.task import LEVELS, Task
 
 
@@ -68,13 +69,13 @@ def page_data(
         "fps": CONTROL_HZ,
         "levels": list(LEVELS),
         "memory_types": list(GROUPS),
-        "suite": runs[0].summary.of_libero,
+        "suite": runs[0].summary.grouping == SUITE,
         "metrics": list(runs[0].summary.average),
         "operations": {
             key: {"name": OPERATION_NAMES[key], "colour": "#" + bytes(colour).hex()}
             for key, colour in OPERATION_COLOURS.items()
         },
-        "failures": list(dict.fromkeys([*FAILURES, *(name for run in runs for name in failure_counts(run.records))])),
+        "failures": list(dict.fromkeys(name for run in runs for name in run.summary.failures)),
         "tasks": tasks_data([record for run in runs for record in run.records], known),
         "runs": [
             run_data(run, addresses, of_run, controls[run.name])
@@ -88,14 +89,14 @@ def page_data(
 
 def tasks_data(records: Iterable[Record], known: Mapping[str, Task]) -> dict[str, Any]:
     """Return per task of the rollouts, by memory type and name, its language, and the texts of each variant."""
-    order = {memory_type: k for k, memory_type in enumerate(GROUPS)}
     sample = {record["task"]: record for record in records}
     seen = {(record["task"], _variant(record)) for record in records}
     result: dict[str, Any] = {}
-    for name, record in sorted(sample.items(), key=lambda item: (order.get(item[1]["memory_type"], 9), item[0])):
+    for name, (record, *_) in by_task(sample.values()).items():
         task = known.get(name)
         result[name] = {
             "memory_type": record["memory_type"],
+            "id": libero_id(name),
             "language": task.title if task else name.replace("_", " "),
             "variants": {
                 str(k): variant_data(task.variant(k))
@@ -128,7 +129,8 @@ def run_data(
     run: Run, videos: Mapping[int, str], reads: Mapping[int, Sequence[Chunk]], controls: Sequence[str]
 ) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
-    summary, starts = run.summary, run.card.get("runs", [])
+    summary = run.summary
+    starts = [start for each in run.evaluations for start in each.card.get("runs", [])]
     return {
         "name": run.name,
         "headline": headline([run]),
@@ -136,7 +138,7 @@ def run_data(
         "commands": [shlex.join(start["command"]) for start in starts if start.get("command")],
         "notes": list(run.notes),
         "csv": csv_tables(build([run])),
-        "average": row_data(summary.average),
+        "average": row_data(summary.average) if summary.means else None,
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
         "tasks": {name: task_data(name, summary) for name in summary.tasks},
         "episodes": [episode_data(record, videos.get(k), reads.get(k, ())) for k, record in enumerate(run.records)],
@@ -145,9 +147,13 @@ def run_data(
 
 def facts(run: Run) -> list[str]:
     """Return the line below the first one: rollouts, their horizon, and how often choices follow the evidence."""
-    horizon = run.protocol.get("horizon")
+    horizons = dict.fromkeys(each.protocol.get("horizon") for each in run.evaluations)
     evidence = [] if run.evidence is None else evidence_phrase(run.evidence)
-    return [count_of(len(run.records), "rollout"), *([] if horizon is None else [f"horizon {horizon}"]), *evidence]
+    return [
+        count_of(len(run.records), "rollout"),
+        *(f"horizon {horizon}" for horizon in horizons if horizon),
+        *evidence,
+    ]
 
 
 def task_data(name: str, summary: Summary) -> dict[str, Any]:

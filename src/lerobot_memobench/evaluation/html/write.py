@@ -83,13 +83,19 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
     reads: list[dict[int, list[Chunk]]] = []
     evaluations = read_runs(folders)
     for run, slug in zip(evaluations, _slugs([run.name for run in evaluations]), strict=True):
-        found, notes = find_videos(run.folder, run.records)
+        found, read, notes, first = dict[int, Path](), dict[int, list[Chunk]](), list[str](), 0
+        for each in run.evaluations:
+            videos, misfits = find_videos(each.folder, each.records)
+            own_reads, others = find_reads(each.folder, each.records, each.protocol)
+            found |= {first + k: video for k, video in videos.items()}
+            read |= {first + k: chunks for k, chunks in own_reads.items()}
+            notes += [*misfits, *others]
+            first += len(each.records)
         names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}{VIDEO}" for k in found}
         chosen |= {out / name: found[k] for k, name in names.items()}
         addresses.append(names)
-        read, misfits = find_reads(run.folder, run.records, run.protocol)
         reads.append(read)
-        runs.append(replace(run, notes=(*run.notes, *notes, *misfits)))
+        runs.append(replace(run, notes=(*run.notes, *notes)))
     refuse_links(out / VIDEOS, *(target.parent for target in chosen))
     known = task_source({record["task"] for run in runs for record in run.records}, task_dir)
     text = page(page_data(runs, addresses, known, reads), title=", ".join(run.name for run in runs))

@@ -89,6 +89,12 @@ const OUTCOMES = {
   unstable_physics: { words: "unstable physics", letter: "B", why: "The physics broke down and ended it." },
 };
 
+if (DATA.suite) {
+  // LIBERO's tasks have no checkpoints: other classes do not occur, and this one means no more than this.
+  for (const name of Object.keys(OUTCOMES)) if (name !== "success" && !DATA.failures.includes(name)) delete OUTCOMES[name];
+  if (OUTCOMES.execution_failure) OUTCOMES.execution_failure.why = "The goal was not reached within the step limit.";
+}
+
 const outcomeMark = (outcome) =>
   el(
     "span",
@@ -99,7 +105,8 @@ const outcomeMark = (outcome) =>
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 /** A memory type as a title, or the name of a suite of LIBERO. */
 const groupName = (group) => (DATA.suite ? group : capital(group));
-const taskTitle = (task) => capital(DATA.tasks[task].language);
+/** A task's instruction, after LIBERO's id where it has one. */
+const taskTitle = (task) => `${DATA.tasks[task].id === null ? "" : `${DATA.tasks[task].id} · `}${capital(DATA.tasks[task].language)}`;
 const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 const seconds = (frames) => `${(frames / DATA.fps).toFixed(1)} s`;
 

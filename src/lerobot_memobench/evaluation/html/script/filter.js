@@ -12,7 +12,7 @@ function searchText(episode) {
     [
       episode.task,
       DATA.tasks[episode.task].language,
-      DATA.tasks[episode.task].memory_type,
+      `${DATA.tasks[episode.task].memory_type} ${DATA.tasks[episode.task].id ?? ""}`,
       OUTCOMES[episode.outcome].words,
       `episode ${episode.episode}`,
       `seed ${episode.seed}`,

@@ -106,7 +106,7 @@ function ticks(end) {
 const markLegend = () =>
   el(
     "span",
-    { class: "signs" },
+    { class: "signs", hidden: DATA.suite },
     el("span", {}, shape("S", "hollow"), " first held"),
     el("span", {}, shape("S", "full"), " held in order"),
     el("span", {}, el("span", { class: "sample active op-S" }), " being worked on"),

@@ -16,6 +16,9 @@ function fillControls() {
     byId("level"),
     DATA.levels.map((level) => [level, level]),
   );
+  for (const part of document.querySelectorAll("[data-memory]")) part.hidden = DATA.suite;
+  byId("legend").hidden = DATA.suite;
+  if (DATA.suite) byId("groups").textContent = "Suite";
   byId("run").parentElement.hidden = DATA.runs.length < 2;
   byId("to-compare").hidden = DATA.runs.length < 2;
   const types = DATA.memory_types.filter((type) => Object.values(DATA.tasks).some((task) => task.memory_type === type));

@@ -10,8 +10,8 @@ const METRIC_WORDS = {
 };
 
 const RATES_HINT =
-  "Per cent; the line is Wilson’s 95 % interval over n rollouts. A memory type is the mean over its tasks, the average " +
-  "over the memory types, as far as a metric applies.";
+  `Per cent; the line is Wilson’s 95 % interval over n rollouts. A ${DATA.suite ? "suite" : "memory type"} is the mean ` +
+  `over its tasks, the average over the ${DATA.suite ? "suites" : "memory types, as far as a metric applies"}.`;
 
 /** A rate as a number above its interval on a scale from 0 to 100. */
 function rateCell(rate, metric) {
@@ -49,8 +49,7 @@ const rateCells = (row) => DATA.metrics.map((metric) => rateCell(row?.[metric], 
 /** Rates per memory type; several runs stand under one another. */
 function summaryTable(run) {
   const several = DATA.runs.length > 1;
-  const average = DATA.suite ? [] : [["average", "Average"]];
-  const groups = [...average, ...DATA.memory_types.map((type) => [type, groupName(type)])];
+  const groups = [["average", "Average"], ...DATA.memory_types.map((type) => [type, groupName(type)])];
   const rowOf = (it, key) => (key === "average" ? it.average : it.memory_types[key]);
   const bodies = groups.map(([key, words]) => {
     const runs = DATA.runs.filter((it) => rowOf(it, key));
@@ -109,7 +108,8 @@ function countOutcomes(run, keep) {
 function outcomeTable(run) {
   const row = (words, counts, where) =>
     el("tr", {}, el("th", { scope: "row" }, words), el("td", { class: "wide" }, outcomeBar(counts, where)));
-  const types = DATA.suite ? [] : DATA.memory_types.filter((type) => run.memory_types[type]);
+  const there = DATA.memory_types.filter((type) => run.memory_types[type]);
+  const types = DATA.suite && there.length === 1 ? [] : there;
   return el(
     "table",
     { class: "endings" },
@@ -243,7 +243,7 @@ function drawOverview(run, chosen) {
       el(
         "section",
         {},
-        el("h3", {}, "Rates", csvLink(run, "memory-types", "Rates by memory type")),
+        el("h3", {}, "Rates", csvLink(run, "memory-types", DATA.suite ? "Rates by suite" : "Rates by memory type")),
         el("div", { class: "scroll" }, summaryTable(run)),
         el("p", { class: "hint" }, RATES_HINT),
       ),

@@ -37,7 +37,7 @@ function playButtons(toggle, paced) {
   return { play, speed, label };
 }
 
-const keysHint = () => el("span", { class: "hint" }, "Space plays, ← → step, [ ] jump between checkpoints");
+const keysHint = () => el("span", { class: "hint" }, `Space plays, ← → step${DATA.suite ? "" : ", [ ] jump between checkpoints"}`);
 
 /** The video with its buttons, or a plain word where there is none. `moved` is told the frame that is seen. */
 function stage(episode, moved) {

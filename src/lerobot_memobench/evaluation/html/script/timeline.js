@@ -67,6 +67,7 @@ function timeline(episode, level, seek, length = lastFrame(episode), lead = 0) {
 function subgoalWords(episode, now, level) {
   if (now.phase === "prompt") return "watch the prompt";
   if (now.phase === "end" && episode.outcome === "success") return "done";
+  if (DATA.suite) return now.phase === "end" ? "the goal does not hold" : "";
   if (now.checkpoint === null && now.phase === "end") return "every checkpoint is complete, the goal does not hold";
   if (now.checkpoint === null) return "every checkpoint is complete";
   return checkpointText(episode.task, episode.variant, now.checkpoint, level);
