@@ -104,13 +104,15 @@ def _present_plan(seat: Seat) -> tuple[int, int]:
 
 def by_undeclared_plan(seat: Seat) -> Motion:
     """Time the event so that a plan begins within it; if the plan goes on after the hold, the event is done."""
-    (first, *_), (placed, *_) = seat.events(), seat.placed()
+    first, *others = seat.events()
     while not np.linalg.norm(seat.frames[seat.elapsed - seat.elapsed % UNDECLARED]) > HAND_POSE:
         while UNDECLARED - seat.elapsed % UNDECLARED > EVENT_STEPS:
             yield seat.expert.hand.toward(*seat.sim.home, OPEN)
         yield from bring(seat, *first)
         yield from seat.do()
-    yield from seat.do(placed)
+    for event in others:
+        yield from bring(seat, *event)
+    yield from finish(seat)
 
 
 LIMITS: dict[str, tuple[Strategy, dict[str, Any]]] = {
@@ -126,7 +128,7 @@ def applies(strategy: str, task: Task) -> bool:
     """Return whether a strategy is written for a task."""
     if "clock" in strategy:
         return task.family in ("counting", "ordering")
-    return task.family == "ordering" and (strategy == "phase of plans" or len(task.objects) > 1 or "bowl" in task.name)
+    return task.family == "ordering" and (strategy == "phase of plans" or "three" not in task.name)
 
 
 @cache
