@@ -337,21 +337,21 @@ def past_home(seat: Seat) -> Motion:
         done = seat.guess() if seen is None else seen
         if done < len(events):
             yield from bring(seat, *events[done])
-            yield from _come_from(seat, done + 1)
+            yield from come_from(seat, done + 1, lambda: seat.begins_plan)
         elif placed:
             yield from seat.do(*placed)
         else:
             yield from seat.rest()
 
 
-def _come_from(seat: Seat, number: int) -> Motion:
+def come_from(seat: Seat, number: int, plan_begins: Callable[[], bool]) -> Motion:
     """Wait beside home, on the side of ``number`` events, until a plan begins; then come home."""
     hand, (home, turn) = seat.expert.hand, seat.sim.home
     side = directions()[number - 1]
     yield from rise(hand, OPEN, 0.2)
     yield from hand.move(home + BESIDE * side, turn, OPEN, tolerance=0.012, turn_tolerance=0.04, timeout=120)
     yield from hand.move(home + NEAR * side, turn, OPEN, tolerance=0.004, turn_tolerance=0.04, timeout=60)
-    while not seat.begins_plan:
+    while not plan_begins():
         yield hand.toward(home + NEAR * side, turn, OPEN)
     for _ in range(30):
         if seat.sim.holds(Atom("asbegun", ())):

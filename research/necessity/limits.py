@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,15 +21,11 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.experts.hand import OPEN
-from lerobot_memobench.experts.travel import rise
 from lerobot_memobench.protocol import LONGEST_HOLD, VALIDATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import STRICT, Task
 from research.command import run
 from research.necessity.adversaries import (
-    BESIDE,
     HAND_POSE,
     NEAR,
     Motion,
@@ -37,6 +33,7 @@ from research.necessity.adversaries import (
     Strategy,
     bring,
     ceiling,
+    come_from,
     directions,
     finish,
     gather,
@@ -53,7 +50,7 @@ UNDECLARED = 400
 """Actions of a plan that is declared as a single action."""
 
 
-def by_elapsed_steps(releases: Callable[[Seat, int], NDArray[np.float64]], seat: Seat) -> Motion:
+def by_elapsed_steps(releases: Callable[[Seat, int], NDArray[np.floating]], seat: Seat) -> Motion:
     """Count past events by the elapsed steps at a release; ``releases`` expects them after 0 to n events."""
     expected = releases(seat, len(seat.events()))
     while (done := int(np.argmin(np.abs(expected - seat.elapsed)))) < len(seat.events()):
@@ -62,12 +59,12 @@ def by_elapsed_steps(releases: Callable[[Seat, int], NDArray[np.float64]], seat:
     yield from finish(seat)
 
 
-def after_longest_holds(seat: Seat, events: int) -> NDArray[np.float64]:
+def after_longest_holds(seat: Seat, events: int) -> NDArray[np.floating]:
     """Return the releases if a declared window makes all holds as long as the longest one."""
     return LONGEST_HOLD + np.arange(events + 1) * (LONGEST_HOLD + EVENT_STEPS)
 
 
-def after_public_holds(seat: Seat, events: int) -> NDArray[np.float64]:
+def after_public_holds(seat: Seat, events: int) -> NDArray[np.floating]:
     """Return the releases by the holds that the public seed of a recognised scene draws."""
     drawn = [next(holds) for holds in [seat.episode.draw_holds()] for _ in range(events + 1)]
     return np.cumsum(drawn) + np.arange(events + 1) * EVENT_STEPS
@@ -75,19 +72,13 @@ def after_public_holds(seat: Seat, events: int) -> NDArray[np.float64]:
 
 def by_phase_of_plans(seat: Seat) -> Motion:
     """Begin plans early beside home; the phase of later plans counts the events."""
-    hand, (home, turn) = seat.expert.hand, seat.sim.home
-    events, placed = seat.events(), seat.placed()
+    events = seat.events()
     while (done := EVENTS_BY_INDEX.get(seat.elapsed - _present_plan(seat)[0], 0)) < len(events):
         yield from bring(seat, *events[done])
-        side = directions()[done]
-        yield from rise(hand, OPEN, 0.2)
-        yield from hand.move(home + BESIDE * side, turn, OPEN, tolerance=0.012, turn_tolerance=0.04, timeout=120)
-        yield from hand.move(home + NEAR * side, turn, OPEN, tolerance=0.003, turn_tolerance=0.04, timeout=60)
-        while not (seat.elapsed == _present_plan(seat)[0] and _present_plan(seat)[1] < PLAN):
-            yield hand.toward(home + NEAR * side, turn, OPEN)
-        while seat.episode.action_has_effect and not seat.sim.holds(Atom("asbegun", ())):
-            yield hand.toward(home, turn, OPEN, speed=0.6)
-    yield from seat.do(*placed)
+        yield from come_from(
+            seat, done + 1, lambda: _present_plan(seat) in [(seat.elapsed, cut) for cut in CUT.values()]
+        )
+    yield from finish(seat)
 
 
 def _present_plan(seat: Seat) -> tuple[int, int]:
@@ -103,13 +94,11 @@ def _present_plan(seat: Seat) -> tuple[int, int]:
 
 
 def by_undeclared_plan(seat: Seat) -> Motion:
-    """Time the event so that a plan begins within it; if the plan goes on after the hold, the event is done."""
+    """Come home within a plan that began beside home; if the plan goes on after the hold, the event is done."""
     first, *others = seat.events()
-    while not np.linalg.norm(seat.frames[seat.elapsed - seat.elapsed % UNDECLARED]) > HAND_POSE:
-        while UNDECLARED - seat.elapsed % UNDECLARED > EVENT_STEPS:
-            yield seat.expert.hand.toward(*seat.sim.home, OPEN)
+    while np.linalg.norm(seat.frames[seat.elapsed - seat.elapsed % UNDECLARED]) <= HAND_POSE:
         yield from bring(seat, *first)
-        yield from seat.do()
+        yield from come_from(seat, 1, lambda: seat.elapsed % UNDECLARED == 0)
     for event in others:
         yield from bring(seat, *event)
     yield from finish(seat)
@@ -125,39 +114,31 @@ LIMITS: dict[str, tuple[Strategy, dict[str, Any]]] = {
 
 
 def applies(strategy: str, task: Task) -> bool:
-    """Return whether a strategy is written for a task."""
-    if "clock" in strategy:
-        return task.family in ("counting", "ordering")
-    return task.family == "ordering" and (strategy == "phase of plans" or "three" not in task.name)
-
-
-@cache
-def _episode(name: str, strategy: str) -> Episode:
-    return Episode(get_task(name), EnvSettings(suite=STRICT, **LIMITS[strategy][1]))
+    """Return whether a strategy is written for a temporal task."""
+    orders_two = task.family == "ordering" and "three" not in task.name
+    return "clock" in strategy or orders_two or (strategy == "phase of plans" and task.family == "ordering")
 
 
 def rollout(name: str, strategy: str, seed: int) -> dict[str, object]:
     """Return one rollout of a strategy, as `research.necessity.adversaries.rollout`."""
-    return play(_episode(name, strategy), LIMITS[strategy][0], strategy, seed)
+    act, declared = LIMITS[strategy]
+    return play(Episode(get_task(name), EnvSettings(suite=STRICT, **declared)), act, strategy, seed)
 
 
 def limits(
     out: Annotated[Path, typer.Option(help="Folder of the rollouts; the same command goes on.")],
     scenes: Annotated[int, typer.Option(min=1, help="Scenes of each task and strategy.")] = 4,
-    seed: Annotated[int, typer.Option(help="Seed of the first scene.")] = VALIDATION_SEED,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
 ) -> None:
     """Roll out the strategies; print solved rollouts by strategy and ceiling."""
-    names = [name for name in task_names(suite="strict") if get_task(name).memory_type == "temporal"]
     wanted = [
-        (name, strategy, seed + k)
+        (name, strategy, VALIDATION_SEED + k)
         for k in range(scenes)
         for strategy in LIMITS
-        for name in names
+        for name in task_names("temporal", suite="strict")
         if applies(strategy, get_task(name))
     ]
     found: dict[tuple[str, str], list[bool]] = {}
-    for one in gather(rollout, wanted, out, workers):
+    for one in gather(rollout, wanted, out, workers=1):
         task = get_task(str(one["task"]))
         kind = f"{task.family} | {100 * ceiling(task):.1f}"
         found.setdefault((str(one["strategy"]), kind), []).append(bool(one["success"]))

@@ -33,7 +33,9 @@ def test_the_phase_of_plans_counts_the_cut_plans() -> None:
 
 
 def test_each_strategy_applies_to_temporal_tasks_alone() -> None:
-    found = {name: sum(applies(name, get_task(task)) for task in task_names(suite="strict")) for name in LIMITS}
+    found = {
+        name: sum(applies(name, get_task(task)) for task in task_names("temporal", suite="strict")) for name in LIMITS
+    }
     assert list(found.values()) == [10, 10, 5, 4]
 
 
