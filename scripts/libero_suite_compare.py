@@ -9,15 +9,17 @@ difference. Run it under MuJoCo 3.3.7, the version of the records.
 from __future__ import annotations
 
 import argparse
-from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.sim.libero import placement
 from lerobot_memobench.sim.libero.scene import get_scene
 from lerobot_memobench.sim.scene import SUBSTEPS
 from lerobot_memobench.sim.simulation import Simulation
@@ -148,34 +150,61 @@ def pictures(place: Place, kept: Arrays) -> Differences:
 def observations(place: Place, kept: Arrays) -> Differences:
     """Compare LeRobot's observations after the reset and after two steps of relative actions.
 
-    Stock LIBERO takes fingers and joints from 2 ms before the end of the control step, and the hand from 4 ms before.
+    Stock LIBERO observes fingers and joints 2 ms before the end of the control step, hand and pictures 4 ms before it.
     """
-    sim = simulate(place)
-    start(sim, 0)
+    sim, shown = simulate(place), simulate(place)
+    moments = watched_start(sim)
     yield "fixtures (LeRobot loads the model once more)", 1, apart(poses(sim), kept["relative.fixtures"])
-    shown, hand, fingers = simulate(place), sim.proprio(), sim.proprio()
     for step in range(3):
+        (hand, drawn), (fingers, _), (state, last) = moments
         theirs = kept[f"relative.{step}.processed.observation.state"][0]
-        yield f"state at the end of step {step}", 1, apart(sim.proprio(), theirs)
-        if step:
-            yield f"earlier_state of step {step}", 1, apart([*hand[:6], *fingers[6:]], theirs)
+        yield f"state at the end of step {step}", 1, apart(state, theirs)
+        yield f"earlier_state of step {step}", 1, apart([*hand[:6], *fingers[6:]], theirs)
         for camera, name in zip(CAMERAS, ("image", "image2"), strict=True):
             image = 255 * kept[f"relative.{step}.processed.observation.images.{name}"][0].transpose(1, 2, 0)
-            set_recorded(shown, kept[f"relative.{step}.qpos"], kept["relative.fixtures"])
-            ours = shown.render(camera).astype(float)
-            yield f"mirrored_{camera} at step {step}", 1, float(np.abs(ours[:, ::-1] - image).mean())
-            yield f"unmirrored_{camera} at step {step}", 1, float(np.abs(ours - image).mean())
+            for time, qpos in (("", last), ("earlier_", drawn)):
+                set_recorded(shown, qpos, kept["relative.fixtures"])
+                ours = shown.render(camera).astype(float)
+                yield f"{time}mirrored_{camera} at step {step}", 1, float(np.abs(ours[:, ::-1] - image).mean())
+                yield f"{time}unmirrored_{camera} at step {step}", 1, float(np.abs(ours - image).mean())
         action = kept[f"relative.{step}.action"]
         sim._controller.set_goal(sim.data, action)
-        sim._controller.advance(sim.data, float(action[6]), SUBSTEPS - 2)
-        hand = sim.proprio()
-        sim._controller.advance(sim.data, float(action[6]), 1)
-        fingers = sim.proprio()
-        sim._controller.advance(sim.data, float(action[6]), 1)
+        moments = []
+        for substeps in (SUBSTEPS - 2, 1, 1):
+            sim._controller.advance(sim.data, float(action[6]), substeps)
+            moments.append((sim.proprio(), sim.data.qpos.copy()))
+
+
+def watched_start(sim: Simulation) -> Sequence[tuple[NDArray[Any], NDArray[Any]]]:
+    """Reset to episode 0, and return proprioception and qpos after its last three physics steps."""
+    moments: deque[tuple[NDArray[Any], NDArray[Any]]] = deque(maxlen=3)
+    advance = sim._controller.advance
+
+    def watched(*args: Any) -> None:
+        advance(*args)
+        moments.append((sim.proprio(), sim.data.qpos.copy()))
+
+    with patch.object(sim._controller, "advance", watched):
+        start(sim, 0)
+    return moments
+
+
+def loads(place: Place, kept: Arrays) -> Differences:
+    """Compare fixtures with those of LeRobot's episodes, after as many loads of the model and after ours."""
+    sim, usual = simulate(place), placement.MODEL_LOADS
+    for episode, theirs in enumerate(kept["fixtures"]):
+        placement.MODEL_LOADS = usual + 1 + episode
+        sim._placer.place(FIRST_SEED + episode)
+        placement.MODEL_LOADS = usual
+        yield f"fixtures of LeRobot's episode {episode}", 1, apart(poses(sim), theirs)
+        sim._placer.place(FIRST_SEED + episode)
+        for name, ours, pose in zip(sim.fixture_poses(), poses(sim), theirs, strict=True):
+            yield f"distance of {name} in episode {episode}", 1, float(np.linalg.norm(ours[:3] - pose[:3]))
 
 
 KINDS: dict[str, tuple[Callable[[Place, Arrays], Differences], str, float]] = {
     "observations": (observations, "observations", 1e-5),
+    "loads": (loads, "loads", 1e-9),
     "models": (models, "models", 0.0),
     "first_states": (states, "first_states", 1e-9),
     "states": (states, "states", 1e-9),

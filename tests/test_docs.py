@@ -333,7 +333,7 @@ def check(words: list[str]) -> None:
             check_lerobot(program.partition("-")[2], [as_pair(word) for word in spelled(parse_words(rest))])
         case "memobench":
             check_memobench(rest)
-        case "python":
+        case _ if program == "python" or program.endswith("/bin/python"):
             check_python(rest)
         case "vla-eval":
             check_vla_eval(rest)

@@ -123,7 +123,7 @@ class Seat:
     rng: np.random.Generator
 
     def __post_init__(self) -> None:
-        self._frames: list[NDArray[np.float64]] = []
+        self.frames: list[NDArray[np.float64]] = []
         self._places = {name: self.sim.body_pose(name)[0] for name in self.task.objects}
 
     @property
@@ -138,12 +138,12 @@ class Seat:
 
     def see(self) -> None:
         """Keep the hand's position in the observation of this control step, in a hold too."""
-        self._frames.append(self.sim.proprio()[:3].astype(np.float64) - self.sim.home[0])
+        self.frames.append(self.sim.proprio()[:3].astype(np.float64) - self.sim.home[0])
 
     @property
     def elapsed(self) -> int:
         """Control steps since the execution began, in holds too: what a clock would show."""
-        return len(self._frames) - 1
+        return len(self.frames) - 1
 
     @property
     def begins_plan(self) -> bool:
@@ -157,9 +157,9 @@ class Seat:
         """
         settings = self.episode.settings
         last = self.elapsed - self.elapsed % (settings.replan_steps or 1)
-        for frame in self._frames[max(last - settings.window_steps + 1, 0) : last + 1]:
+        for frame in self.frames[max(last - settings.window_steps + 1, 0) : last + 1]:
             if np.linalg.norm(frame) > HAND_POSE:
-                return 1 + int(np.argmax(_directions() @ frame))
+                return 1 + int(np.argmax(directions() @ frame))
         return None
 
     def guess(self) -> int:
@@ -212,6 +212,8 @@ class Seat:
         return float(self.sim.body_pose(name)[0][1] - self._places[name][1])
 
 
+Wanted = tuple[str, str, int]
+"""Task, strategy and seed of a rollout."""
 Strategy = Callable[[Seat], Motion]
 """Yields actions; each decision is a function of the present observation of the seat."""
 
@@ -225,15 +227,15 @@ def by_note(read: Callable[[Seat], int], write: Callable[[Seat, int], Motion]) -
     def act(seat: Seat) -> Motion:
         events = seat.events()
         while (done := read(seat)) < len(events):
-            yield from _bring(seat, *events[done])
+            yield from bring(seat, *events[done])
             yield from write(seat, done + 1)
             yield from seat.do()
-        yield from _finish(seat)
+        yield from finish(seat)
 
     return act
 
 
-def _bring(seat: Seat, begun: Atom, ended: Atom) -> Motion:
+def bring(seat: Seat, begun: Atom, ended: Atom) -> Motion:
     """Do one event; where something is stowed within it, that too."""
     yield from seat.expert.achieve(begun)
     for atom in atoms(seat.task.goal):
@@ -242,7 +244,7 @@ def _bring(seat: Seat, begun: Atom, ended: Atom) -> Motion:
     yield from seat.expert.achieve(ended)
 
 
-def _finish(seat: Seat) -> Motion:
+def finish(seat: Seat) -> Motion:
     """Finish after the events: carry an object to its place, or rest."""
     for atom in seat.placed():
         yield from seat.expert.achieve(atom)
@@ -304,9 +306,9 @@ def by_clock(seat: Seat) -> Motion:
             yield seat.expert.hand.toward(seat.sim.home[0] + HOVER * UP, seat.sim.home[1], OPEN)
         if choice == 1 if counts else choice == len(events):
             yield from seat.do()
-            yield from _finish(seat)
+            yield from finish(seat)
             return
-        yield from _bring(seat, *events[choice])
+        yield from bring(seat, *events[choice])
         yield from seat.do()
 
 
@@ -316,7 +318,7 @@ def by_chance(seat: Seat) -> Motion:
     while True:
         choice = seat.guess()
         if choice < len(events):
-            yield from _bring(seat, *events[choice])
+            yield from bring(seat, *events[choice])
             yield from seat.do()
         elif placed:
             yield from seat.do(*placed)
@@ -334,22 +336,22 @@ def past_home(seat: Seat) -> Motion:
         seen = seat.side()
         done = seat.guess() if seen is None else seen
         if done < len(events):
-            yield from _bring(seat, *events[done])
-            yield from _come_from(seat, done + 1)
+            yield from bring(seat, *events[done])
+            yield from come_from(seat, done + 1, lambda: seat.begins_plan)
         elif placed:
             yield from seat.do(*placed)
         else:
             yield from seat.rest()
 
 
-def _come_from(seat: Seat, number: int) -> Motion:
+def come_from(seat: Seat, number: int, plan_begins: Callable[[], bool]) -> Motion:
     """Wait beside home, on the side of ``number`` events, until a plan begins; then come home."""
     hand, (home, turn) = seat.expert.hand, seat.sim.home
-    side = _directions()[number - 1]
+    side = directions()[number - 1]
     yield from rise(hand, OPEN, 0.2)
     yield from hand.move(home + BESIDE * side, turn, OPEN, tolerance=0.012, turn_tolerance=0.04, timeout=120)
     yield from hand.move(home + NEAR * side, turn, OPEN, tolerance=0.004, turn_tolerance=0.04, timeout=60)
-    while not seat.begins_plan:
+    while not plan_begins():
         yield hand.toward(home + NEAR * side, turn, OPEN)
     for _ in range(30):
         if seat.sim.holds(Atom("asbegun", ())):
@@ -357,7 +359,7 @@ def _come_from(seat: Seat, number: int) -> Motion:
         yield hand.toward(home, turn, OPEN, speed=0.6)
 
 
-def _directions() -> NDArray[np.float64]:
+def directions() -> NDArray[np.float64]:
     """Return `SIDES` as unit vectors."""
     return SIDES / np.linalg.norm(SIDES, axis=1, keepdims=True)
 
@@ -366,7 +368,7 @@ def without_coming_home(seat: Seat) -> Motion:
     """Do all events without coming home in between: the place of the hand encodes the count."""
     while True:
         for begun, ended in seat.events():
-            yield from _bring(seat, begun, ended)
+            yield from bring(seat, begun, ended)
         yield from seat.do(*seat.placed())
 
 
@@ -541,14 +543,20 @@ def _episode(name: str, strategy: str) -> Episode:
 def rollout(name: str, strategy: str, seed: int) -> dict[str, object]:
     """Return one rollout of a strategy: success, whether the goal was lost, control steps, and those in holds."""
     episode = _episode(name, strategy if strategy in DECLARED else "")
+    return play(episode, STRATEGIES[str(episode.published.family)][strategy], strategy, seed)
+
+
+def play(episode: Episode, act: Strategy, strategy: str, seed: int) -> dict[str, object]:
+    """Return the rollout of a strategy with this name in the scene of a seed."""
     episode.reset(seed, keep_prompt=True)
     while episode.phase != EXECUTION:
         episode.step(NOTHING)
+    name = episode.published.name
     rng = np.random.default_rng([seed, zlib.crc32(f"{name}, {strategy}".encode())])
     expert = Expert(episode.task, episode.sim, rng)
     expert.hand.speed = 0.8
     seat = Seat(episode, expert, rng)
-    motion = STRATEGIES[str(episode.task.family)][strategy](seat)
+    motion = act(seat)
     while not episode.done:
         seat.see()
         action = next(motion, None) if episode.action_has_effect else NOTHING
@@ -560,6 +568,22 @@ def rollout(name: str, strategy: str, seed: int) -> dict[str, object]:
     return {"task": name, "strategy": strategy, "seed": seed, **found}
 
 
+def gather(
+    play_one: Callable[[str, str, int], dict[str, object]], wanted: Sequence[Wanted], out: Path, workers: int
+) -> list[dict[str, object]]:
+    """Return the rollouts of task, strategy and seed, old ones in the folder included; new ones are appended there."""
+    out.mkdir(parents=True, exist_ok=True)
+    log = out / "rollouts.jsonl"
+    found = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
+    done = {(r["task"], r["strategy"], r["seed"]) for r in found}
+    with ProcessPoolExecutor(workers) as pool, log.open("a") as file:
+        for future in as_completed([pool.submit(play_one, *one) for one in wanted if one not in done]):
+            found.append(future.result())
+            file.write(json.dumps(found[-1]) + "\n")
+            file.flush()
+    return [r for r in found if (r["task"], r["strategy"], r["seed"]) in set(wanted)]
+
+
 def table(rollouts: list[dict[str, object]]) -> str:
     """Return the rates by task and strategy with Wilson intervals, and the ceiling."""
     lines = ["| task | ceiling | strategy | solved | rollouts | interval |", "|---|---:|---|---:|---:|---|"]
@@ -569,7 +593,7 @@ def table(rollouts: list[dict[str, object]]) -> str:
     for name in task_names(suite="strict"):
         for strategy in STRATEGIES[str(get_task(name).family)]:
             if found := results.get((name, strategy)):
-                lines.append(_line(f"`{name}` | {100 * ceiling(get_task(name)):.1f} | {strategy}", found))
+                lines.append(line(f"`{name}` | {100 * ceiling(get_task(name)):.1f} | {strategy}", found))
     return "\n".join(lines)
 
 
@@ -581,11 +605,12 @@ def summary(rollouts: list[dict[str, object]]) -> str:
             mine = [r for r in rollouts if get_task(str(r["task"])).family == family and r["strategy"] == strategy]
             if mine:
                 most = np.mean([ceiling(get_task(str(r["task"]))) for r in mine])
-                lines.append(_line(f"{family} | {100 * most:.1f} | {strategy}", [bool(r["success"]) for r in mine]))
+                lines.append(line(f"{family} | {100 * most:.1f} | {strategy}", [bool(r["success"]) for r in mine]))
     return "\n".join(lines)
 
 
-def _line(what: str, found: list[bool]) -> str:
+def line(what: str, found: list[bool]) -> str:
+    """Return a row of a table: rate in per cent, number of rollouts, and interval."""
     rate = float(np.mean(found))
     low, high = wilson(rate, len(found))
     return f"| {what} | {100 * rate:.0f} | {len(found)} | {100 * low:.0f} to {100 * high:.0f} |"
@@ -600,10 +625,6 @@ def adversaries(
     strategies: Annotated[list[str] | None, typer.Option(help="Names of strategies; all if omitted.")] = None,
 ) -> None:
     """Roll out every strategy on every strict task; print the table."""
-    out.mkdir(parents=True, exist_ok=True)
-    log = out / "rollouts.jsonl"
-    found = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
-    done = {(r["task"], r["strategy"], r["seed"]) for r in found}
     chosen = [
         name for name in task_names(suite="strict") if not tasks or name in tasks or get_task(name).memory_type in tasks
     ]
@@ -612,14 +633,9 @@ def adversaries(
         for scene in range(scenes)
         for name in chosen
         for strategy in STRATEGIES[str(get_task(name).family)]
-        if (name, strategy, seed + scene) not in done and strategy in (strategies or [strategy])
+        if strategy in (strategies or [strategy])
     ]
-    with ProcessPoolExecutor(workers) as pool, log.open("a") as file:
-        for future in as_completed([pool.submit(rollout, *one) for one in wanted]):
-            found.append(future.result())
-            file.write(json.dumps(found[-1]) + "\n")
-            file.flush()
-    asked = [one for one in found if one["task"] in chosen and seed <= one["seed"] < seed + scenes]
+    asked = gather(rollout, wanted, out, workers)
     print(f"{table(asked)}\n\n{summary(asked)}")
     print(f"\nceiling of these tasks, their mean: {100 * np.mean([ceiling(get_task(name)) for name in chosen]):.1f} %")
 

@@ -50,7 +50,7 @@ def test_holds_are_heavy_tailed_and_do_not_depend_on_the_variant() -> None:
     drawn = []
     for seed in range(20_000, 20_400):
         episode.seed = seed
-        drawn.append(list(episode._draw_holds()))
+        drawn.append(list(episode.draw_holds()))
     holds = np.array(drawn)
     assert holds.shape == (400, MOST_HOLDS)
     assert holds.min() >= 0
@@ -103,7 +103,7 @@ def test_a_hold_follows_an_event_and_the_return_to_the_scene_as_it_began(name: s
     episode, found = Episode(get_task(name)), set()
     for variant in variants:
         episode.reset(20_001, variant=variant)
-        drawn = list(episode._draw_holds())
+        drawn = list(episode.draw_holds())
         lengths = [_held(episode)]
         for joints in ({}, {TOP: OPEN}, {TOP: 0.0, MIDDLE: OPEN}, {MIDDLE: 0.0}, {}):
             lengths.append(_trip(episode, joints))

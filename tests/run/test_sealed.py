@@ -209,7 +209,7 @@ def test_salt_changes_variants_and_holds_only() -> None:
     for episode in episodes:
         episode.reset(100_007)
     assert len({episode.scene_hash for episode in episodes}) == 1
-    assert len({tuple(episode._draw_holds()) for episode in episodes}) == 3
+    assert len({tuple(episode.draw_holds()) for episode in episodes}) == 3
 
 
 def test_draws_without_a_salt_are_those_of_earlier_versions() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.hiding import PARKING_HEIGHT, HiddenObjects
+from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
@@ -73,6 +76,21 @@ def test_variants_are_equal_until_a_drawer_is_ajar(task: str, variants: range, p
     heights = [min(episode.sim.body_pose(name)[0][2] for name, _ in episode.task.prompt.places) for episode in episodes]  # type: ignore[union-attr]
     assert [height < PARKING_HEIGHT / 2 for height in heights] == inside
     assert 0 < sum(inside) < len(inside)
+
+
+@pytest.mark.parametrize("joints", [(1.9, -0.3, 1.9, -3.0, -0.8, 0.3, 0.9), (1.3, -0.8, 0.0, -0.7, 1.2, 3.1, 0.3)])
+def test_a_wrist_camera_that_looks_up_lists_no_absent_object(joints: tuple[float, ...]) -> None:
+    episode = _begun(ONE, 20_000, 0)
+    sim, slots = episode.sim, ObjectSlots(episode.sim)
+    sim.data.qpos[:7] = joints
+    mujoco.mj_step1(sim.model, sim.data)
+    seen = slots.observe().reshape(SLOTS, WIDTH)
+    assert not (seen[:, STARTS["position"] + 2] > PARKING_HEIGHT / 2).any()
+    (hidden,) = sim.absent
+    rays = slots.things[next(k for k, t in enumerate(slots.things) if t.body == sim.model.body(hidden).id)]
+    camera = sim.data.cam("robot0_eye_in_hand")
+    direction = camera.xmat.reshape(3, 3).T @ (slots.position(rays) - camera.xpos)
+    assert np.hypot(*direction[:2]) < -direction[2]  # the camera's picture contains the parking place
 
 
 def test_an_object_appears_at_rest_in_its_drawer_and_leaves_when_the_scene_is_restored() -> None:

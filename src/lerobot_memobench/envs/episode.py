@@ -129,7 +129,7 @@ class Episode:
         self.exec_start: int | None = None
         self.pacing = Pacing(self.settings, self._rng(4))
         self.rested = False
-        self._event, self._holds = False, self._draw_holds()
+        self._event, self._holds = False, self.draw_holds()
         self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
         self.prompt_shown: bool | None = None
         self.drifted = False
@@ -159,7 +159,7 @@ class Episode:
         found: NDArray[np.float64] = states[(self.seed - self.settings.seed_base) % len(states)]
         return found
 
-    def _draw_holds(self) -> Iterator[int]:
+    def draw_holds(self) -> Iterator[int]:
         """Return the lengths of the episode's holds, which do not depend on the variant."""
         rng = generator(self.published, self.seed, 5, self.settings.salt)
         drawn = rng.gamma(HOLD_SHAPE, HOLD_MEAN / HOLD_SHAPE, MOST_HOLDS)

@@ -120,7 +120,9 @@ class ObjectSlots:
 
     def observe(self) -> NDArray[np.float32]:
         """Return the observation (SIZE,) of the present state."""
-        things = [thing for thing, visible in zip(self.things, self._visible(), strict=True) if visible]
+        absent = {self._sim.model.body(name).id for name in self._sim.absent}
+        shown = zip(self.things, self._visible(), strict=True)
+        things = [thing for thing, visible in shown if visible and thing.body not in absent]
         rows = np.array([self._row(thing) for thing in things]).reshape(-1, WIDTH)
         return fill_slots(rows, round_to_resolution(self._sim.data.xpos[[thing.ordered_by for thing in things]]))
 

@@ -264,7 +264,7 @@ class Simulation:
             self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
             mujoco.mj_step1(self.model, self.data)
         else:
-            self._start.mark_objects(hidden.name for hidden in self._hidden.absent)
+            self._start.mark_objects(self.absent)
         self.data.time = time
 
     # --- state ----------------------------------------------------------------------------------------------
@@ -425,6 +425,11 @@ class Simulation:
     def home(self) -> tuple[Array, Array]:
         """Position (3,) and rotation (3, 3) of the grip site after the scene has settled."""
         return self._start.home
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Names of the hidden objects that are outside the scene."""
+        return tuple(hidden.name for hidden in self._hidden.absent)
 
     @property
     def at_detent(self) -> bool:
