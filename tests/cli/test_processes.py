@@ -174,7 +174,7 @@ class Job:
             time.sleep(0.1)
 
     def end(self, processes: int = 2) -> str:
-        """End it as Slurm does; return its message. No process may be left a moment later."""
+        """End it by SIGTERM, as a cluster does; return its message. No process may be left a moment later."""
         assert len(self.alive) >= processes  # else the check below would be empty
         self.process.terminate()
         try:

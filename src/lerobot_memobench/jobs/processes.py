@@ -28,7 +28,7 @@ from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 
 class Job(Protocol):
-    """A piece of work. It is pickled to other processes and machines, so ``folder`` is on a disk that they share."""
+    """A piece of work. It is pickled to worker processes."""
 
     @property
     def folder(self) -> Path:
@@ -65,25 +65,6 @@ class Advance:
 
 
 ProgressCallback = Callable[[Advance], None]
-
-
-MOST_NAMED = 5
-
-
-def check_finished(jobs: Sequence[Job], logs: Path) -> None:
-    """Refuse jobs that ended without a result, for example because they were killed.
-
-    Raises:
-        MemobenchError: names the jobs.
-    """
-    failed = [job.folder.name for job in jobs if not job.finished()]
-    if not failed:
-        return
-    names = ", ".join(failed[:MOST_NAMED]) + (f" and {len(failed) - MOST_NAMED} more" if failed[MOST_NAMED:] else "")
-    raise MemobenchError(
-        f"{len(failed)} of {len(jobs)} jobs ended without a result ({names}); "
-        f"see {logs}, then run the same command again (an evaluation with resume=true) for the missing jobs"
-    )
 
 
 def run_in_processes(jobs: Sequence[Job], workers: int, done: Callable[[Job], None]) -> None:

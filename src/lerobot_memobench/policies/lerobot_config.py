@@ -157,19 +157,6 @@ def checkpoint_hash(path: str) -> str:
     return path if folder is None else f"{path}@{folder.name}"
 
 
-def parameters_of(path: str) -> int | None:
-    """Return the approximate number of parameters of a checkpoint: the size of its weights divided by four bytes.
-
-    Args:
-        path: folder or repository; the result is None for one that is not on this machine.
-    """
-    folder: Path | None = Path(path).expanduser()
-    if folder is not None and not folder.is_dir():
-        folder = _cached_folder(path)
-    sizes = [] if folder is None else [file.stat().st_size for file in folder.glob("*model*.safetensors")]
-    return sum(sizes) // 4 if sizes else None
-
-
 def _cached_folder(repository: str) -> Path | None:
     """Return the local copy of a repository, None without one."""
     from huggingface_hub import try_to_load_from_cache
