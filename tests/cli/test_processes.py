@@ -110,7 +110,6 @@ def test_a_second_writer_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, dataset: Path, command: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in ("out/notes.json", "out/.1-a.part.evaluation.json", "run/model", "files/a.hdf5"):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("of the first run")

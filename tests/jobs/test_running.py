@@ -9,11 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from filelock import lock_descriptor
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs import processes
-from lerobot_memobench.jobs.processes import Advance, locked, taking_turns
+from lerobot_memobench.jobs.processes import Advance, locked
 from lerobot_memobench.jobs.running import run_jobs
 from tests.support.note_job import Killed, Note
 
@@ -74,7 +73,7 @@ def test_a_disk_without_locks_is_noted_once(
     monkeypatch.setattr(fcntl, "flock", flock)
     processes.note_missing_locks.cache_clear()
     for _ in range(2):
-        with locked(tmp_path, tmp_path), taking_turns(tmp_path / "lock"):
+        with locked(tmp_path, tmp_path):
             pass
     err = capsys.readouterr().err
     assert (err.count("\n"), os.strerror(number) in err) == (1, True)
@@ -84,21 +83,20 @@ def test_a_disk_without_locks_is_noted_once(
 
 
 def test_killed_processes_release_locks(tmp_path: Path) -> None:
-    path = tmp_path / "cache.lock"
-    with taking_turns(path), path.open() as other:
-        assert not lock_descriptor(other.fileno(), blocking=False)
     code = f"""
 import pathlib, time
-from lerobot_memobench.jobs.processes import locked, taking_turns
-path = pathlib.Path({str(path)!r})
-with taking_turns(path), locked(path.parent, path.parent):
+from lerobot_memobench.jobs.processes import locked
+path = pathlib.Path({str(tmp_path)!r})
+with locked(path, path):
     print("held", flush=True)
     time.sleep(600)
 """
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
+        with pytest.raises(MemobenchError, match=str(tmp_path)), locked(tmp_path, tmp_path):
+            pass
         holder.kill()
         holder.wait()
-    with taking_turns(path), locked(tmp_path, tmp_path):
+    with locked(tmp_path, tmp_path):
         pass

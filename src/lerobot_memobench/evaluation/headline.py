@@ -85,10 +85,7 @@ def _seeds(run: Run) -> list[str]:
         return []
     seeds = f"seeds {found[0]} to {found[-1]}" if len(found) > 1 else f"seed {found[0]}"
     name = next((name for name, split in SPLITS.items() if found[0] in split and found[-1] in split), PAPER)
-    if name == PAPER:
-        return [seeds]
-    number = run.card.get("sealed", {}).get("run")
-    return [f"{seeds} ({name}{f', run {number} of this policy' if number else ''})"]
+    return [seeds if name == PAPER else f"{seeds} ({name})"]
 
 
 def extent_phrase(records: Sequence[Record]) -> str:

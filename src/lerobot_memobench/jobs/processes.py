@@ -223,10 +223,10 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """Errors of `flock` on disks without locks, as some clusters mount them."""
 
 
-def _lock(descriptor: int, blocking: bool = False) -> bool:
+def _lock(descriptor: int) -> bool:
     """Lock an open file or folder; return whether no other process holds the lock. A disk may have no locks."""
     try:
-        return lock_descriptor(descriptor, blocking=blocking)
+        return lock_descriptor(descriptor, blocking=False)
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
@@ -260,16 +260,3 @@ def _is_at(folder: Path, descriptor: int) -> bool:
         return os.path.samestat(os.fstat(descriptor), folder.stat())
     except FileNotFoundError:
         return False
-
-
-@contextlib.contextmanager
-def taking_turns(path: Path, wait: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Hold the lock of a file; if another process of this machine holds it, call ``wait`` and wait.
-
-    The file stays; a killed process releases its lock.
-    """
-    with path.open("w") as file:
-        if not _lock(file.fileno()):
-            wait()
-            _lock(file.fileno(), blocking=True)
-        yield

@@ -18,10 +18,8 @@ from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 
-SEALED_LEDGER = "sealed_tests.jsonl"
-"""File in which `run.sealed` counts a policy's runs on the sealed seeds."""
 NOT_THE_CHECKPOINT = (
-    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes", SEALED_LEDGER),
+    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),
     *("training_curve.png", "training_curve.json"),
 )
 """Files of a checkpoint folder that do not affect the policy's actions."""
