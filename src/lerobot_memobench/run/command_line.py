@@ -11,7 +11,7 @@ import dataclasses
 import re
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -21,6 +21,7 @@ import draccus
 import yaml
 from draccus.utils import DecodingError, ParsingError, is_choice_type, is_enum, is_literal, is_union
 
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, chain, nearest
 from lerobot_memobench.policies.checkpoint import (
     TRAIN_CONFIG,
@@ -47,31 +48,22 @@ PATH, TYPE, PACKAGES = "path", "type", "discover_packages_path"
 """Keys of a choice that LeRobot's parser reads besides its fields: ``--policy.type``."""
 HELP = "help"
 
+OF_POLICY = ("align", "size", "perception", "detector", "visual_encoder", "device")
+OF_ENVIRONMENT = ("tasks", "task", "task_ids", *(each.name for each in fields(EnvSettings)))
 COMMON: dict[str, tuple[str, ...]] = {
-    **{key: (f"policy.{key}",) for key in ("align", "size", "perception", "detector", "visual_encoder", "device")},
-    **{key: (f"env.{key}",) for key in ("tasks", "obs_type", "suite", "referent")},
+    **{key: (f"policy.{key}",) for key in OF_POLICY},
+    **{key: (f"env.{key}",) for key in OF_ENVIRONMENT},
     "replan": ("policy.n_action_steps", "env.replan_steps"),
 }
 SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
     "eval": {
         **COMMON,
         **{key: (f"policy.{key}",) for key in ("host", "port", "dialect")},
-        **{
-            key: (f"env.{key}",)
-            for key in (
-                *("task", "task_ids", "convention", "camera_name_mapping", "observation_height", "observation_width"),
-                *("robot_state", "control_mode"),
-                *("difficulty", "protocol", "demonstration_prompt", "prompt_in", "horizon"),
-                *("pause_steps", "speed", "evidence", "salt", "videos"),
-                *("corrupt", "corrupt_step", "reshow", "interference"),
-            )
-        },
-        "episodes": ("eval.n_episodes",),
-        "batch_size": ("eval.batch_size",),
+        **{"episodes": ("eval.n_episodes",), "batch_size": ("eval.batch_size",)},
     },
     "train": {**COMMON, "episodes": ("dataset.episodes",)},
 }
-"""Command -> short form -> the fields it sets, as far as they exist. `cli/lerobot_<command>.txt` explains them."""
+"""Command -> short form -> the fields it sets, as far as they exist. `cli/lerobot.py` explains them."""
 RUN_OPTIONS = ("split", "memory_reads", "resume", "shard", "shards", "workers", "slurm")
 """Keys of `lerobot eval env=memobench` that LeRobot does not have (`plan.RunOptions`)."""
 TRAINING_OPTIONS = ("prompt_frames", "obs_type")
