@@ -101,8 +101,9 @@ def plain(docstring: str | None) -> str:
 
 def short_forms(command: str) -> list[list[str]]:
     """Return the rows of ``lerobot <command> --help``: short form, meaning, default."""
-    text = (SOURCE / "cli" / f"lerobot_{command}.txt").read_text()
-    rows = []
+    from lerobot_memobench.cli.lerobot import help_of
+
+    text, rows = help_of(command), []
     for typed, lines in re.findall(r"^  (\S.*)\n((?: {8}.*\n)+)", text, re.MULTILINE):
         meaning, default = re.fullmatch(r"(.*?)(?: \(default: (.*)\))?", " ".join(lines.split())).groups("")
         rows.append([typed, meaning, default])
@@ -126,7 +127,10 @@ def lerobot_page() -> str:
             for typed, meaning, default in short_forms(command)
         ]
         parts += [f"## lerobot {command}", f"```text\n{example}\n```", table(["short form", "sets", "default"], rows)]
-    rows = [[code(f"env.{name}"), code(default), meaning] for name, default, meaning in environment_fields()]
+    rows = [
+        [code(f"env.{name}"), html.escape(default, quote=False), meaning]
+        for name, default, meaning in environment_fields()
+    ]
     parts += ["## Environment settings", table(["setting", "default", "meaning"], rows)]
     return "\n\n".join(parts) + "\n"
 
@@ -137,7 +141,8 @@ def environment_fields() -> Iterator[tuple[str, str, str]]:
 
     for field in dataclasses.fields(EnvSettings):
         values = ", ".join(code(value) for value in field.metadata["values"] or ())
-        yield field.name, repr(field.default), f"{field.metadata['meaning']}{f' ({values})' if values else ''}"
+        default = field.metadata["usual"] or repr(field.default)
+        yield field.name, default, f"{field.metadata['meaning']}{f' ({values})' if values else ''}"
     tree = class_of(SOURCE / "envs" / "configuration_memobench.py", "MemobenchEnvConfig")
     meaning = arguments(ast.get_docstring(tree) or "")
     for node in tree.body:

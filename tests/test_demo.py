@@ -15,7 +15,7 @@ from PIL import Image
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
-from lerobot_memobench.run.arguments import split_arguments
+from lerobot_memobench.run.command_line import parse_words
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.logs import rollout
@@ -75,7 +75,7 @@ def test_demo_writes_pictures_and_table(demo: SimpleNamespace, tmp_path: Path, m
     }
     assert [Path(command[0]).name for command in commands] == ["lerobot"] * 4
     for command in commands:
-        take_run_options(split_arguments([word for word in command[2:] if not word.startswith("policy=")]))
+        take_run_options(parse_words([word for word in command[2:] if not word.startswith("policy=")]))
     # The evaluations of the second part differ only in policy and folder.
     varied = ("policy=", "output_dir=")
     assert len({tuple(word for word in command if not word.startswith(varied)) for command in commands[1:]}) == 1

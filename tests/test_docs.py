@@ -27,12 +27,14 @@ from lerobot_memobench.envs import episode_log, evaluation_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Rate
 from lerobot_memobench.policies.memobench_mem.memory import OURS
-from lerobot_memobench.run.arguments import (
+from lerobot_memobench.run.command_line import (
+    HELP,
     is_of_benchmark,
-    joined,
-    read_arguments,
+    parse_words,
+    read_words,
     resolve_recipe,
-    split_arguments,
+    spelled,
+    typed,
 )
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.settings import read_settings
@@ -328,7 +330,7 @@ def check(words: list[str]) -> None:
         case "lerobot":
             check_lerobot(rest[0], rest[1:])
         case "lerobot-eval" | "lerobot-train":
-            check_lerobot(program.partition("-")[2], [as_pair(word) for word in joined(rest)])
+            check_lerobot(program.partition("-")[2], [as_pair(word) for word in spelled(parse_words(rest))])
         case "memobench":
             check_memobench(rest)
         case _ if program == "python" or program.endswith("/bin/python"):
@@ -355,13 +357,16 @@ def check_lerobot(command: str, line: list[str]) -> None:
     """Parse a line as `lerobot` does; folders, repositories and example policies are replaced by existing ones."""
     existing = {"policy": "policy=memobench_mem", "dataset": "dataset.root=outputs"}
     pairs = [existing[key] if (key := word.partition("=")[0]) in existing and is_place(word) else word for word in line]
-    given = split_arguments(pairs)
+    given = parse_words(pairs)
     if command == "eval" and is_of_benchmark(given):
         read_settings(take_run_options(given)[1])
         return
     if command == "train":
         given = take_training_options(resolve_recipe(given))[-1]
-    read_arguments(command, given)
+        given = {"dataset.repo_id": "none", **given}
+    if HELP not in given:
+        asked = read_words(command, given)
+        typed(asked.config, asked.settings)
 
 
 def is_place(pair: str) -> bool:

@@ -20,7 +20,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
 from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
 from lerobot_memobench.policies.remote.transports import pack, unpack
-from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.sim.object_layout import STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, fill_slots
@@ -49,11 +49,11 @@ def test_ten_minutes_commands_are_valid(tmp_path: Path, monkeypatch: pytest.Monk
     runpy.run_path(str(EXAMPLES / "train_in_ten_minutes.py"), run_name="__main__")
     (tmp_path / "data").mkdir()
     trainings = [line for command, verb, *line in typed if (command, verb) == ("lerobot", "train")]
-    memories = [read_arguments("train", split_arguments(line)).get("policy.memory") for line in trainings]
+    memories = [read_words("train", parse_words(line)).get("policy.memory") for line in trainings]
     assert memories == [None, "none"]
     evaluations = [line for command, verb, *line in typed if (command, verb) == ("lerobot", "eval")]
     for line in evaluations:
-        take_run_options(split_arguments([word for word in line if not word.startswith("policy=")]))
+        take_run_options(parse_words([word for word in line if not word.startswith("policy=")]))
     assert len(evaluations) == 2
 
 

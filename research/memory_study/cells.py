@@ -12,7 +12,7 @@ from pathlib import Path
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.arguments import split_arguments
+from lerobot_memobench.run.command_line import parse_words
 from research.memory_study.commands import Cost, check_training, has_ended, kept_of, run_once, train_once
 from research.memory_study.grid import POLICY, ROLLOUTS, SEALED, TRAINING, Grid, folder_name, word_of
 
@@ -178,7 +178,7 @@ class Cell:
         for part in self.parts:
             rest = [word for word in self.evaluation_words(part)[2:] if not word.startswith(("env=", "policy="))]
             given = ["env=memobench", f"policy={word_of(words, 'policy')}", *rest]
-            read_settings(take_run_options(split_arguments(given))[1])
+            read_settings(take_run_options(parse_words(given))[1])
 
     def training_words(self) -> list[str]:
         """Return the command that trains its policy."""

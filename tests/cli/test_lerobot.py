@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 from urllib.error import URLError
@@ -15,7 +16,7 @@ from urllib.error import URLError
 import lerobot.scripts.lerobot_eval
 import numpy as np
 import pytest
-from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.numpy import save_file
 
@@ -24,10 +25,9 @@ from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint, folder_with_checkpoint
-from lerobot_memobench.policies.lerobot_config import overrides
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.protocol import CLOCK
-from lerobot_memobench.run.arguments import OPTIONS, SHORT_FORMS, split_arguments
+from lerobot_memobench.run.command_line import OPTIONS, SHORT_FORMS, parse_words
 from lerobot_memobench.run.plan import EvaluationPlan
 from lerobot_memobench.training.resume import resumed
 from tests.support import logs
@@ -39,15 +39,17 @@ class Called:
 
     def __init__(self) -> None:
         self.flags: list[str] | None = None
-        self.action: Callable[[list[str]], Any] = lambda flags: 0
+        self.config: Any = None
+        self.config_path: str | None = None
+        self.action: Callable[[], Any] = lambda: 0
 
-    def __call__(self, flags: Any = None) -> Any:
-        self.flags = sys.argv[1:] if flags is None else [*flags]
-        return self.action(self.flags)
+    def __call__(self, config: Any = None, config_path: str | None = None) -> Any:
+        self.flags, self.config = sys.argv[1:], config
+        self.config_path = config_path or self.config_path
+        return self.action()
 
-    def value(self, key: str) -> str | None:
-        values = dict(flag.removeprefix("--").split("=", 1) for flag in self.flags or () if "=" in flag)
-        return values.get(key)
+    def value(self, key: str) -> Any:
+        return attrgetter(key)(self.config)
 
 
 @pytest.fixture
@@ -62,8 +64,13 @@ def training(monkeypatch: pytest.MonkeyPatch, fake_loop: FakeLoop) -> Called:
     called = Called()
     package = "lerobot_memobench.training"
     monkeypatch.setattr(f"{package}.command.run_lerobot", called)
-    monkeypatch.setattr(f"{package}.view.viewed", lambda arguments, *_: arguments)
-    monkeypatch.setattr(f"{package}.configuration.read_training", lambda flags: flags)
+    monkeypatch.setattr(f"{package}.view.viewed", lambda config, *_: config)
+
+    def complete(config: Any, asked: Any) -> Any:
+        called.config_path = asked.config_path
+        return config
+
+    monkeypatch.setattr(f"{package}.configuration.complete", complete)
     monkeypatch.setattr(f"{package}.loop.train", called)
     monkeypatch.setattr(f"{package}.command.cores", lambda: 8)
     return called
@@ -99,8 +106,10 @@ def test_help_explains_every_short_form(
     assert main([command, "--help"]) == 0
     assert (theirs if command == "eval" else training).flags is None  # LeRobot's import takes ten seconds
     text = capsys.readouterr().out
-    explained = {word for line in text.splitlines() if line.endswith("=") for word in line.strip().split(", ")}
-    assert {f"{word}=" for word in (*SHORT_FORMS[command], *OPTIONS[command], "policy")} <= explained
+    explained = {word for line in text.splitlines() if "=" in line for word in line.strip().split(", ")}
+    of_env = {f"{word}=" for word, full in SHORT_FORMS[command].items() if full[0].startswith("env.")}
+    words = {f"{word}=" for word in (*SHORT_FORMS[command], *OPTIONS[command], "policy")}
+    assert words - (of_env - {"tasks=", "obs_type="} if command == "train" else set()) <= explained
     assert not any(len(line) > 106 for line in text.splitlines())
 
 
@@ -287,55 +296,47 @@ def training_run(folder: Path, steps: int = 100, done: tuple[int, ...] = (40, 80
     return place / "pretrained_model"
 
 
-NULL: dict[str, str | None] = dict.fromkeys(("memory_stride", "memory_fusion", "memory_phase", "memory_repeats"))
 SMALL = ["policy=memobench_strict", "steps=1", "device=cpu"]
-DEFAULTS: list[tuple[list[str], dict[str, str | None]]] = [
+DEFAULTS: list[tuple[list[str], dict[str, Any]]] = [
     (
         ["policy=memobench_mem", "align=contrastive"],
         {"policy.type": "memobench_mem", "policy.align": "contrastive", "dataset.repo_id": DEFAULT_REPO_ID}
-        | {"policy.push_to_hub": "false", "num_workers": None, "log_freq": None},
+        | {"policy.push_to_hub": False, "num_workers": 4, "log_freq": 200},
     ),
-    (["policy=act", "steps=50"], {"log_freq": "5"}),
-    (["policy=act", "policy.repo_id=user/name"], {"policy.push_to_hub": None}),
+    (["policy=act", "steps=50"], {"log_freq": 5}),
+    (["policy=act", "policy.repo_id=user/name"], {"policy.push_to_hub": True}),
     (["policy=act", "dataset=mine"], {"dataset.repo_id": "local/mine", "dataset.root": "mine"}),
     (
         ["config_path=train.yaml", "align=semantic"],
-        {"config_path": "train.yaml", "policy.align": "semantic", "dataset.repo_id": None, "policy.push_to_hub": None},
+        {"policy.align": "semantic", "dataset.repo_id": "a/b", "policy.push_to_hub": False, "steps": 100_000},
     ),
     # A memory that is not the checkpoint's has its own defaults.
-    (SMALL, {f"policy.{key}": text for key, text in NULL.items()}),
-    ([*SMALL, "policy.memory=frames"], {f"policy.{key}": text for key, text in NULL.items()}),
-    (
-        [*SMALL, "policy.memory=motion", "policy.memory_stride=2"],
-        {"policy.memory_stride": "2", "policy.memory_fusion": "null"},
-    ),
-    (
-        [*SMALL, "align=none", "policy.memory=none"],
-        {"policy.memory_phase": "false", "policy.memory_repeats": "true"},
-    ),
+    (SMALL, {"policy.memory_stride": 8, "policy.memory_repeats": False}),
+    ([*SMALL, "policy.memory=frames"], {"policy.memory_stride": 8, "policy.memory_repeats": False}),
+    ([*SMALL, "policy.memory=motion", "policy.memory_stride=2"], {"policy.memory_stride": 2}),
+    ([*SMALL, "align=none", "policy.memory=none"], {"policy.memory_phase": False, "policy.memory_repeats": True}),
 ]
 
 
 @pytest.mark.parametrize(("words", "found"), DEFAULTS, ids=[" ".join(words) for words, _ in DEFAULTS])
 def test_a_training_gets_the_benchmarks_defaults(
-    training: Called, words: list[str], found: dict[str, str | None], capsys: pytest.CaptureFixture[str]
+    training: Called, words: list[str], found: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     datasets("mine")
     Path("train.yaml").write_text("policy: {type: memobench_mem}\ndataset: {repo_id: a/b}\n")
     assert main(["train", *words]) == 0
     assert {key: training.value(key) for key in found} == found
-    if "policy.memory=motion" in words:  # as LeRobot reads it
-        path, flags = str(training.value("policy.path")), training.flags or []
-        config: Any = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides("policy", flags))
+    if "policy.memory=motion" in words:
+        config = training.config.policy
         own = MemobenchMemConfig(device="cpu", size="small", perception="objects", memory="motion", memory_stride=2)
         assert (config.memory_fusion, config.memory_settings) == (own.memory_fusion, own.memory_settings)
 
 
 def test_the_trainers_status_and_a_small_machine(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lerobot_memobench.training.command.cores", lambda: 2)
-    training.action = lambda flags: 3
+    training.action = lambda: 3
     assert main(["train", "policy=act"]) == 3
-    assert training.value("num_workers") == "2"
+    assert training.value("num_workers") == 2
 
 
 def test_settings_that_differ_from_the_checkpoints_are_noted(
@@ -405,12 +406,12 @@ def test_a_training_is_resumed_by_its_folder(training: Called, capsys: pytest.Ca
     for words in (again, [*again, *free], ["train", "output_dir=run", "--resume"]):
         training.flags = None
         assert main(words) == 0
-        assert (training.value("config_path"), training.value("resume")) == (LAST_CONFIG, "true")
-        assert training.value("policy.type") is None
+        assert (training.config_path, training.value("resume")) == (LAST_CONFIG, True)
+        assert training.value("policy.size") == "tiny"
     assert capsys.readouterr().err == ""
     for stated in ("run/checkpoints/000040/pretrained_model/train_config.json", "somebody/repository"):
         for resume in ("resume=true", "--resume=True"):
-            given = split_arguments([f"config_path={stated}", resume])
+            given = parse_words([f"config_path={stated}", resume])
             assert resumed(given) == given  # LeRobot's own form
 
 
@@ -430,7 +431,7 @@ def test_a_copied_run_has_no_link(training: Called, last: str | None, lost: str 
         for text in ("run", "run/checkpoints/last", "run/checkpoints/last/pretrained_model"):
             assert folder_with_checkpoint(text) == found
     assert main(RESUME) == 0
-    assert training.value("config_path") == str(found / "train_config.json")
+    assert training.config_path == str(found / "train_config.json")
     assert not link.exists(), "LeRobot makes it"
 
 
@@ -476,7 +477,7 @@ def test_changed_settings_of_a_resumed_training_are_noted(training: Called, caps
     assert "continues with" not in capsys.readouterr().err
     assert main([*RESUME, "batch_size=3", "seed=7", "dataset.use_imagenet_stats=false"]) == 0
     noted = " ".join(capsys.readouterr().err.split())
-    for changed in ("seed=7 instead of 1000", "batch_size=3 instead of 8", "use_imagenet_stats=false instead of True"):
+    for changed in ("seed=7 instead of 1000", "batch_size=3 instead of 8", "use_imagenet_stats=False instead of True"):
         assert changed in noted
 
 
@@ -502,7 +503,7 @@ def test_a_dataset_that_cannot_be_fetched(
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    training.action = lambda flags: LeRobotDatasetMetadata(training.value("dataset.repo_id") or "", root="none")
+    training.action = lambda: LeRobotDatasetMetadata(training.value("dataset.repo_id"), root="none")
     assert main(["train", "policy=memobench_mem"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1

@@ -23,8 +23,9 @@ from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec
+from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.training import loop
-from lerobot_memobench.training.configuration import read_training
+from lerobot_memobench.training.configuration import complete
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 TASK = "fold the towel"
@@ -72,7 +73,8 @@ def train(root: Path, out: Path, *flags: str, size: str = "tiny") -> Path:
         *("--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", "--policy.device=cpu"),
         "--policy.push_to_hub=false",
     ]
-    loop.train(read_training([*own, *usual, *flags]))
+    asked = read_words("train", parse_words([*own, *usual, *flags]))
+    loop.train(complete(asked.build(), asked))
     return out / "checkpoints" / "last" / "pretrained_model"
 
 

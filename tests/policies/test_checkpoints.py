@@ -39,8 +39,8 @@ from lerobot_memobench.policies.compatibility import cameras_read, check_feature
 from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreement, require_statistics
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.run.arguments import checkpoint_of, read_arguments, split_arguments
 from lerobot_memobench.run.card import training_facts
+from lerobot_memobench.run.command_line import checkpoint_of, parse_words, read_words
 from tests.support import mutations
 
 TASK = "turn_on_the_stove_and_turn_it_off"
@@ -321,7 +321,7 @@ FILES = {
     "train_config.json": {"dataset": {"repo_id": "me/it", "root": None, "episodes": None}, "steps": 5},
 }
 RECIPE = """# A recipe.
-policy: {type: act, chunk_size: 50}
+policy: {type: act, chunk_size: 100}
 dataset:
   repo_id: me/it
 steps: 100
@@ -350,7 +350,9 @@ def test_damaged_files_end_in_a_result_or_an_error(tmp_path: Path, kind: str, co
 
     def use(_: random.Random) -> None:
         if kind == "recipe":
-            read_arguments("train", split_arguments([f"config_path={damaged / 'recipe.yaml'}"]))
+            read_words("train", parse_words([f"config_path={damaged / 'recipe.yaml'}"])).default(
+                "dataset.repo_id", "a/b"
+            ).build()
             return
         training_facts(damaged)
         check_checkpoint(str(damaged))

@@ -24,7 +24,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 )
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
-from lerobot_memobench.run.arguments import recipe_file
+from lerobot_memobench.run.command_line import recipe_file
 
 OBJECTS = {"size": "small", "perception": "objects"}
 

@@ -21,7 +21,7 @@ import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.convention import chosen_convention
-from lerobot_memobench.run.arguments import split_arguments
+from lerobot_memobench.run.command_line import parse_words
 from lerobot_memobench.run.plan import plan_line, with_names
 from lerobot_memobench.run.settings import read_settings
 from lerobot_memobench.sim.convention import CONVENTIONS
@@ -143,7 +143,7 @@ def test_the_names_of_a_training_are_those_of_its_evaluation(tmp_path: Path, cap
         f"observation.images.{old}": f"observation.images.{new}" for old, new in zip(THEIRS, NUMBERED, strict=True)
     }
     path = saved(tmp_path, NUMBERED, repo_id="lerobot/libero", rename_map=names | {"observation.images.top": "top"})
-    asked = read_settings(split_arguments(["env=memobench", f"policy={path}"]))
+    asked = read_settings(parse_words(["env=memobench", f"policy={path}"]))
     for convention, expected in (("libero", names), ("upright", dict([*names.items()][:1]))):
         assert with_names(asked, MemobenchEnvConfig(convention=convention)).rename_map == expected
     mine = replace(asked, rename_map={"observation.images.image": "mine"})

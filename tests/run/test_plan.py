@@ -17,7 +17,7 @@ import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.protocol import SPLITS
-from lerobot_memobench.run.arguments import split_arguments
+from lerobot_memobench.run.command_line import parse_words
 from lerobot_memobench.run.plan import (
     EvaluationPlan,
     Grid,
@@ -40,7 +40,7 @@ OBJECTS = "environment_state_agent_pos"
 @pytest.fixture(autouse=True)
 def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
+    monkeypatch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
 
 
 def test_a_plan_is_complete_and_never_changes() -> None:
@@ -142,7 +142,7 @@ BAD: list[tuple[list[str], str]] = [
     (["policy=memobench_strict_memoryless", "corrupt=noise", "tasks=object"], "memobench_mem has none"),
     (["policy=memobench_strict", "corrupt=swap", "tasks=object", "episodes=11"], "batch of one episode"),
     (["policy=memobench_strict", "corrupt=delete", "tasks=temporal"], "set corrupt_step="),
-    (["policy=diffusion", "policy.down_dims=[1"], "a value of policy. cannot be read"),
+    (["policy=diffusion", "policy.down_dims=[1"], "policy.down_dims=[1 cannot be read"),
     (["policy=memobench_strict", "obs_type=pixels_agent_pos"], "lacks inputs of the policy"),
     (["policy.discover_packages_path=not_here"], "not_here"),
     (["shard=0/4"], "shard=0/4"),
@@ -295,10 +295,10 @@ def test_a_policy_of_another_package_is_known(tmp_path: Path, monkeypatch: pytes
 
 
 def test_run_options_are_taken_out_of_the_arguments() -> None:
-    taken, rest = take_run_options(split_arguments(["env=memobench", "resume=true", "episodes=3", "shard=2/3"]))
-    assert rest.pairs == [("env", "memobench"), ("episodes", "3")]
+    taken, rest = take_run_options(parse_words(["env=memobench", "resume=true", "episodes=3", "shard=2/3"]))
+    assert rest == {"env": "memobench", "episodes": "3"}
     assert taken == RunOptions(resume=True, shard=Shard(2, 3))
-    taken, _ = take_run_options(split_arguments(["shards=8", "workers=2", "slurm=--partition=gpu --mem=4G"]))
+    taken, _ = take_run_options(parse_words(["shards=8", "workers=2", "slurm=--partition=gpu --mem=4G"]))
     assert taken == RunOptions(shards=8, workers=2, slurm=("--partition=gpu", "--mem=4G"))
 
 

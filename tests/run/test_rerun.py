@@ -42,7 +42,7 @@ RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "su
 def in_folder(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """An empty folder, and no search of all installed packages."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
+        patch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
         patch.chdir(tmp_path_factory.mktemp("here"))
         make_checkpoint(Path("checkpoint"))
         yield
@@ -85,7 +85,10 @@ HOSTILE: list[tuple[str, dict[str, Any]]] = [
     ("policy.path", {"policy": {"path": "http://stranger/a b"}}),
     ("policy.path", {"policy": {"path": "~nobody/at/all"}}),
     ("policy.path", {"policy": {"path": "a" * 5000}}),
-    ("policy.seed", policy("memobench_random", seed=3)),
+    ("policy.seed", policy("memobench_random", seed=3.5)),
+    ("policy.seed", policy("memobench_random", seed=True)),
+    ("policy.seed", policy("memobench_random", seed=[3])),
+    ("policy.down_dims", policy("diffusion", down_dims=[16, "x"])),
     ("policy.seed", policy("memobench_random", seed="many")),
     ("policy.seed", policy("memobench_random", seed="!!python/object/apply:os.system [x]")),
     ("policy.discover_packages_path", policy("act", discover_packages_path="antigravity")),
@@ -147,10 +150,10 @@ def test_flags_of_an_earlier_card_become_settings() -> None:
     [
         (FLAGS[1:], "env.type"),
         (["--env.type=aloha"], "env.type"),
-        (["--env=/tmp/env.yaml"], "'env'"),
+        (["--env=/tmp/env.yaml"], "env=/tmp/env.yaml"),
         (["--env.hub_path=stranger/env"], "env.hub_path"),
         (["--policy.trust_remote_code=true"], "policy.trust_remote_code"),
-        (["--anything.discover_packages_path=antigravity"], "anything.discover_packages_path"),
+        (["--anything.discover_packages_path=antigravity"], "'anything'"),
         (["--config_path=/tmp/settings.yaml"], "config_path"),
         (["--output_dir=/tmp/elsewhere"], "output_dir"),
         (["--eval.n_episodes=many"], "eval.n_episodes"),

@@ -102,7 +102,7 @@ def fake_loop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLoop:
     """The loop is replaced, and the current folder is an empty one."""
     import lerobot_policy_memobench  # noqa: F401 - LeRobot would find it by a search of all installed packages
 
-    monkeypatch.setattr("lerobot_memobench.run.arguments.register_plugins", lambda: None)
+    monkeypatch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.chdir(tmp_path)
     fake = FakeLoop()

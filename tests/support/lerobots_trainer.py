@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import io
+import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
+import draccus
 import pytest
+from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_memobench.training import command
 
 
-def run_in_this_process(flags: Sequence[str]) -> int:
+def run_in_this_process(config: TrainPipelineConfig, config_path: str | None) -> int:
     from lerobot_memobench.training import samples
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["lerobot-train", *flags])
+        patch.setattr(sys, "argv", ["samples", *([f"--config_path={config_path}"] if config.resume else [])])
+        patch.setattr(sys, "stdin", io.StringIO(json.dumps(draccus.encode(config))))
+        patch.setattr(samples, "register_plugins", lambda: None)
         patch.setattr(samples.lerobot_train, "make_train_eval_datasets", samples.open_datasets)
-        samples.lerobot_train.main()
+        samples.main()
     return 0
 
 

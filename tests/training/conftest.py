@@ -43,14 +43,15 @@ def train() -> Callable[..., None]:
     """Train a memory policy by the words of ``lerobot train``."""
 
     def run(*words: str) -> None:
-        from lerobot_memobench.run.arguments import read_arguments, split_arguments
+        from lerobot_memobench.run.command_line import parse_words, read_words
         from lerobot_memobench.training.command import complete_training
-        from lerobot_memobench.training.configuration import read_training
+        from lerobot_memobench.training.configuration import complete
         from lerobot_memobench.training.loop import train as loop
         from lerobot_memobench.training.resume import resumed
 
-        given = resumed(split_arguments(["policy.device=cpu", "seed=3", *words]))
-        loop(read_training(complete_training(read_arguments("train", given)).for_parser))
+        given = resumed(parse_words(["policy.device=cpu", "seed=3", *words]))
+        asked, config = complete_training(read_words("train", given))
+        loop(complete(config, asked))
 
     return run
 

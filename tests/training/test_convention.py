@@ -23,7 +23,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import read_info
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS
-from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.training.configuration import check_environment
 from lerobot_memobench.training.features import detections
@@ -174,8 +174,7 @@ def test_names_of_pictures_in_a_continued_training(
     words = [f"policy={path}", f"dataset={both['libero']}"]
 
     def renamed() -> Any:
-        found = viewed(read_arguments("train", split_arguments(words)), None, None, lambda note: None)
-        return json.loads(str(found.get("rename_map")))
+        return viewed(read_words("train", parse_words(words)).build(), None, None, lambda note: None).rename_map
 
     names = {
         f"observation.images.{old}": f"observation.images.camera{k + 1}" for k, old in enumerate(("image", "image2"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,18 +63,21 @@ def test_policies_without_pictures_train_from_memory(objects: Path, pictured: Pa
 
 
 def test_lerobots_trainer_opens_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[list[str]] = []
-
-    def run(words: list[str], **_: Any) -> SimpleNamespace:
-        called.append(words)
+    def run(words: list[str], input: bytes, **_: Any) -> SimpleNamespace:
+        assert words[1:] == ["-m", samples.__name__, "--config_path=run"]
+        monkeypatch.setattr("sys.stdin", io.StringIO(input.decode()))
+        samples.main()
         return SimpleNamespace(returncode=0)
 
+    received: list[TrainPipelineConfig] = []
+    policy = make_policy_config("act", device="cpu", push_to_hub=False)
+    config = TrainPipelineConfig(DatasetConfig("local/data"), policy=policy, steps=1, resume=True)
     monkeypatch.setattr(subprocess, "run", run)
-    assert command.run_lerobot(["--steps=1"]) == 0
-    assert called[0][1:] == ["-m", samples.__name__, "--steps=1"]
+    monkeypatch.setattr(samples, "register_plugins", lambda: None)
     monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", None)
-    monkeypatch.setattr(lerobot_train, "main", lambda: None)
-    samples.main()
+    monkeypatch.setattr(lerobot_train, "train", received.append)
+    assert command.run_lerobot(config, "run") == 0
+    assert (received[0].steps, received[0].policy) == (1, policy)
     assert lerobot_train.make_train_eval_datasets is open_datasets
 
 

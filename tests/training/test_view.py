@@ -16,7 +16,7 @@ from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.arguments import read_arguments, split_arguments
+from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.training.samples import keep_in_memory
 from lerobot_memobench.training.view import Choice, viewed, write_view
 from tests.support.held_dataset import LENGTHS as HELD_LENGTHS
@@ -96,8 +96,8 @@ def test_chosen_episodes_are_those_of_the_dataset(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     root = make_held_dataset(tmp_path / "held")
     words = ["policy=act", "policy.device=cpu", f"dataset={root}", "dataset.episodes=[1]"]
-    found = viewed(read_arguments("train", split_arguments(words)), None, None, print)
-    assert found.get("dataset.episodes") == "[2, 3]"
+    found = viewed(read_words("train", parse_words(words)).build(), None, None, print)
+    assert found.dataset.episodes == [2, 3]
 
 
 @pytest.mark.parametrize(
@@ -135,22 +135,23 @@ def test_missing_observations_are_refused(synthetic: Path, objects: Path, tmp_pa
 
 def test_trainings_share_a_view(pictured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    given = read_arguments("train", split_arguments(["policy=act", "policy.device=cpu", f"dataset={pictured}"]))
+    given = read_words("train", parse_words(["policy=act", "policy.device=cpu", f"dataset={pictured}"])).build()
     notes: list[str] = []
     for _ in range(2):
         found = viewed(given, None, OBJECTS, notes.append)
-    folder = Path(str(found.get("dataset.root")))
+    folder = Path(str(found.dataset.root))
     assert set(inputs(folder)) == {STATE, SLOTS}
     assert not [note for note in notes if "pixels" in note]
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
     kept = viewed(given, True, None, notes.append)
-    assert "observation.phase" not in str(kept.get("policy.input_features"))
-    assert "observation.images.image" in str(kept.get("policy.input_features"))
+    assert "observation.phase" not in str(kept.policy.input_features)
+    assert "observation.images.image" in str(kept.policy.input_features)
     (note,) = (note for note in notes if "pixels" in note)
     assert "pixels, and policy=act does not resize them" in note
     assert "evaluate it with observation_height=48 observation_width=48" in note
+    given.dataset.episodes = [7]
     with pytest.raises(MemobenchError, match=r"episodes=\[7\]"):
-        viewed(given.default("dataset.episodes", "[7]"), None, None, notes.append)
+        viewed(given, None, None, notes.append)
 
 
 def test_command_writes_a_view(pictured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -176,7 +177,7 @@ def test_inputs_that_a_policy_cannot_have_are_refused(
     synthetic: Path, words: list[str], named: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    given = read_arguments("train", split_arguments([*words, "policy.device=cpu", f"dataset={synthetic}"]))
+    given = read_words("train", parse_words([*words, "policy.device=cpu", f"dataset={synthetic}"])).build()
     with pytest.raises(MemobenchError, match=named):
         viewed(given, None, None, print)
     assert not [*tmp_path.rglob("info.json")]

@@ -9,34 +9,40 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+import textwrap
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import Field, fields
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from lerobot_memobench.cli.console import WITH_PARENT, console, counting, note, run_command, say
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import as_path, explaining_disk_errors
 from lerobot_memobench.jobs.processes import adding_resume_hint
 from lerobot_memobench.jobs.threads import ACTING, use_threads
-from lerobot_memobench.run.arguments import (
+from lerobot_memobench.run.command_line import (
     CONFIG_FILE,
+    HELP,
+    PACKAGES,
+    PATH,
     RUN_OPTIONS,
     SHORT_FORMS,
-    Arguments,
-    LerobotArguments,
-    call_lerobot,
+    TYPE,
     check_names,
     is_of_benchmark,
-    lerobot_commands,
-    read_arguments,
-    split_arguments,
+    parse_words,
+    read_words,
+    spelled,
+    without,
 )
+from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands
 from lerobot_memobench.tasks.catalogue import lerobots_choice, resolve_tasks
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -61,28 +67,46 @@ def run(line: Sequence[str]) -> int:
     if not line or line[0] in ("-h", "--help", "help"):
         print(overview(commands))
         return 0
-    name, given = line[0], split_arguments(line[1:])
+    name = line[0]
     if name not in commands:
         raise MemobenchError(f"there is no command {name!r}, {nearest(name, commands)}")
-    if given.wants_help and name in SHORT_FORMS:
-        print(Path(__file__).with_name(f"lerobot_{name}.txt").read_text(encoding="utf-8"), flush=True)
-        if not given.pairs:
+    if name not in SHORT_FORMS:  # its words are passed on
+        return call_lerobot(
+            name, [word if word.startswith("-") or "=" not in word else f"--{word}" for word in line[1:]]
+        )
+    words = parse_words(line[1:])
+    if HELP in words:
+        print(help_of(name), flush=True)
+        if len(words) == 1:
             print(f"all settings: `lerobot {name} --help` with env= or policy=, which imports LeRobot")
             return 0
     if sys.flags.optimize > 1:
         raise MemobenchError("found python -OO or PYTHONOPTIMIZE=2, and transformers reads docstrings; use -O or 1")
-    if name in SHORT_FORMS:
-        check_names(name, given)
+    check_names(name, words)
     if name == "train":
         from lerobot_memobench.training.command import train
 
-        return train(given, line[1:], note)
-    if name == "eval":
-        use_threads(ACTING)  # before torch is imported
-        if is_of_benchmark(given) and not given.wants_help:
-            return evaluate(given, ("lerobot", *line))
-        return call_lerobot(name, read_other(given).for_parser)
-    return call_lerobot(name, read_arguments(name, given).for_parser)
+        return train(words, note)
+    use_threads(ACTING)  # before torch is imported
+    if is_of_benchmark(words) and HELP not in words:
+        return evaluate(words)
+    return call_lerobot(name, flags_of_other(words))
+
+
+def help_of(command: str) -> str:
+    """Return the help of ``lerobot eval`` or ``lerobot train``, with the settings of the environment."""
+    text = Path(__file__).with_name(f"lerobot_{command}.txt").read_text(encoding="utf-8")
+    return text.replace("{environment}", "".join(map(explained, fields(EnvSettings))))
+
+
+def explained(setting: Field[Any]) -> str:
+    """Return the entry of a setting in the help: name, meaning, values and default."""
+    meaning, values, usual = (setting.metadata[key] for key in ("meaning", "values", "usual"))
+    default = "none" if setting.default is None else str(setting.default)
+    plain = default.lower() if isinstance(setting.default, bool) else default
+    accepted = f"; {', '.join(values)}" if values else ""
+    text = textwrap.fill(f"{meaning}{accepted} (default: {usual or plain})", 92)
+    return f"  {setting.name}=\n{textwrap.indent(text, ' ' * 8)}\n"
 
 
 def overview(commands: Iterable[str]) -> str:
@@ -107,44 +131,37 @@ def overview(commands: Iterable[str]) -> str:
 # --- eval ---
 
 
-def evaluate(given: Arguments, command: Sequence[str]) -> int:
-    """Run ``lerobot eval`` on the benchmark.
-
-    Args:
-        command: the whole command line, for the card.
-    """
-    suites = check_tasks(given)
+def evaluate(words: Mapping[str, str]) -> int:
+    """Run ``lerobot eval`` on the benchmark."""
+    suites = check_tasks(words)
     if len(suites) > 1:
-        return evaluate_suites(suites, given, command)
-    from lerobot_memobench.run.plan import make_plan, take_run_options
-    from lerobot_memobench.run.settings import read_settings
+        return evaluate_suites(suites, words)
+    from lerobot_memobench.run.plan import plan_line
 
-    options, given = take_run_options(given)
-    plan = make_plan(read_settings(given), options, command)
+    plan = plan_line(spelled(words))
     hint = f"resume with: {plan.resuming_command}"
     with (
         adding_resume_hint("lerobot", lambda: hint),
         explaining_disk_errors(plan.output, f"finished episodes stay; {hint}"),
     ):
-        return evaluate_in_parts(plan) if options.shards else evaluate_here(plan)
+        return evaluate_in_parts(plan) if plan.options.shards else evaluate_here(plan)
 
 
-def evaluate_suites(suites: Sequence[str], given: Arguments, command: Sequence[str]) -> int:
+def evaluate_suites(suites: Sequence[str], words: Mapping[str, str]) -> int:
     """Run an evaluation of each of several suites of LIBERO, in a folder of its name; return the highest status."""
     from lerobot_memobench.envs.episode_log import has_log
     from lerobot_memobench.evaluation.records import read_runs
     from lerobot_memobench.evaluation.report_tables import memory_types_table
     from lerobot_memobench.evaluation.tables import terminal_table
-    from lerobot_memobench.run.plan import with_changes
 
-    named = given.value("output_dir")
-    if named is None and given.value("resume") is None:
+    named = words.get("output_dir")
+    if named is None and "resume" not in words:
         named = f"outputs/eval/{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
     status, folders = 0, list[Path]()
     for suite in suites:
         folder = None if named is None else Path(named) / suite
-        line = with_changes(command[2:], **{"env.task": None}, task=suite, output_dir=folder)
-        status = max(status, evaluate(split_arguments(line), ("lerobot", "eval", *line)))
+        place = {} if folder is None else {"output_dir": str(folder)}
+        status = max(status, evaluate(without(words, "env.task") | {"task": suite} | place))
         folders += [folder] if folder is not None and has_log(folder) else []
     if folders:
         (run,) = read_runs(folders)
@@ -152,13 +169,13 @@ def evaluate_suites(suites: Sequence[str], given: Arguments, command: Sequence[s
     return status
 
 
-def check_tasks(given: Arguments) -> tuple[str, ...]:
+def check_tasks(words: Mapping[str, str]) -> tuple[str, ...]:
     """Refuse unknown tasks before LeRobot is imported, which takes ten seconds; return the suites."""
-    tasks = given.value("tasks") or given.value("env.tasks")
-    task = given.value("task") or given.value("env.task")
-    suite = given.value("suite") or given.value("env.suite") or PUBLISHED
-    elsewhere = any(given.value(key) for key in ("config_path", "task_dir", "env.task_dir"))
-    ids = None if elsewhere else given.value("task_ids") or given.value("env.task_ids")
+    tasks = words.get("tasks") or words.get("env.tasks")
+    task = words.get("task") or words.get("env.task")
+    suite = words.get("suite") or words.get("env.suite") or PUBLISHED
+    elsewhere = any(words.get(key) for key in (CONFIG_FILE, "task_dir", "env.task_dir"))
+    ids = None if elsewhere else words.get("task_ids") or words.get("env.task_ids")
     with suppress(yaml.YAMLError):
         ids = yaml.safe_load(ids or "null")
     suites, tasks = lerobots_choice(task, ids, suite, "all" if tasks is None else tasks)
@@ -168,25 +185,27 @@ def check_tasks(given: Arguments) -> tuple[str, ...]:
     return suites
 
 
-def read_other(given: Arguments) -> LerobotArguments:
-    """Return LeRobot's arguments for an evaluation of another environment than the benchmark, checked.
+def flags_of_other(words: Mapping[str, str]) -> list[str]:
+    """Return LeRobot's flags for an evaluation of another environment than the benchmark.
 
     Raises:
         MemobenchError: no environment is named, an option is the benchmark's, or the checkpoint is not complete.
     """
     from lerobot_memobench.policies.checkpoint import check_checkpoint
 
-    for key, _ in given.pairs:
+    for key in words:
         if key in RUN_OPTIONS:
             raise MemobenchError(f"{key}= belongs to the benchmark: name it with env=memobench")
-    arguments = read_arguments("eval", given)
-    if given.wants_help:
-        return arguments
-    if not arguments.has("env.type") and not arguments.has(CONFIG_FILE):
+    asked = read_words("eval", words)
+    kept = {key: words[key] for key in words if key == CONFIG_FILE or key.endswith(f".{PACKAGES}")}
+    flags = [f"--{word}" for word in spelled({**kept, **asked.words})]
+    if HELP in words:
+        return ["--help", *flags]
+    if asked.get(f"env.{TYPE}") is None and CONFIG_FILE not in words:
         raise MemobenchError("name an environment: env=memobench")
-    if (path := arguments.get("policy.path")) is not None:
+    if (path := asked.get(f"policy.{PATH}")) is not None:
         check_checkpoint(path)
-    return arguments
+    return flags
 
 
 def evaluate_here(plan: EvaluationPlan) -> int:

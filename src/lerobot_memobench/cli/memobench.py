@@ -202,7 +202,7 @@ def recipe(
     name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
 ) -> int:
     """Print the file of a training recipe. As in `lerobot-train --config_path=$(memobench recipe train_paper)`."""
-    from lerobot_memobench.run.arguments import recipe_file, recipes
+    from lerobot_memobench.run.command_line import recipe_file, recipes
 
     if name is not None:
         print(recipe_file(name))

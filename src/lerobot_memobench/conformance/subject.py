@@ -26,8 +26,8 @@ from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.policies.convention import chosen_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import CLOCK
-from lerobot_memobench.run.arguments import SHORT_FORMS, policy_config, read_arguments, split_arguments
-from lerobot_memobench.run.rollout import has_planned_action, needs_observation
+from lerobot_memobench.run.command_line import PATH, SHORT_FORMS, has_setting, parse_words, policy_config, read_words
+from lerobot_memobench.run.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 
@@ -84,21 +84,26 @@ class Subject:
             sparing: repeat earlier pictures and objects if the policy does not need new ones, and everything except
                 the clock if its next action is planned already, as evaluations do.
         """
-        needed, planned = needs_observation(self.policy), has_planned_action(self.policy)
+        actions = ActionQueue(self.policy)
         last: dict[str, Any] = {}
         answers = []
-        self.policy.reset()
+        actions.reset()
         with EqualNoise() if equal_noise else nullcontext():
             for call in range(max(len(stream) for stream in streams)):
                 batch = self._batch(streams, call)
                 begins = any(call in (0, stream.start) for stream in streams)
                 costly = [key for key in batch if key.startswith(("observation.images", OBJECTS_COLUMN))]
                 if sparing and not begins:
-                    kept = [key for key in batch if key not in CLOCK] if planned() else [] if needed() else costly
+                    kept = (
+                        [key for key in batch if key not in CLOCK]
+                        if actions.has_planned_action()
+                        else []
+                        if actions.needs_observation()
+                        else costly
+                    )
                     batch |= {key: last[key] for key in kept}
                 last = batch
-                with torch.inference_mode():
-                    action = self.postprocessor(self.policy.select_action(self.preprocessor(batch)))
+                action = self.postprocessor(actions.select(self.preprocessor(batch)))
                 answers.append(action.to("cpu", torch.float32).numpy().copy())
         return np.stack(answers)
 
@@ -156,35 +161,33 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
     Raises:
         MemobenchError: no policy is named, it cannot be built, or the dataset has too few episodes.
     """
-    _, obs_type, given = take_training_options(split_arguments(words))
+    _, obs_type, given = take_training_options(parse_words(words))
     short = [key for key, fields in SHORT_FORMS["train"].items() if fields[0].startswith("policy.")]
-    for key, _ in given.pairs:
+    for key in given:
         if key.partition(".")[0] not in KEYS and key not in short:
             raise MemobenchError(f"memobench conformance has no setting {key!r}, {nearest(key, [*KEYS, *short])}")
-    if given.value("dataset") is None:
-        begun = read_arguments("train", given)
-        policy, path = policy_config(begun), begun.get("policy.path")
+    asked = read_words("train", given)
+    path = asked.get(f"policy.{PATH}")
+    if "dataset" not in given:
+        policy = policy_config(asked)
         convention = None if path is None or policy is None else trained_convention(path, policy)[0]
         task = task_of_texts(getattr(policy, "subgoals", None) or {})
         made = write_streams(folder / "streams", task=task, convention=convention or UPRIGHT)
-        given = type(given)([*given.pairs, ("dataset", str(made))], given.flags)
-    arguments = read_arguments("train", given)
-    check_device(arguments.get("policy.device"))
+        asked = read_words("train", {**given, "dataset": str(made)})
+    check_device(asked.get("policy.device"))
     if not torch.cuda.is_available():
-        arguments = arguments.default("policy.device", "cpu")
-    if "n_action_steps" in getattr(arguments.chosen.get("policy"), "__dataclass_fields__", ()):
-        arguments = arguments.default("policy.n_action_steps", REPLAN)
-    config: Any = policy_config(arguments)
+        asked = asked.default("policy.device", "cpu")
+    if has_setting(asked, "policy.n_action_steps"):
+        asked = asked.default("policy.n_action_steps", REPLAN)
+    config: Any = policy_config(asked)
     if config is None:
         raise MemobenchError("name a policy: a checkpoint folder, policy=memobench_strict, or a type (policy=act)")
-    path = arguments.get("policy.path")
-    config.pretrained_path = None if path is None else Path(path)
-    data = str(arguments.get("dataset.repo_id")), arguments.get("dataset.root")
+    data = str(asked.get("dataset.repo_id")), asked.get("dataset.root")
     errors = []
-    for asked in [obs_type] if obs_type else [None, OBJECTS, BOTH]:
+    for kind in [obs_type] if obs_type else [None, OBJECTS, BOTH]:
         try:
             with quiet():
-                subject = _built(copy.deepcopy(config), *data, asked, folder / f"view {asked}")
+                subject = _built(copy.deepcopy(config), *data, kind, folder / f"view {kind}")
                 subject.roll([subject.streams[0].until(subject.streams[0].start)])
             return subject
         except MemobenchError:

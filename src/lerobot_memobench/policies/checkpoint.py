@@ -431,6 +431,17 @@ def statistics_shapes(path: str | Path, revision: str | None = None) -> dict[str
     }
 
 
+def checkpoint_settings(path: str) -> dict[str, Any]:
+    """Return the settings in the configuration of a checkpoint folder, or of a repository, which is downloaded.
+
+    Raises:
+        MemobenchError: there is none, it cannot be downloaded, or it is no JSON.
+    """
+    if (file := checkpoint_file(path, CONFIG_FILE)) is None:
+        raise MemobenchError(f"the repository {path} holds no {CONFIG_FILE}; expected a checkpoint of LeRobot")
+    return read_json(file)
+
+
 def training_of(path: str | Path, revision: str | None = None) -> dict[str, Any]:
     """Return the settings of a checkpoint's training (`TrainConfig`); {} if they are not there or not readable."""
     with suppress(MemobenchError):

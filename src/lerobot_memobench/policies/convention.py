@@ -8,35 +8,23 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-from lerobot.configs import PreTrainedConfig, parser
-from lerobot.configs.eval import EvalPipelineConfig
-from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE, read_info
-from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, Acting
-from lerobot_memobench.envs.observations import check_obs_type, policy_features, policy_names
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import statistics_shapes, trained_names, training_of
-from lerobot_memobench.policies.compatibility import cameras_read, check_actions
-from lerobot_memobench.policies.lerobot_config import acting, quiet, read_lerobots_config
+from lerobot_memobench.policies.compatibility import cameras_read
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
 
 logger = logging.getLogger(__name__)
 
 OF_LIBERO = ("lerobot/", "HuggingFaceVLA/", "physical-intelligence/")
 """Owners of LIBERO's data on the hub. Other datasets of that name may be of this package."""
-
-LEROBOTS_COMMANDS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalPipelineConfig}
-"""LeRobot's command -> its configuration."""
 
 
 def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
@@ -102,48 +90,3 @@ def chosen_convention(
     if asked is None and found != UPRIGHT:
         logger.warning("pictures have convention=%s, as in the training of %s (%s)", found, name, why)
     return asked or found
-
-
-def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None, Acting]:
-    """Return the policy on the command line of ``lerobot-eval`` or ``lerobot-train``, and its description for the log.
-
-    The configuration is None elsewhere; the description is known in evaluations. Set the convention for the checkpoint
-    of an evaluation; a training may begin with any.
-
-    Raises:
-        MemobenchError: as of `chosen_convention` and `check_obs_type`; or LeRobot's command would run the policy in
-            LIBERO's pipelines.
-    """
-    command = Path(sys.argv[0]).name.replace("_", "-")
-    kind = next((kind for name, kind in LEROBOTS_COMMANDS.items() if command.startswith(name)), None)
-    if kind is None:
-        return None, UNKNOWN_POLICY
-    with quiet():
-        config = read_lerobots_config(kind, sys.argv[1:])
-    path, policy = parser.get_path_arg("policy"), config.policy
-    if not isinstance(config, EvalPipelineConfig) or policy is None:
-        return policy, UNKNOWN_POLICY
-    check_obs_type(policy, environment.obs_type, environment.suite)
-    if path is None:
-        return policy, acting(policy, None, None, environment.settings)
-    check_actions(path, policy)
-    if policy.type == "xvla":
-        raise MemobenchError(
-            "lerobot-eval runs every XVLA with the processors of LIBERO, which mirror a picture and convert actions; "
-            f"run `lerobot eval env=memobench policy={path}`"
-        )
-    asked = _named_convention() or (MIRRORED if environment.camera_name_mapping else None)
-    found = chosen_convention(path, policy, asked, config.rename_map)
-    if found not in (None, environment.convention):  # with the names of its pictures
-        names = {"features": policy_features(), "features_map": policy_names()}
-        vars(environment).update(vars(replace(environment, **names, convention=found)))
-    return policy, acting(policy, path, None, environment.settings)
-
-
-def _named_convention() -> str | None:
-    """Return the convention that LeRobot's command line, or the file of its ``config_path``, names; None without it."""
-    file = parser.parse_arg("config_path")
-    found: Any = yaml.safe_load(Path(file).read_bytes()) if file and Path(file).is_file() else None
-    for part in ("env", "convention"):
-        found = found.get(part) if isinstance(found, dict) else None
-    return parser.parse_arg("env.convention") or found

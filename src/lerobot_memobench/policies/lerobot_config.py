@@ -1,4 +1,4 @@
-"""Configurations of LeRobot's policies: overrides, plain values, and a hash that identifies what acts."""
+"""Configurations of LeRobot's policies: plain values, and a hash that identifies what acts."""
 
 from __future__ import annotations
 
@@ -7,20 +7,16 @@ import hashlib
 import json
 import logging
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lerobot_memobench.envs.episode_log import Acting
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
-
-if TYPE_CHECKING:
-    from lerobot.configs.eval import EvalPipelineConfig
-    from lerobot.configs.train import TrainPipelineConfig
 
 SEALED_LEDGER = "sealed_tests.jsonl"
 """File in which `run.sealed` counts a policy's runs on the sealed seeds."""
@@ -39,40 +35,6 @@ ELSEWHERE = (
 LONGEST, LARGEST = 100_000, 10_000_000
 """Largest number of control steps or tokens of a policy, and largest other number of its configuration."""
 LENGTHS = ("chunk_size", "horizon", "memory_settings.frames", "n_action_steps", "n_obs_steps", "tokenizer_max_length")
-
-
-def overrides(key: str, flags: Sequence[str]) -> list[str]:
-    """Return the flags that set fields of a choice such as ``policy``, in the form that draccus reads."""
-    from lerobot.configs import parser
-
-    given = parser.get_cli_overrides(key, flags) or []
-    # LeRobot's parser takes these out before draccus reads.
-    return [flag for flag in given if not flag.startswith("--discover_packages_path")]
-
-
-def read_lerobots_config[T: (TrainPipelineConfig, EvalPipelineConfig)](kind: type[T], flags: Sequence[str]) -> T:
-    """Return the configuration that flags of a LeRobot command set, the policy's from the checkpoint that they name."""
-    import draccus
-    from lerobot.configs import PreTrainedConfig, parser
-
-    for key, package in parser.parse_plugin_args("discover_packages_path", flags).items():
-        parser.load_plugin(package)
-        flags = parser.filter_arg(key, flags)
-    named = kind.__get_path_fields__()
-    file, rest = parser.parse_arg("config_path", flags), parser.filter_path_args(named, flags)
-    if file is not None:
-        file, rest = parser.extract_path_fields_from_config(file, named), parser.filter_arg("config_path", rest)
-    config: Any
-    if file is None or not hasattr(kind, "from_pretrained"):
-        config = draccus.parse(kind, config_path=file, args=rest)
-    else:
-        config = kind.from_pretrained(file, cli_args=rest)
-    path = parser.get_path_arg("policy", flags)
-    if path is not None:
-        given = [*parser.get_yaml_overrides("policy"), *overrides("policy", flags)]
-        config.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=given)
-        config.policy.pretrained_path = Path(path)
-    return config
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import datetime as dt
 import itertools
 import secrets
 import shlex
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -34,7 +34,7 @@ from lerobot_memobench.protocol import (
     SPLITS,
     VALIDATION,
 )
-from lerobot_memobench.run.arguments import RUN_OPTIONS, Arguments, is_true, joined, split_arguments
+from lerobot_memobench.run.command_line import RUN_OPTIONS, parse_words, spelled, value_of, without
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.tasks.libero_suites import NUM_STATES, check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
@@ -124,13 +124,13 @@ class EvaluationPlan:
     def resuming_command(self) -> str:
         """The command line that resumes it, ready to be typed."""
         folder = self.output if self.options.shard is None else self.output.parent
-        return shlex.join(with_changes(self.command, resume="true", output_dir=folder))
+        return shlex.join([*self.command[:2], *with_changes(self.command[2:], resume="true", output_dir=folder)])
 
 
 def with_changes(line: Sequence[str], **changes: object) -> list[str]:
     """Return a command line in which these keys have other values; None removes one."""
-    kept = [word for word in joined(line) if word.removeprefix("--").partition("=")[0] not in changes]
-    return [*kept, *(f"{key}={value}" for key, value in changes.items() if value is not None)]
+    given = {key: str(value) for key, value in changes.items() if value is not None}
+    return spelled(without(parse_words(line), *changes) | given)
 
 
 # --- making it ---
@@ -140,8 +140,8 @@ def plan_line(line: Sequence[str]) -> EvaluationPlan:
     """Return the plan of the benchmark's evaluation that ``lerobot eval <line>`` asks for."""
     from lerobot_memobench.run.settings import read_settings
 
-    options, given = take_run_options(split_arguments(line))
-    return make_plan(read_settings(given), options, ("lerobot", "eval", *line))
+    options, words = take_run_options(parse_words(line))
+    return make_plan(read_settings(words), options, ("lerobot", "eval", *line))
 
 
 def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:
@@ -451,28 +451,27 @@ class RunOptions:
         return self.shard is not None or self.shards > 0
 
 
-def take_run_options(given: Arguments) -> tuple[RunOptions, Arguments]:
-    """Return the run options of a command line, and the arguments without them.
+def take_run_options(words: Mapping[str, str]) -> tuple[RunOptions, dict[str, str]]:
+    """Return the run options of a command line, and the words without them.
 
     Raises:
         MemobenchError: a value that an option does not accept, or options that exclude each other.
     """
-    last = {key: value for key, value in given.pairs if key in RUN_OPTIONS}
     options = RunOptions(
-        split=last.get("split"),
-        memory_reads=is_true("memory_reads", last.get("memory_reads")),
-        resume=is_true("resume", last.get("resume")),
-        shard=Shard.parse(last["shard"]) if "shard" in last else None,
-        shards=_count("shards", last.get("shards")),
-        workers=_count("workers", last.get("workers")),
-        slurm=read_options(last["slurm"]) if "slurm" in last else None,
+        split=words.get("split"),
+        memory_reads=value_of("memory_reads", bool, words.get("memory_reads", "false")),
+        resume=value_of("resume", bool, words.get("resume", "false")),
+        shard=Shard.parse(words["shard"]) if "shard" in words else None,
+        shards=_count("shards", words.get("shards")),
+        workers=_count("workers", words.get("workers")),
+        slurm=read_options(words["slurm"]) if "slurm" in words else None,
     )
     if options.shards and options.shard is not None:
         raise MemobenchError(f"found shard={options.shard} and shards={options.shards}; give one of them")
-    idle = [key for key in ("workers", "slurm") if key in last]
+    idle = [key for key in ("workers", "slurm") if key in words]
     if idle and not options.shards:
         raise MemobenchError(f"found {idle[0]}= without shards=; give the number of parts, such as shards=8")
-    return options, replace(given, pairs=[pair for pair in given.pairs if pair[0] not in RUN_OPTIONS])
+    return options, without(words, *RUN_OPTIONS)
 
 
 def _count(key: str, text: str | None) -> int:

@@ -19,7 +19,7 @@ from typing import Annotated, Any, TypedDict
 
 from annotated_types import Ge, Le
 from draccus.utils import is_enum, is_literal, is_union
-from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs import PreTrainedConfig
 
 from lerobot_memobench.envs.episode_log import MOST_EPISODES, OMITTED, differences, read_log
 from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
@@ -32,17 +32,17 @@ from lerobot_memobench.io import Malformed, checked, count_of, parsed
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
 from lerobot_memobench.protocol import HORIZON, SEALED
-from lerobot_memobench.run.arguments import (
+from lerobot_memobench.run.card import PACKAGES, detector_hash, drawn_with, first_variant_mismatch, versions
+from lerobot_memobench.run.command_line import (
+    NULLS,
     PLAIN,
-    Arguments,
-    checked_value,
     chosen_class,
+    field_types,
     load_plugins,
-    setting_type,
-    setting_types,
+    nested,
+    value_of,
     without_none,
 )
-from lerobot_memobench.run.card import PACKAGES, detector_hash, drawn_with, first_variant_mismatch, versions
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
 from lerobot_memobench.sim.convention import UPRIGHT
@@ -68,14 +68,13 @@ WORD = re.compile(r"[\w.,+' ()-]*")
 DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d{1,3})?")
 SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
 OBSERVATION = re.compile(r"[\w./-]+")
-NULLS = ("null", "none", "None", "~")
 
 
 class CardSettings(TypedDict, total=False):
     """The settings of an evaluation on a card, see `EvaluationSettings`."""
 
     env: dict[str, Any]
-    policy: dict[str, str]
+    policy: dict[str, str | bool | float | list[Any] | None]
     seed: int | None
     episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)] | None
     batch_size: Annotated[int, Ge(0), Le(512)] | None
@@ -260,7 +259,7 @@ def settings_on(card: Mapping[str, Any]) -> EvaluationSettings:
         raise MemobenchError(f"found env.type={kind} on the card; expected an evaluation of the benchmark")
     if "env.task" in values:
         values["env.tasks"] = values.pop("env.task")
-    return typed_settings(values)
+    return typed_settings(nested(values))
 
 
 def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> EvaluationSettings:
@@ -294,11 +293,14 @@ def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> Ev
     return replace(asked, policy=_allowed_policy(dict(asked.policy), server))
 
 
-def _allowed_policy(policy: dict[str, str], server: str | None) -> dict[str, str]:
+def _allowed_policy(policy: dict[str, Any], server: str | None) -> dict[str, Any]:
     """Return the settings of a card's policy, checked; its checkpoint is a folder of this machine.
 
     Of a repository, it is the copy in the hub's cache, without a download.
     """
+    for name in ("path", "type"):
+        if not isinstance(value := policy.get(name), str | None):
+            raise _refused(f"policy.{name}", value, "expected a name")
     if (path := policy.get("path")) is not None:
         try:
             folder = local_folder(path)
@@ -311,10 +313,9 @@ def _allowed_policy(policy: dict[str, str], server: str | None) -> dict[str, str
         if policy.get("type") != "memobench_remote":
             raise MemobenchError(f"--server {server} needs a card of policy.type=memobench_remote")
         policy = {name: value for name, value in policy.items() if name not in (*SERVERS, "port")}
-    load_plugins(Arguments())
-    named = {f"policy.{name}": policy.get(name) for name in ("path", "type")}
-    chosen = chosen_class(EvalPipelineConfig, "policy", named, {})
-    known = {} if chosen is None else setting_types(chosen, {})
+    load_plugins()
+    chosen = chosen_class(PreTrainedConfig, "policy", policy)
+    known = {} if chosen is None else field_types(chosen)
     for name, value in policy.items():
         if name not in ("path", "type"):
             policy[name] = _checked(known, name, value)
@@ -323,34 +324,35 @@ def _allowed_policy(policy: dict[str, str], server: str | None) -> dict[str, str
     return policy if server is None else {**policy, "servers": server}
 
 
-def _checked(known: Mapping[str, Any], name: str, value: str) -> str:
+def _checked(known: Mapping[str, Any], name: str, value: Any) -> Any:
     """Return a value of a policy's setting as LeRobot reads it, if it stays on this machine."""
     key = f"policy.{name}"
+    if name not in known:
+        raise _refused(key, value, "the policy has no such setting")
     if name in TEXTS:
         accepts, expected = TEXTS[name]
-        if not accepts(value):
+        if not accepts(str(value)):
             raise _refused(key, value, f"expected {expected}")
         return value
-    try:
-        kind = setting_type(known, name)
-    except KeyError:
-        raise _refused(key, value, "the policy has no such setting") from None
-    if name.rpartition(".")[2] in REACHING_OUT:
+    if name in REACHING_OUT:
         raise _refused(key, value, "no card sets it")
-    if value in NULLS:
-        return value
-    parts = typing.get_args(kind) if is_union(kind) else (kind,)
-    kind = without_none(kind)
+    if value is None or value in (*NULLS, "none", "None"):
+        return None
+    parts = typing.get_args(known[name]) if is_union(known[name]) else (known[name],)
+    kind = without_none(known[name])
     if dataclasses.is_dataclass(kind) or typing.get_origin(kind) is dict:
         raise _refused(key, value, "no card sets it")
     if any(part in (str, Path, Any, object) for part in parts):
         raise _refused(key, value, "it may name a file or a repository")
     if not (kind in PLAIN or is_enum(kind) or is_literal(kind)):
         try:
-            checked(parsed(value), bool | float | list[bool | float | list[bool | float]])
+            checked(
+                parsed(value) if isinstance(value, str) else value,
+                bool | float | list[bool | float | list[bool | float]],
+            )
         except Malformed:
             raise _refused(key, value, "expected numbers") from None
-    return checked_value(key, kind, value)
+    return value_of(key, known[name], value)
 
 
 def _are_here(text: str) -> bool:

@@ -9,8 +9,6 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import draccus
-import yaml
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.eval import EvalPipelineConfig
 
@@ -18,17 +16,14 @@ from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import portable_path
-from lerobot_memobench.run.arguments import (
-    CONFIG_FILE,
-    Arguments,
-    LerobotArguments,
-    checked_value,
+from lerobot_memobench.run.command_line import (
+    TYPE,
+    build,
     chosen_class,
-    load_plugins,
-    read_config_file,
-    translate,
-    with_file,
-    without_none,
+    field_types,
+    given_values,
+    read_words,
+    value_of,
 )
 from lerobot_memobench.tasks.catalogue import lerobots_choice
 from lerobot_memobench.tasks.task import PUBLISHED
@@ -42,16 +37,12 @@ ENVIRONMENT: dict[str, Any] = {
     if name in (*OWN, *(each.name for each in fields(EnvSettings)))
 }
 """Setting of the environment -> its type."""
-OTHERS: dict[str, tuple[str, Any]] = {
-    "seed": ("seed", int),
-    "eval.n_episodes": ("episodes", int),
-    "eval.batch_size": ("batch_size", int),
-    "eval.use_async_envs": ("use_async_envs", bool),
-    "rename_map": ("rename_map", dict[str, str]),
-    "output_dir": ("output_dir", str),
+OTHERS = {
+    **{name: name for name in ("seed", "rename_map", "output_dir")},
+    **{"eval.n_episodes": "episodes", "eval.batch_size": "batch_size", "eval.use_async_envs": "use_async_envs"},
 }
-"""LeRobot's key -> field of `EvaluationSettings`, and its type."""
-WITHOUT_EFFECT = ("env.type", "env.discover_packages_path", "job_name", "trust_remote_code")
+"""LeRobot's key -> field of `EvaluationSettings`."""
+WITHOUT_EFFECT = (f"env.{TYPE}", "job_name", "trust_remote_code")
 """LeRobot's keys without an effect on an evaluation of the benchmark."""
 
 
@@ -61,7 +52,7 @@ class EvaluationSettings:
 
     Attributes:
         env: fields of `MemobenchEnvConfig` by name.
-        policy: ``path`` of a checkpoint or ``type``, and settings of the policy's configuration as text.
+        policy: ``path`` of a checkpoint or ``type``, and settings of the policy's configuration.
         seed: of the first episode of each task.
         episodes: of each task.
         batch_size: environments at once. use_async_envs: whether each has a process of its own.
@@ -70,7 +61,7 @@ class EvaluationSettings:
     """
 
     env: Mapping[str, Any] = field(default_factory=dict)
-    policy: Mapping[str, str] = field(default_factory=dict)
+    policy: Mapping[str, Any] = field(default_factory=dict)
     seed: int | None = None
     episodes: int | None = None
     batch_size: int | None = None
@@ -102,41 +93,49 @@ class EvaluationSettings:
         return found
 
 
-def read_settings(given: Arguments) -> EvaluationSettings:
+def read_settings(words: Mapping[str, str]) -> EvaluationSettings:
     """Return the settings that a command line, and the file that its ``config_path`` names, ask for.
 
     Raises:
         MemobenchError: an unknown key or value, named with the nearest known one.
     """
-    load_plugins(given)
-    file = read_config_file(given.value(CONFIG_FILE))
-    given = with_file(given.without(CONFIG_FILE), file, EvalPipelineConfig)
-    return typed_settings(translate("eval", given, EvalPipelineConfig, {}).values)
+    asked = typed_settings(read_words("eval", words).settings)
+    chosen = chosen_class(PreTrainedConfig, "policy", with_policy(asked).policy)
+    return replace(asked, policy={**asked.policy, **given_values(chosen, asked.policy, "policy.")})
 
 
-def typed_settings(values: Mapping[str, str | None]) -> EvaluationSettings:
-    """Return the settings for LeRobot's keys and values; None means a flag without a value.
+def typed_settings(given: Mapping[str, Any]) -> EvaluationSettings:
+    """Return settings for LeRobot's names, nested.
 
     Raises:
         MemobenchError: an evaluation of the benchmark has no such setting, or a value has another type.
     """
-    env: dict[str, Any] = {}
-    policy: dict[str, str] = {}
-    others: dict[str, Any] = {}
-    for key, given in values.items():
-        text = "true" if given is None else given
-        section, _, name = key.partition(".")
-        if section == "env" and name in ENVIRONMENT:
-            env[name] = _typed(key, ENVIRONMENT[name], text)
-        elif section == "policy" and name:
-            policy[name] = text
-        elif key in OTHERS:
-            field_name, kind = OTHERS[key]
-            others[field_name] = _typed(key, kind, text)
+    known = field_types(EvalPipelineConfig)
+    env, policy, loop = (_section(name, given.get(name)) for name in ("env", "policy", "eval"))
+    others = {name: value for name, value in given.items() if name not in ("env", "policy", "eval")}
+    kinds = {**known, **{f"eval.{name}": kind for name, kind in field_types(known["eval"]).items()}}
+    found: dict[str, Any] = {}
+    for key, value in {**others, **{f"eval.{name}": value for name, value in loop.items()}}.items():
+        if key in OTHERS:
+            found[OTHERS[key]] = value_of(key, kinds[key], value)
         elif key not in WITHOUT_EFFECT:
-            known = [*OTHERS, *(f"env.{name}" for name in ENVIRONMENT)]
-            raise MemobenchError(f"an evaluation of the benchmark has no setting {key!r}, {nearest(key, known)}")
-    return EvaluationSettings(_without_lerobots_names(env), policy, **others)
+            raise _without_setting(key)
+    for name in env:
+        if name not in ENVIRONMENT and f"env.{name}" not in WITHOUT_EFFECT:
+            raise _without_setting(f"env.{name}")
+    typed = {name: value_of(f"env.{name}", ENVIRONMENT[name], env[name]) for name in env if name in ENVIRONMENT}
+    return EvaluationSettings(_without_lerobots_names(typed), policy, **found)
+
+
+def _section(name: str, given: Any) -> dict[str, Any]:
+    if not isinstance(given, Mapping | None):
+        raise MemobenchError(f"found {name}={given}; expected settings, such as {name}.<name>=")
+    return {**(given or {})}
+
+
+def _without_setting(key: str) -> MemobenchError:
+    known = [*OTHERS, *(f"env.{name}" for name in ENVIRONMENT)]
+    return MemobenchError(f"an evaluation of the benchmark has no setting {key!r}, {nearest(key, known)}")
 
 
 def _without_lerobots_names(env: Mapping[str, Any]) -> dict[str, Any]:
@@ -155,19 +154,6 @@ def _without_lerobots_names(env: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in env.items() if name not in names} | {"suite": suites[0], "tasks": tasks}
 
 
-def _typed(key: str, kind: Any, text: str) -> Any:
-    """Return a value of its type, checked."""
-    checked = checked_value(key, kind, text)
-    if checked == "null" and kind is not str:
-        return None
-    named = [part for part in (typing.get_args(kind) or (kind,)) if part is not type(None)]
-    if named == [str]:
-        return checked
-    if typing.get_origin(without_none(kind)) in (dict, list):
-        return yaml.safe_load(checked)
-    return draccus.decode(named[0], checked)
-
-
 def with_policy(asked: EvaluationSettings) -> EvaluationSettings:
     """Return settings that evaluate the scripted expert where no policy is named."""
     if {"type", "path"} & asked.policy.keys():
@@ -181,8 +167,6 @@ def policy_of(asked: EvaluationSettings) -> PreTrainedConfig:
     Raises:
         MemobenchError: the type is not known, or a value cannot be read. Others are the configuration's own.
     """
-    values = {f"policy.{name}": text for name, text in asked.policy.items()}
-    # The type of a repository that is not here yet is known once LeRobot has fetched it.
-    chosen = chosen_class(EvalPipelineConfig, "policy", values, {}) or PreTrainedConfig
-    found: PreTrainedConfig = LerobotArguments(values, EvalPipelineConfig, {"policy": chosen}).configuration("policy")
+    found: PreTrainedConfig = build(PreTrainedConfig, asked.policy, "policy")
+    found.pretrained_path = None  # it does not depend on the place of the checkpoint
     return found

@@ -7,13 +7,11 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import yaml
+from typing import TYPE_CHECKING, Any
 
 from lerobot_memobench.datasets.lerobot_format.layout import (
     DEFAULT_REPO_ID,
@@ -31,26 +29,26 @@ from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_CONFIG
 from lerobot_memobench.policies.checkpoint import (
     as_trained,
+    check_checkpoint,
     check_weights,
     differing,
     local_folder,
     looks_local,
     read_json,
 )
-from lerobot_memobench.policies.lerobot_config import check_device, quiet
-from lerobot_memobench.run.arguments import (
-    CONFIG_FILE,
+from lerobot_memobench.policies.lerobot_config import check_device, check_sizes, quiet
+from lerobot_memobench.run.command_line import (
+    HELP,
+    PATH,
     TRAINING_OPTIONS,
-    Arguments,
-    LerobotArguments,
-    checked_value,
-    env_config,
-    policy_config,
-    read_arguments,
-    read_config_file,
+    Asked,
+    read_words,
     resolve_recipe,
-    whole_number,
+    spelled,
+    value_of,
+    without,
 )
+from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.training.resume import (
     check_same_training,
     make_room_for_link,
@@ -58,6 +56,9 @@ from lerobot_memobench.training.resume import (
     resume_hint,
     resumed,
 )
+
+if TYPE_CHECKING:
+    from lerobot.configs.train import TrainPipelineConfig
 
 MEMORY_POLICY = "memobench_mem"
 OBJECT_BATCH = 72
@@ -78,54 +79,60 @@ SMALLEST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0,
 """Setting -> its smallest value."""
 
 
-def train(given: Arguments, line: Sequence[str], notify: Callable[[str], None]) -> int:
+def train(words: Mapping[str, str], notify: Callable[[str], None]) -> int:
     """Run ``lerobot train``; return the exit status.
 
     Args:
-        line: the words of the command, for the message that explains how to resume.
+        words: of the command line (`run.command_line.parse_words`).
         notify: called with notes.
     """
     begun = time.time()
-    prompt_frames, obs_type, given = take_training_options(resolve_recipe(resumed(given)))
-    arguments = read_arguments("train", given)
-    if given.wants_help:
-        return run_lerobot(arguments.for_parser)
-    arguments = complete_training(arguments, notify)
-    note, updates_left = note_on_resume(arguments)
+    prompt_frames, obs_type, rest = take_training_options(resolve_recipe(resumed(words)))
+    asked = read_words("train", rest)
+    if HELP in words:
+        return call_lerobot("train", ["--help", *(f"--{word}" for word in spelled(asked.words))])
+    asked, config = complete_training(asked, notify)
+    note, updates_left = note_on_resume(asked, config)
     if note is not None:
         notify(note)
     if not updates_left:
         return 0
-    make_room_for_link(arguments)
-    root = arguments.get("dataset.root")
+    make_room_for_link(asked)
+    root = config.dataset.root
     with (
-        adding_resume_hint("lerobot", lambda: resume_hint(arguments, line, begun)),
-        locked_run(arguments),
+        adding_resume_hint("lerobot", lambda: resume_hint(asked, words, begun)),
+        locked_run(config),
         naming_damage(Path(root) if root else None),
     ):
-        policy = arguments.chosen.get("policy")
-        if policy is not None and policy.get_choice_name(policy) == MEMORY_POLICY:  # type: ignore[attr-defined]
-            from lerobot_memobench.training.configuration import read_training
+        if config.policy is not None and config.policy.type == MEMORY_POLICY:
+            from lerobot_memobench.training.configuration import complete
             from lerobot_memobench.training.loop import train as train_memory_policy
 
-            train_memory_policy(read_training(arguments.for_parser))
+            train_memory_policy(complete(config, asked))
             return 0
         from lerobot_memobench.training.view import viewed
 
-        status = run_lerobot(viewed(arguments, prompt_frames, obs_type, notify).for_parser)
-        if status and root and (Path(root) / INFO_FILE).is_file() and not arguments.has("dataset.episodes"):
+        status = run_lerobot(viewed(config, prompt_frames, obs_type, notify), asked.config_path)
+        if status and root and (Path(root) / INFO_FILE).is_file() and config.dataset.episodes is None:
             check_whole(Path(root))  # LeRobot's error does not name the damaged file
         return status
 
 
-def run_lerobot(flags: Sequence[str]) -> int:
-    """Run LeRobot's trainer, with samples in memory, in a process of its own; return its exit status."""
-    command = [sys.executable, "-m", "lerobot_memobench.training.samples", *flags]
-    return subprocess.run(command, check=False).returncode
+def run_lerobot(config: TrainPipelineConfig, config_path: str | None) -> int:
+    """Run LeRobot's trainer, with samples in memory, in a process of its own; return its exit status.
+
+    Args:
+        config_path: the file or repository of a resumed training.
+    """
+    import draccus
+
+    line = [f"--config_path={config_path}"] if config.resume and config_path is not None else []
+    command = [sys.executable, "-m", "lerobot_memobench.training.samples", *line]
+    return subprocess.run(command, input=json.dumps(draccus.encode(config)).encode(), check=False).returncode
 
 
 @contextmanager
-def locked_run(arguments: LerobotArguments) -> Iterator[None]:
+def locked_run(config: TrainPipelineConfig) -> Iterator[None]:
     """Lock the folder of a training, in its first process.
 
     The lock is a file next to the folder, because LeRobot refuses a folder that exists before its first checkpoint.
@@ -133,11 +140,10 @@ def locked_run(arguments: LerobotArguments) -> Iterator[None]:
     Raises:
         MemobenchError: another training holds the lock.
     """
-    named = arguments.get("output_dir") or read_config_file(arguments.get(CONFIG_FILE)).get("output_dir")
-    if not isinstance(named, str) or os.environ.get("RANK", "0") != "0":
+    if config.output_dir is None or os.environ.get("RANK", "0") != "0":
         yield
         return
-    run = Path(named).expanduser().absolute()
+    run = Path(config.output_dir).expanduser().absolute()
     run.parent.mkdir(parents=True, exist_ok=True)
     lock = run.with_name(f".{run.name}.lock")
     lock.touch()
@@ -149,28 +155,28 @@ def locked_run(arguments: LerobotArguments) -> Iterator[None]:
                 lock.unlink()
 
 
-def take_training_options(given: Arguments) -> tuple[bool | None, str | None, Arguments]:
+def take_training_options(words: Mapping[str, str]) -> tuple[bool | None, str | None, dict[str, str]]:
     """Split off the options that LeRobot does not have.
 
     Returns:
         Whether frames of demonstration prompts are trained on, the kind of observation (each None if it is not given),
-        and the other arguments.
+        and the other words.
 
     Raises:
         MemobenchError: an option has an unknown value.
     """
-    found = dict(given.pairs)
-    of_env = {"obs_type"} if "env" in found else set()  # it is a setting of the environment, too
-    rest = [pair for pair in given.pairs if pair[0] in of_env or pair[0] not in TRAINING_OPTIONS]
-    obs_type = found.get("obs_type")
+    obs_type = words.get("obs_type")
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)
-    prompts = checked_value("prompt_frames", bool | None, found.get("prompt_frames", "null"))
-    return {"true": True, "false": False}.get(prompts), obs_type, replace(given, pairs=rest)
+    prompts: bool | None = value_of("prompt_frames", bool | None, words.get("prompt_frames", "null"))
+    rest = without(words, *TRAINING_OPTIONS)
+    if obs_type is not None and "env" in words:  # it is a setting of the environment, too
+        rest["obs_type"] = obs_type
+    return prompts, obs_type, rest
 
 
-def complete_training(arguments: LerobotArguments, notify: Callable[[str], None] = print) -> LerobotArguments:
-    """Check a training's arguments, and add the benchmark's defaults.
+def complete_training(asked: Asked, notify: Callable[[str], None] = print) -> tuple[Asked, TrainPipelineConfig]:
+    """Check a training's settings and add the benchmark's defaults; return them and the configuration.
 
     Args:
         notify: called with notes.
@@ -179,22 +185,24 @@ def complete_training(arguments: LerobotArguments, notify: Callable[[str], None]
         MemobenchError: no policy is named, a number is too small, the dataset or the checkpoint cannot be used, or a
             resumed training has other settings.
     """
-    from_file = arguments.has(CONFIG_FILE)
-    if not from_file:
-        if not any(arguments.has(key) for key in TRAINED):
-            raise MemobenchError("name a policy: policy=memobench_mem")
-        arguments = arguments.default("dataset.repo_id", DEFAULT_REPO_ID)
-        named = arguments.has("policy.type") or arguments.has("policy.path")
-        if named and not arguments.has("policy.repo_id"):  # LeRobot would require one
-            arguments = arguments.default("policy.push_to_hub", False)
-    check_device(arguments.get("policy.device"))
-    check_numbers(arguments)
-    check_dataset(arguments)
-    check_same_training(arguments)
-    arguments, policy = parse_policy(with_memory_defaults(arguments))
-    check_memory_settings(arguments, policy)
-    path = arguments.get("policy.path")
-    if path is not None and policy is not None:
+    if not any(asked.get(key) for key in TRAINED):
+        raise MemobenchError("name a policy: policy=memobench_mem")
+    asked = asked.default("dataset.repo_id", DEFAULT_REPO_ID)
+    if asked.get("policy") and asked.get("policy.repo_id") is None:  # LeRobot would require one
+        asked = asked.default("policy.push_to_hub", False)
+    path = asked.get(f"policy.{PATH}")
+    check_device(asked.get("policy.device"))
+    check_dataset(asked)
+    if path is not None:
+        check_checkpoint(path)
+    asked, config = build_training(with_memory_defaults(asked))
+    check_numbers(config)
+    check_same_training(asked, config)
+    policy: Any = config.policy
+    if policy is not None:
+        check_sizes(policy)
+        check_memory_settings(asked, policy)
+    if path is not None:
         with quiet():
             trained = as_trained(path, policy)
             check_weights(path, trained)
@@ -202,67 +210,59 @@ def complete_training(arguments: LerobotArguments, notify: Callable[[str], None]
         if changed:
             was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))
             notify(f"note: '{path}' was trained with {was}; this training continues from its weights with {now}")
-    environment: Any = env_config(arguments)
-    if environment is not None and environment.type == "memobench":
-        check_obs_type(policy, environment.obs_type, environment.suite)
-    steps = whole_number(arguments.get("steps"))
-    if steps is not None and steps < SHORT_TRAINING and arguments.get("resume") != "true":
-        arguments = arguments.default("log_freq", max(1, steps // 10))
-    if not from_file and getattr(policy, "decodes_no_video", False):
-        arguments = arguments.default("batch_size", OBJECT_BATCH)
-    if cores() < 4 and not from_file:  # LeRobot's default is four loaders
-        arguments = arguments.default("num_workers", cores())
-    return arguments
+    if getattr(config.env, "type", None) == "memobench":
+        check_obs_type(policy, config.env.obs_type, config.env.suite)
+    if config.steps < SHORT_TRAINING and asked.get("log_freq") is None:
+        config.log_freq = max(1, config.steps // 10)
+    if asked.get("batch_size") is None and getattr(policy, "decodes_no_video", False):
+        config.batch_size = OBJECT_BATCH
+    if asked.get("num_workers") is None and cores() < 4:  # LeRobot's default is four loaders
+        config.num_workers = cores()
+    return asked, config
 
 
-def parse_policy(arguments: LerobotArguments) -> tuple[LerobotArguments, Any]:
-    """Parse the policy's configuration; it is None if a configuration file is named.
+def build_training(asked: Asked) -> tuple[Asked, TrainPipelineConfig]:
+    """Return the settings and the configuration.
 
     Settings of a checkpoint that have no effect under the settings of the command line are reset to their defaults.
     """
-    from draccus.utils import ParsingError
-
     try:
-        return arguments, policy_config(arguments)
-    except ParsingError as error:
-        unread = getattr(error.__cause__, "defaults", {})
-        if not unread or arguments.get("policy.path") is None:
+        return asked, asked.build()
+    except MemobenchError as error:
+        unread = getattr(error, "defaults", {})
+        if not unread or asked.get(f"policy.{PATH}") is None:
             raise
-        for name, value in unread.items():
-            arguments = arguments.default(f"policy.{name}", json.dumps(value))
-        return arguments, policy_config(arguments)
+        asked = replace(asked, words={**{f"policy.{name}": value for name, value in unread.items()}, **asked.words})
+        return asked, asked.build()
 
 
-def with_memory_defaults(arguments: LerobotArguments) -> LerobotArguments:
-    """Return arguments in which a memory that differs from the checkpoint's or the recipe's has its own defaults."""
-    memory, path = arguments.get("policy.memory"), arguments.get("policy.path")
+def with_memory_defaults(asked: Asked) -> Asked:
+    """Return settings in which a memory that differs from the checkpoint's or the recipe's has its own defaults."""
+    memory, path = asked.words.get("policy.memory"), asked.get(f"policy.{PATH}")
     if memory is None:
-        return arguments
+        return asked
     folder = None if path is None else local_folder(path)
-    recipe = read_config_file(arguments.get(CONFIG_FILE)).get("policy")
-    begun = read_json(folder / POLICY_CONFIG) if folder is not None else recipe if isinstance(recipe, dict) else {}
+    begun = read_json(folder / POLICY_CONFIG) if folder is not None else asked.file.get("policy") or {}
     held = begun.get("memory") or ("none" if begun.get("memory_fusion") == "none" else "frames")
     if begun.get("type") != MEMORY_POLICY or held == ("frames" if memory == "null" else memory):
-        return arguments
-    for name, value in MEMORY_DEFAULTS.items():
-        arguments = arguments.default(f"policy.{name}", "null" if value is None else value)
-    return arguments
+        return asked
+    defaults = {f"policy.{name}": value for name, value in MEMORY_DEFAULTS.items()}
+    return replace(asked, words={**defaults, **asked.words})
 
 
-def check_numbers(arguments: LerobotArguments) -> None:
-    """Refuse numbers on the command line, or else in the configuration file, that are below `SMALLEST`."""
-    file = read_config_file(arguments.get(CONFIG_FILE))
+def check_numbers(config: TrainPipelineConfig) -> None:
+    """Refuse numbers below `SMALLEST`."""
     for key, smallest in SMALLEST.items():
-        section, _, name = key.rpartition(".")
-        held = file.get(section) if section else file
-        number = whole_number(arguments.get(key) or (str(held.get(name)) if isinstance(held, dict) else None))
-        if number is not None and number < smallest:
-            raise MemobenchError(f"found {key}={number}; expected at least {smallest}")
+        found: Any = config
+        for part in key.split("."):
+            found = getattr(found, part)
+        if found < smallest:
+            raise MemobenchError(f"found {key}={found}; expected at least {smallest}")
 
 
-def check_dataset(arguments: LerobotArguments) -> None:
+def check_dataset(asked: Asked) -> None:
     """Refuse a folder that is not a dataset; a folder that does not exist may be one to download into."""
-    root, repository = arguments.get("dataset.root"), arguments.get("dataset.repo_id")
+    root, repository = asked.get("dataset.root"), asked.get("dataset.repo_id")
     if root is None:
         if repository is not None and looks_local(repository):
             raise MemobenchError(
@@ -279,10 +279,10 @@ def check_dataset(arguments: LerobotArguments) -> None:
     check_fetched(folder)
 
 
-def check_memory_settings(arguments: LerobotArguments, policy: Any) -> None:
+def check_memory_settings(asked: Asked, policy: Any) -> None:
     """Refuse settings on the command line that belong to another memory; errors as of `read_settings`."""
     from lerobot_memobench.policies.memobench_mem.memory import NONE, read_settings
 
-    given = yaml.safe_load(arguments.get("policy.memory_settings") or "{}")
+    given = asked.words.get("policy.memory_settings")
     if given and getattr(policy, "memory", NONE) != NONE:
-        read_settings(policy.memory, given)
+        read_settings(policy.memory, value_of("policy.memory_settings", dict[str, Any], given))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import copy
 import datetime as dt
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from lerobot.common.train_utils import resolve_resume_checkpoint
-from lerobot.configs import FeatureType, parser
+from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -19,7 +19,7 @@ from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.policies.convention import trained_convention
-from lerobot_memobench.policies.lerobot_config import read_lerobots_config
+from lerobot_memobench.run.command_line import Asked
 from lerobot_memobench.sim.convention import convention_of
 
 READ = frozenset(
@@ -34,23 +34,23 @@ READ = frozenset(
 """Fields of LeRobot's configuration that the loop of memory policies reads, itself or through LeRobot's functions."""
 
 
-def read_training(flags: Sequence[str]) -> TrainPipelineConfig:
-    """Return the complete configuration of a memory policy's training: optimizer, folder of the run, checkpoint.
+def complete(config: TrainPipelineConfig, asked: Asked) -> TrainPipelineConfig:
+    """Return the configuration of a memory policy's training with its optimizer, folder of the run and checkpoint.
 
     Raises:
         MemobenchError: settings do not go together.
     """
-    config, now = read_lerobots_config(TrainPipelineConfig, flags), dt.datetime.now()
-    policy = config.policy
+    policy, now = config.policy, dt.datetime.now()
     assert policy is not None
     check_settings(config)
     if config.resume:
-        file = parser.parse_arg("config_path", flags)
+        file = asked.config_path
         assert file is not None
         if Path(file).exists():
             pretrained = Path(file) if Path(file).is_dir() else Path(file).parent
         else:  # a repository
-            config.output_dir = Path(parser.parse_arg("output_dir", flags) or f"outputs/train/{now:%Y-%m-%d/%H-%M-%S}")
+            named = asked.words.get("output_dir") or f"outputs/train/{now:%Y-%m-%d/%H-%M-%S}"
+            config.output_dir = Path(named)
             pretrained = resolve_resume_checkpoint(file, config.output_dir) / "pretrained_model"
         config.checkpoint_path, policy.pretrained_path = pretrained.parent, pretrained
     elif config.output_dir is not None and config.output_dir.is_dir():

@@ -53,7 +53,7 @@ def train(config: TrainPipelineConfig) -> None:
     """Train a memory policy until ``config.steps``, from the beginning or from ``config.checkpoint_path``.
 
     Args:
-        config: complete, as of `configuration.read_training`.
+        config: complete, as of `configuration.complete`.
     """
     accelerator = begin(config)
     with accelerator.main_process_first():  # the others find the dataset downloaded

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import itertools
 import shlex
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
-
-import yaml
+from typing import TYPE_CHECKING
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import (
@@ -24,16 +21,22 @@ from lerobot_memobench.policies.checkpoint import (
     read_json,
     text_of_link,
 )
-from lerobot_memobench.policies.lerobot_config import overrides, quiet
-from lerobot_memobench.run.arguments import (
+from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.run.command_line import (
     CONFIG_FILE,
+    PATH,
     RECIPE,
     TRAINING_OPTIONS,
-    Arguments,
-    LerobotArguments,
-    is_true,
-    whole_number,
+    TYPE,
+    Asked,
+    field_types,
+    spelled,
+    value_of,
+    without,
 )
+
+if TYPE_CHECKING:
+    from lerobot.configs.train import TrainPipelineConfig
 
 TRAINING_STEP = Path("training_state") / "training_step.json"
 OF_OPTIMIZER = ("optimizer.", "policy.optimizer_")
@@ -46,8 +49,8 @@ OPTIMIZER_GROUPS = "optimizer_param_groups.json"
 """Written after an optimizer's state, which is nearly the last part of a checkpoint."""
 
 
-def resumed(given: Arguments) -> Arguments:
-    """Return LeRobot's arguments to resume a training, if ``output_dir=<run> resume=true`` is given.
+def resumed(words: Mapping[str, str]) -> dict[str, str]:
+    """Return the words of LeRobot to resume a training, if ``output_dir=<run> resume=true`` is given.
 
     LeRobot needs the path of the configuration in the run's last checkpoint. That holds all settings of the run;
     settings on the command line override it.
@@ -55,26 +58,25 @@ def resumed(given: Arguments) -> Arguments:
     Raises:
         MemobenchError: there is no checkpoint, a recipe is named, or another policy than that of the run.
     """
-    wanted = "true" if "--resume" in given.flags and given.value("resume") is None else given.value("resume")
-    if not is_true("resume", wanted):
-        return given
-    recipe, stated = given.value(RECIPE), given.value(CONFIG_FILE)
+    if not value_of("resume", bool, words.get("resume", "false")):
+        return dict(words)
+    recipe, stated = words.get(RECIPE), words.get(CONFIG_FILE)
     if recipe is None and stated is not None and not (Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG):
-        return given  # LeRobot's own form: a checkpoint or a repository
+        return dict(words)  # LeRobot's own form: a checkpoint or a repository
     named = f"{RECIPE}={recipe}" if recipe is not None else f"{CONFIG_FILE}={stated}"
     if recipe is not None or stated is not None:
         raise MemobenchError(
             f"{named} cannot be combined with resume=true, which uses the configuration in the last checkpoint; leave "
             "the recipe out, and change settings by key=value"
         )
-    folder = given.value("output_dir")
+    folder = words.get("output_dir")
     if folder is None:
         raise MemobenchError("resume=true needs the folder of the training: output_dir=<folder>")
     checkpoint = last_checkpoint(Path(folder).expanduser())
     checkpoint_type(str(checkpoint))
-    _check_same_policy(given, checkpoint, folder)
-    rest = given.without("policy", "policy.path", "policy.type", "resume")
-    return replace(rest, pairs=[(CONFIG_FILE, str(checkpoint / TRAIN_CONFIG)), ("resume", "true"), *rest.pairs])
+    _check_same_policy(words, checkpoint, folder)
+    rest = without(words, "policy", f"policy.{PATH}", f"policy.{TYPE}")
+    return {CONFIG_FILE: str(checkpoint / TRAIN_CONFIG), **rest}
 
 
 def last_checkpoint(run: Path) -> Path:
@@ -102,13 +104,13 @@ def whole_checkpoints(run: Path) -> Iterator[Path]:
             yield folder
 
 
-def make_room_for_link(arguments: LerobotArguments) -> None:
+def make_room_for_link(asked: Asked) -> None:
     """Remove a file that a copy made of the link ``last`` of a resumed training, because LeRobot makes the link.
 
     Raises:
         MemobenchError: ``last`` is a folder, or another file.
     """
-    checkpoint = _resumed_checkpoint(arguments)
+    checkpoint = _resumed_checkpoint(asked)
     last = None if checkpoint is None else checkpoint.parents[1] / LAST
     if last is None or last.is_symlink() or not last.exists():
         return
@@ -121,135 +123,130 @@ def make_room_for_link(arguments: LerobotArguments) -> None:
     last.unlink(missing_ok=True)  # another process of this training may remove it
 
 
-def _check_same_policy(given: Arguments, checkpoint: Path, folder: str) -> None:
+def _check_same_policy(words: Mapping[str, str], checkpoint: Path, folder: str) -> None:
     """Refuse to resume with another type of policy than the run's."""
     begun = (read_json(checkpoint / TRAIN_CONFIG).get("policy") or {}).get("type")
-    named = given.value("policy") or given.value("policy.type")
+    named = words.get("policy") or words.get(f"policy.{TYPE}")
     where = None if named is None else checkpoint_folder(named)
     kind = named if where is None else checkpoint_type(str(where))
     if kind is not None and begun is not None and "/" not in kind and kind != begun:
         raise MemobenchError(f"the training in {folder} has policy={begun}; found policy={named}; leave policy out")
 
 
-def check_same_training(arguments: LerobotArguments) -> None:
+def check_same_training(asked: Asked, config: TrainPipelineConfig) -> None:
     """Refuse to resume a training with another dataset, or with settings that it cannot change.
+
+    Args:
+        config: the configuration of `asked`.
 
     Raises:
         MemobenchError: a setting differs.
     """
-    checkpoint = _resumed_checkpoint(arguments)
+    checkpoint = _resumed_checkpoint(asked)
     if checkpoint is None:
         return
     check_processors(checkpoint)
-    _check_same_dataset(arguments, checkpoint)
-    for name, value, held in changed_settings(arguments, checkpoint):
+    begun = begun_training(checkpoint)
+    _check_same_dataset(asked, begun, checkpoint)
+    for name, value, held in changed_settings(asked, config, begun):
         if name.startswith(OF_OPTIMIZER):
             raise MemobenchError(
                 f"this training was begun with {name}={held}, which its saved optimizer keeps; found {value}; leave "
                 f"{name.removeprefix('policy.')} out, or train a new run from the checkpoint: policy={checkpoint} "
                 "output_dir=<new folder>"
             )
-    given = overrides("policy", arguments.for_parser)
-    if not given:
-        return
-    from lerobot.configs.policies import PreTrainedConfig
+    if config.policy is not None and begun.policy is not None:
+        check_as_begun(checkpoint, config.policy, begun.policy)
+
+
+def begun_training(checkpoint: Path) -> TrainPipelineConfig:
+    """Return the configuration with which a resumed training was begun."""
+    from lerobot.configs.train import TrainPipelineConfig
 
     with quiet():
-        begun = PreTrainedConfig.from_pretrained(checkpoint)
-        asked = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=given)
-    check_as_begun(checkpoint, asked, begun)
+        return TrainPipelineConfig.from_pretrained(checkpoint)
 
 
-def _check_same_dataset(arguments: LerobotArguments, checkpoint: Path) -> None:
+def _check_same_dataset(asked: Asked, begun: TrainPipelineConfig, checkpoint: Path) -> None:
     """Refuse to resume a training on another dataset, or on other episodes of it."""
-    begun = read_json(checkpoint / TRAIN_CONFIG).get("dataset") or {}
-    root, repository = arguments.get("dataset.root"), arguments.get("dataset.repo_id")
-    held = str(begun.get("root") or begun.get("repo_id"))
+    root, repository = asked.words.get("dataset.root"), asked.words.get("dataset.repo_id")
+    held = str(begun.dataset.root or begun.dataset.repo_id)
     advice = f"leave it out, or train a new run from the checkpoint: policy={checkpoint} output_dir=<new folder>"
     same = (
         root is not None
-        and begun.get("root") is not None
-        and (Path(root).expanduser().resolve() == Path(begun["root"]).expanduser().resolve())
+        and begun.dataset.root is not None
+        and (Path(root).expanduser().resolve() == Path(begun.dataset.root).expanduser().resolve())
     )
-    if not same and (root is not None or repository not in (None, begun.get("repo_id"))):
-        moved = begun.get("root") is not None and not Path(held).expanduser().exists()
+    if not same and (root is not None or repository not in (None, begun.dataset.repo_id)):
+        moved = begun.dataset.root is not None and not Path(held).expanduser().exists()
         raise MemobenchError(
             f"this training was begun on the dataset {held}; found {root or repository}; "
             + (f"if it is the same dataset, move it or link it to {held}; else " if moved else "")
             + advice
         )
     for name in ("episodes", "revision"):
-        asked = arguments.get(f"dataset.{name}")
-        if asked is not None and yaml.safe_load(asked) != begun.get(name):
-            raise MemobenchError(
-                f"this training was begun with dataset.{name}={begun.get(name)}; found {asked}; {advice}"
-            )
+        text, value = asked.words.get(f"dataset.{name}"), getattr(begun.dataset, name)
+        if text is not None and value_of(name, field_types(type(begun.dataset))[name], text) != value:
+            raise MemobenchError(f"this training was begun with dataset.{name}={value}; found {text}; {advice}")
 
 
-def _resumed_checkpoint(arguments: LerobotArguments) -> Path | None:
+def _resumed_checkpoint(asked: Asked) -> Path | None:
     """Return the checkpoint that a training resumes from; None if it is new, or if the checkpoint is on the hub."""
-    path, resume = arguments.get(CONFIG_FILE), arguments.get("resume")
-    wanted = arguments.has("resume") if resume is None else resume.lower() == "true"  # LeRobot takes a bare --resume
-    if not wanted or path is None or not Path(path).exists():
+    path = asked.config_path
+    if not value_of("resume", bool, asked.get("resume") or "false") or path is None or not Path(path).exists():
         return None
     return Path(path) if Path(path).is_dir() else Path(path).parent
 
 
-def note_on_resume(arguments: LerobotArguments) -> tuple[str | None, bool]:
+def note_on_resume(asked: Asked, config: TrainPipelineConfig) -> tuple[str | None, bool]:
     """Return a note on a resumed training, or None, and whether updates are left."""
-    checkpoint = _resumed_checkpoint(arguments)
+    checkpoint = _resumed_checkpoint(asked)
     if checkpoint is None:
         return None, True
-    steps = whole_number(arguments.get("steps"))
-    total = steps or whole_number(str(read_json(checkpoint / TRAIN_CONFIG).get("steps")))
-    done = step_reached(checkpoint)
-    if total is not None and done >= total:
+    begun, done = begun_training(checkpoint), step_reached(checkpoint)
+    if done >= config.steps:
         return (
             f"the training in {checkpoint.parents[2]} has finished its {done} steps; for more, set steps=",
             False,
         )
     changed = [
         f"{name}={value} instead of {held}"
-        for name, value, held in changed_settings(arguments, checkpoint)
+        for name, value, held in changed_settings(asked, config, begun)
         if not name.startswith("policy.")  # see `check_as_begun`
     ]
     note = f"note: this training continues with {', '.join(changed)}" if changed else None
-    return "\n".join(filter(None, (note, note_on_schedule(checkpoint, steps)))) or None, True
+    return "\n".join(filter(None, (note, note_on_schedule(begun, config.steps, done)))) or None, True
 
 
-def changed_settings(arguments: LerobotArguments, checkpoint: Path) -> Iterator[tuple[str, str, object]]:
-    """Yield name, text and earlier value of settings that differ from the run's, but for its folders and length."""
-    begun = read_json(checkpoint / TRAIN_CONFIG)
-    for name, text in arguments.values.items():
-        section, _, last = name.rpartition(".")
-        held: Any = begun
-        for part in filter(None, section.split(".")):
-            held = held.get(part) if isinstance(held, dict) else None
-        if text is None or name in NOT_COMPARED or not isinstance(held, dict) or last not in held:
+def changed_settings(
+    asked: Asked, config: TrainPipelineConfig, begun: TrainPipelineConfig
+) -> Iterator[tuple[str, object, object]]:
+    """Yield name, value and earlier value of settings on the command line that differ from the run's.
+
+    Folders and the number of steps are left out.
+    """
+    for name in asked.words:
+        try:
+            now, before = (attrgetter(name)(one) for one in (config, begun))
+        except AttributeError:  # a setting of another type of optimizer
             continue
-        value = held[last]
-        with suppress(ValueError, TypeError, yaml.YAMLError):
-            if yaml.safe_load(text) == value or float(text) == float(value):
-                continue
-        yield name, text, value
+        if name not in NOT_COMPARED and now != before:
+            yield name, now, before
 
 
-def note_on_schedule(checkpoint: Path, steps: int | None) -> str | None:
+def note_on_schedule(begun: TrainPipelineConfig, steps: int, done: int) -> str | None:
     """Return a note if another number of steps makes the learning rate of a resumed training jump.
 
     LeRobot builds the schedule for the new number and continues in it at the step that was reached.
 
     Args:
-        checkpoint: its folder ``pretrained_model``. steps: the new number; None: as before.
+        steps: the new number. done: the step that was reached.
     """
-    from lerobot.configs.train import TrainPipelineConfig
     from torch import nn, optim
 
-    with quiet():
-        begun = TrainPipelineConfig.from_pretrained(checkpoint)
-    if steps is None or steps == begun.steps or begun.scheduler is None or begun.optimizer is None:
+    if steps == begun.steps or begun.scheduler is None or begun.optimizer is None:
         return None
-    done, rates = step_reached(checkpoint), []
+    rates = []
     for total in (begun.steps, steps):
         made = begun.scheduler.build(optim.SGD(nn.Linear(1, 1).parameters(), lr=1.0), total)
         rates.append(getattr(made, "lr_lambdas", [lambda _: 1.0])[0](done) * getattr(begun.optimizer, "lr", 1.0))
@@ -267,22 +264,20 @@ def step_reached(checkpoint: Path) -> int:
     return int(read_json(checkpoint.parent / TRAINING_STEP)["step"])
 
 
-def resume_hint(arguments: LerobotArguments, line: Sequence[str], begun: float) -> str:
+def resume_hint(asked: Asked, words: Mapping[str, str], begun: float) -> str:
     """Return the advice for a training that was terminated: the command that resumes from its last checkpoint.
 
     Args:
-        line: its command line after ``lerobot train``.
+        words: of its command line.
         begun: its start, seconds since the epoch, to find the folder if LeRobot chose its name.
     """
-    given = arguments.get("output_dir")
+    given = asked.get("output_dir")
     runs = [Path(given)] if given is not None else list(Path("outputs/train").glob("*/*"))
     saved = [checkpoint for run in runs for checkpoint in itertools.islice(whole_checkpoints(run), 1)]
     saved = [one for one in saved if given is not None or one.lstat().st_mtime >= begun]
     if not saved:
-        again = shlex.join(["lerobot", "train", *line])
-        return f"no checkpoint was saved; start again with: {again}"
+        return f"no checkpoint was saved; start again with: {shlex.join(['lerobot', 'train', *spelled(words)])}"
     run = max(saved, key=lambda one: one.lstat().st_mtime).parents[1]
-    # LeRobot's configuration does not hold these.
-    kept = [word for word in line if word.partition("=")[0] in TRAINING_OPTIONS]
-    again = shlex.join(["lerobot", "train", f"output_dir={run}", "resume=true", *kept])
-    return f"go on with: {again}"
+    kept = {key: value for key, value in words.items() if key in TRAINING_OPTIONS}  # LeRobot does not keep these
+    again = spelled({"output_dir": str(run), "resume": "true", **kept})
+    return f"go on with: {shlex.join(['lerobot', 'train', *again])}"

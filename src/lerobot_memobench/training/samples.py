@@ -6,11 +6,13 @@ tensors and pictures are left out; all else of a sample equals LeRobot's to the 
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 from collections.abc import Sequence
 from typing import Any
 
+import draccus
 import numpy as np
 import pyarrow as pa
 import torch
@@ -22,7 +24,9 @@ from lerobot.scripts import lerobot_train
 from torch import Tensor
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import lock_refusal
+from lerobot_memobench.run.command_line import register_plugins
 
 logger = logging.getLogger(__name__)
 
@@ -112,10 +116,14 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
 
 
 def main() -> None:
-    """Run LeRobot's trainer by the words of the command line."""
+    """Run LeRobot's trainer with the configuration in the standard input, as JSON."""
+    register_plugins()
+    config = draccus.decode(TrainPipelineConfig, json.load(sys.stdin))
     lerobot_train.make_train_eval_datasets = open_datasets
     try:
-        lerobot_train.main()
+        lerobot_train.train(config)
+    except MemobenchError as error:
+        sys.exit(f"lerobot: {error}")
     except OSError as error:
         if (refusal := lock_refusal(error)) is None:
             raise

@@ -9,12 +9,13 @@ actions and windows of inputs end at a hold.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import os
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,9 +53,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
 from lerobot_memobench.policies.checkpoint import trained_names
 from lerobot_memobench.policies.compatibility import keeps_sizes
-from lerobot_memobench.policies.lerobot_config import read_lerobots_config
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
-from lerobot_memobench.run.arguments import LerobotArguments
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, OTHER, convention_of
 from lerobot_memobench.training.configuration import check_environment, with_features
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
@@ -127,9 +126,9 @@ class Choice:
 
 
 def viewed(
-    arguments: LerobotArguments, prompt_frames: bool | None, obs_type: str | None, notify: Callable[[str], None]
-) -> LerobotArguments:
-    """Return the arguments for LeRobot's trainer, with a view of the dataset if it is needed.
+    config: TrainPipelineConfig, prompt_frames: bool | None, obs_type: str | None, notify: Callable[[str], None]
+) -> TrainPipelineConfig:
+    """Return the configuration for LeRobot's trainer, with a view of the dataset if it is needed.
 
     Args:
         prompt_frames: whether to train on prompt frames; None: if the policy reads prompts.
@@ -139,22 +138,21 @@ def viewed(
     Raises:
         MemobenchError: the dataset lacks the observations, or is streamed from the hub.
     """
-    config = read_lerobots_config(TrainPipelineConfig, arguments.for_parser)
+    config = copy.deepcopy(config)
     given, policy = config.dataset, config.policy
     if policy is None:
-        return arguments
+        return config
     if given.root is not None:
-        given = replace(given, root=str(without_pattern(Path(given.root))))
+        given.root = str(without_pattern(Path(given.root)))
     meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
     check_dataset_version(meta)
     check_episodes(given.episodes, meta)
     choice = choice_for(policy, meta.features, prompt_frames, obs_type)
     kept = choice.columns(meta.features)
     features = {new: meta.features[name] for name, new in kept.items()}
-    if policy.pretrained_path is not None and not config.rename_map and not arguments.has("rename_map"):
+    if policy.pretrained_path is not None and not config.rename_map:
         names = trained_names(policy.pretrained_path)
         config.rename_map = {old: new for old, new in names.items() if old in features}
-        arguments = arguments.default("rename_map", json.dumps(config.rename_map))
     check_environment(config, meta, features)
     check_inputs(policy, meta, features, config.rename_map)
     sizes = [tuple(features[name]["shape"][:2]) for name in cameras_of(features)]
@@ -170,19 +168,16 @@ def viewed(
                 f"dataset.streaming=true reads {given.repo_id} from the hub with its prompts and all of its columns; "
                 "leave dataset.streaming out"
             )
-        return arguments
+        return config
     complete_statistics(policy, meta, given)
-    if policy.input_features or chooses_inputs(policy) or not choice.prompts:
-        completed = arguments
-    else:  # the view has the clock, which is not an input
-        inputs = {
-            name: {"type": one.type.name, "shape": list(one.shape)}
+    if choice.prompts and not policy.input_features and not chooses_inputs(policy):
+        policy.input_features = {  # the view has the clock, which is not an input
+            name: one
             for name, one in dataset_to_policy_features({new: meta.features[old] for old, new in kept.items()}).items()
             if one.type is not FeatureType.ACTION and name not in CLOCK
         }
-        completed = arguments.default("policy.input_features", json.dumps(inputs))
     if not needs_view(meta.features, choice):
-        return completed
+        return config
     root = Path(meta.root)
     if not (root / "data").is_dir():
         root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
@@ -192,9 +187,9 @@ def viewed(
     notify(f"LeRobot's trainer reads {folder}: {described(choice)}")
     if given.episodes is not None:
         sources = LeRobotDatasetMetadata(given.repo_id, root=folder).episodes[SOURCE_EPISODE]
-        chosen = [number for number, source in enumerate(sources) if source in given.episodes]
-        completed = completed.changed("dataset.episodes", json.dumps(chosen))
-    return completed.changed("dataset.root", folder).changed("dataset.repo_id", given.repo_id)
+        given.episodes = [number for number, source in enumerate(sources) if source in given.episodes]
+    given.root = str(folder)
+    return config
 
 
 def check_inputs(policy: Any, meta: Any, features: dict[str, Any], renamed: Mapping[str, str]) -> None:

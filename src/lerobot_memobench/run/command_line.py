@@ -1,0 +1,647 @@
+"""Read command lines of LeRobot as typed configurations: ``lerobot train policy=memobench_mem align=contrastive``.
+
+``key=value`` words and ``--key=value`` flags become nested settings: short forms get LeRobot's names, ``policy=``,
+``env=`` and ``dataset=`` choose, and ``config=`` names a recipe, whose settings the command line overrides. Texts
+become values by the types of LeRobot's configuration classes; draccus builds these from the values.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import typing
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from importlib import metadata, resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import draccus
+import yaml
+from draccus.utils import DecodingError, ParsingError, is_choice_type, is_enum, is_literal, is_union
+
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.errors import MemobenchError, chain, nearest
+from lerobot_memobench.policies.checkpoint import (
+    TRAIN_CONFIG,
+    check_checkpoint,
+    check_registered,
+    checkpoint_folder,
+    checkpoint_settings,
+    checkpoint_type,
+    looks_local,
+    shipped_policies,
+)
+from lerobot_memobench.policies.lerobot_config import check_sizes, quiet
+
+if TYPE_CHECKING:
+    from lerobot.configs.policies import PreTrainedConfig
+
+Settings = dict[str, Any]
+"""Nested settings: name -> text of a command line, value of a file, or the settings of a section."""
+
+RECIPE, CONFIG_FILE = "config", "config_path"
+"""Our key and LeRobot's for a configuration file."""
+DATASET = "dataset"
+PATH, TYPE, PACKAGES = "path", "type", "discover_packages_path"
+"""Keys of a choice that LeRobot's parser reads besides its fields: ``--policy.type``."""
+HELP = "help"
+
+OF_POLICY = ("align", "size", "perception", "detector", "visual_encoder", "device")
+OF_ENVIRONMENT = ("tasks", "task", "task_ids", *(each.name for each in fields(EnvSettings)))
+COMMON: dict[str, tuple[str, ...]] = {
+    **{key: (f"policy.{key}",) for key in OF_POLICY},
+    **{key: (f"env.{key}",) for key in OF_ENVIRONMENT},
+    "replan": ("policy.n_action_steps", "env.replan_steps"),
+}
+SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
+    "eval": {
+        **COMMON,
+        **{key: (f"policy.{key}",) for key in ("host", "port", "dialect")},
+        **{"episodes": ("eval.n_episodes",), "batch_size": ("eval.batch_size",)},
+    },
+    "train": {**COMMON, "episodes": ("dataset.episodes",)},
+}
+"""Command -> short form -> the fields it sets, as far as they exist. `cli/lerobot.py` explains them."""
+RUN_OPTIONS = ("split", "memory_reads", "resume", "shard", "shards", "workers", "slurm")
+"""Keys of `lerobot eval env=memobench` that LeRobot does not have (`plan.RunOptions`)."""
+TRAINING_OPTIONS = ("prompt_frames", "obs_type")
+"""Keys of `lerobot train` that LeRobot does not have (`training.command.TrainingOptions`)."""
+OPTIONS = {"eval": RUN_OPTIONS, "train": TRAINING_OPTIONS}
+
+
+# --- words ---
+
+
+def parse_words(line: Sequence[str]) -> dict[str, str]:
+    """Return key -> text of ``key=value``, ``--key=value`` and ``--key value``; ``--flag`` is ``true``.
+
+    Of a repeated key the last value counts.
+
+    Raises:
+        MemobenchError: a word has none of these forms.
+    """
+    found: dict[str, str] = {}
+    open_flag: str | None = None  # the previous word was `--flag` without `=`: this word may be its value
+    for word in line:
+        key, equals, value = word.removeprefix("--").partition("=")
+        if word == "-h":
+            key, value = HELP, "true"
+        elif word.startswith("--") and len(word) > 2:
+            value = value if equals else "true"
+        elif not (equals and re.fullmatch(r"[\w.-]*\w[\w.-]*", key) and not key.startswith("-")):
+            if open_flag is None or re.match(r"-[^\d.]", word):
+                raise MemobenchError(f"found {word!r} among the arguments; expected key=value or --flag=value")
+            key, value = open_flag, word
+        open_flag = key if word.startswith("--") and not equals else None
+        found.pop(key, None)  # the order of keys is that of their last values
+        found[key] = value
+    return found
+
+
+def spelled(words: Mapping[str, Any]) -> list[str]:
+    """Return words as a command line."""
+    return [f"{key}={value}" for key, value in words.items()]
+
+
+def without[T](words: Mapping[str, T], *keys: str) -> dict[str, T]:
+    """Return words without these keys."""
+    return {key: value for key, value in words.items() if key not in keys}
+
+
+def check_names(command: str, words: Collection[str]) -> None:
+    """Refuse mistyped names without a dot before LeRobot is imported, which takes eight seconds.
+
+    LeRobot's own names are read from the source of its configuration.
+    """
+    source = Path(str(metadata.distribution("lerobot").locate_file(f"lerobot/configs/{command}.py")))
+    if source.is_file():
+        names = re.findall(r"^    (\w+):", source.read_text(encoding="utf-8"), re.MULTILINE)
+        known = [*SHORT_FORMS[command], *OPTIONS[command], RECIPE, CONFIG_FILE, HELP, *names]
+        for key in words:
+            if "." not in key and key not in known:
+                raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, known)}")
+
+
+def is_of_benchmark(words: Mapping[str, str]) -> bool:
+    """Return whether a command line of `lerobot eval`, or its configuration file, names the benchmark."""
+    section = read_config_file(words.get(CONFIG_FILE)).get("env")
+    in_file = section.get(TYPE) if isinstance(section, Mapping) else section
+    return words.get("env", words.get(f"env.{TYPE}") or in_file) == "memobench"
+
+
+# --- from words to settings ---
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The settings of one of LeRobot's commands, as a command line and its configuration file ask for them.
+
+    Changes return another object.
+
+    Attributes:
+        config: the command's configuration class.
+        words: LeRobot's full name of each setting on the command line -> its text or value.
+        file: settings of the configuration file. config_path: the file's path, or its repository.
+    """
+
+    config: type
+    words: Mapping[str, Any]
+    file: Settings = field(default_factory=dict)
+    config_path: str | None = None
+
+    @property
+    def settings(self) -> Settings:
+        """All settings; the command line overrides the file."""
+        return merged(self.file, nested(self.words))
+
+    def get(self, key: str) -> Any:
+        """Return the text or value of a setting, None without one."""
+        found: Any = self.settings
+        for part in key.split("."):
+            found = found.get(part) if isinstance(found, Mapping) else None
+        return found
+
+    def default(self, key: str, value: object) -> Asked:
+        """Return settings with a value, unless one is given."""
+        return replace(self, file=merged(nested({key: value}), self.file))
+
+    def build(self) -> Any:
+        """Return the configuration; that of a checkpoint beneath it is downloaded if it is in a repository.
+
+        Raises:
+            MemobenchError: there is no setting of a name, with the nearest one; or it cannot have a value.
+        """
+        return build(self.config, self.settings)
+
+    def build_field(self, name: str) -> Any:
+        """Return the value of a field of the configuration, None where it is not given. Errors as of `build`."""
+        given = self.settings.get(name)
+        return None if given is None else build(field_types(self.config)[name], given, name)
+
+
+def read_words(command: str, words: Mapping[str, str]) -> Asked:
+    """Return the settings that the words of ``lerobot eval`` or ``lerobot train`` ask for.
+
+    Raises:
+        MemobenchError: a choice, a recipe or a short form cannot be used, or the configuration file not be read.
+    """
+    from lerobot.configs.eval import EvalPipelineConfig
+    from lerobot.configs.train import TrainPipelineConfig
+
+    load_plugins(words)
+    config = EvalPipelineConfig if command == "eval" else TrainPipelineConfig
+    choices = registries(config)
+    config_path = words.get(CONFIG_FILE)
+    file = _settings_of_file(config, config_path)
+    found: dict[str, str] = {}
+    for key in choices:  # `policy: act` in a file is `policy=act`
+        if isinstance(file.get(key), str):
+            file[key] = nested(choice_settings(config, key, file[key]))[key]
+    for key, value in words.items():
+        if key in choices or (key == DATASET and DATASET in field_types(config)):
+            found = without(found, f"{key}.{TYPE}", f"{key}.{PATH}") | choice_settings(config, key, value)
+        elif not key.endswith(f".{PACKAGES}") and key not in (CONFIG_FILE, HELP):
+            found[key] = value
+    for key in choices:
+        named = {name: found[full] for name in (TYPE, PATH) if (full := f"{key}.{name}") in found}
+        begun = file.get(key)
+        if named and isinstance(begun, Mapping) and {TYPE, PATH} & {*begun} and not named.items() <= begun.items():
+            del file[key]  # settings of another choice
+    if "dataset.repo_id" in found and isinstance(file.get(DATASET), Mapping):
+        file[DATASET] = without(file[DATASET], "root", "repo_id")
+    asked, short = Asked(config, found, file, config_path), SHORT_FORMS[command]
+    for key in found:
+        if "." not in key and key not in (names := (*field_types(config), *short)):
+            raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, names)}")
+    for key in [key for key in found if key in short and key not in field_types(config)]:
+        # replan= sets the policy's interval and the environment's, for the log; either may not exist.
+        fields = [each for each in short[key] if has_setting(asked, each)]
+        if not fields:
+            raise _without_field(asked, key, short[key][0])
+        found |= dict.fromkeys(fields, found[key])
+        del found[key]
+    return asked
+
+
+def has_setting(asked: Asked, key: str) -> bool:
+    """Return whether the command has a setting of this full name, with the choices that are made."""
+    section, _, name = key.partition(".")
+    kind = without_none(field_types(asked.config)[section])
+    chosen = chosen_class(kind, section, asked.get(section) or {}) if is_choice_type(kind) else kind
+    return chosen is not None and name in field_types(chosen)
+
+
+def _without_field(asked: Asked, key: str, full: str) -> MemobenchError:
+    section, _, name = full.partition(".")
+    kind = without_none(field_types(asked.config)[section])
+    chosen = chosen_class(kind, section, asked.get(section) or {})
+    if chosen is not None:
+        return MemobenchError(f"{key}= sets {full}, and {chosen.__name__} has no such field")
+    return MemobenchError(f"{key}= sets {name} of the {section}: name one with {section}=")
+
+
+def nested(words: Mapping[str, Any]) -> Settings:
+    """Return ``policy.align`` -> value as ``{"policy": {"align": value}}``.
+
+    Raises:
+        MemobenchError: a section is given a value of its own.
+    """
+    found: Settings = {}
+    for key, value in words.items():
+        *sections, last = key.split(".")
+        node = found
+        for part in sections:
+            node = node.setdefault(part, {})
+            if not isinstance(node, dict):
+                raise MemobenchError(f"found {key}= and {part}={words.get(part, '')}; give one of them")
+        if isinstance(node.get(last), dict) != isinstance(value, dict) and last in node:
+            raise MemobenchError(
+                f"found {key}={str(value)[:80]}; {key} holds settings, such as {key}.{next(iter(node[last]))}="
+            )
+        node[last] = value
+    return found
+
+
+def merged(*layers: Mapping[str, Any]) -> Settings:
+    """Return nested settings of several layers; of a setting in several of them the last one counts."""
+    found: Settings = {}
+    for layer in layers:
+        if not isinstance(layer, Mapping):
+            raise MemobenchError(f"found {layer!r} in the place of settings; expected name=value")
+        for key, value in layer.items():
+            both = isinstance(value, Mapping) and isinstance(found.get(key), Mapping)
+            found[key] = merged(found[key], value) if both else value
+    return found
+
+
+def flattened(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the full name and the value of nested settings."""
+    for name, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            yield from flattened(value, f"{before}{name}.")
+        else:
+            yield f"{before}{name}", value
+
+
+# --- values of policy=, env=, dataset= …: a registered type, a checkpoint, a repository, a folder ---
+
+
+def choice_settings(config: type, key: str, value: str) -> dict[str, str]:
+    """Return the settings for a choice such as ``policy=``, of a command with this configuration.
+
+    Raises:
+        MemobenchError: it does not exist, with near names.
+    """
+    if not value:
+        raise MemobenchError(f"{key}= is empty; expected a name")
+    if key == DATASET:
+        return dataset_settings(value)
+    known = registries(config)[key]
+    path = checkpoint_of(value, known) if key == "policy" else None
+    if path is not None:
+        return {f"policy.{PATH}": path}
+    if value not in known:
+        others = shipped_policies() if key == "policy" else {}
+        raise MemobenchError(f"there is no {key} {value!r}, {nearest(value, [*known, *others])}")
+    return {f"{key}.{TYPE}": value}
+
+
+def checkpoint_of(value: str, known: Collection[str]) -> str | None:
+    """Return the checkpoint folder or the repository that ``policy=`` names; None where it names a type.
+
+    A known name has precedence over a folder of that name, which a path such as ``./act`` names.
+    """
+    folder = None if value in known else checkpoint_folder(value)
+    if folder is not None:
+        return str(folder)
+    if value not in known and (looks_local(value) or Path(value).is_dir()):
+        problem = "holds no checkpoint (no config.json)" if Path(value).is_dir() else "does not exist"
+        raise MemobenchError(
+            f"policy={value}: this folder {problem}; expected a checkpoint such as "
+            "outputs/train/<run>/checkpoints/last/pretrained_model, or a policy type"
+        )
+    return value if "/" in value else None
+
+
+def dataset_settings(value: str) -> dict[str, str]:
+    """Return the settings for ``dataset=``: a folder here, or a repository's id."""
+    path = Path(value).expanduser()
+    if path.is_dir():
+        return {"dataset.repo_id": f"local/{path.resolve().name}", "dataset.root": str(path)}
+    if looks_local(value) or "/" not in value:
+        raise MemobenchError(
+            f"dataset={value}: there is no such folder; expected one that `memobench generate` wrote, "
+            "or a repository such as user/name"
+        )
+    return {"dataset.repo_id": value}
+
+
+def chosen_class(kind: Any, name: str, section: Mapping[str, Any]) -> type | None:
+    """Return the class that the settings of a choice name, by ``path`` or ``type``; None without one.
+
+    Args:
+        kind: base class of the choice. name: of the choice, for messages.
+
+    Raises:
+        MemobenchError: there is none of this name.
+    """
+    known = registered(kind)
+    chosen = section.get(TYPE)
+    if (path := section.get(PATH)) is not None:
+        if not isinstance(path, str):
+            raise MemobenchError(f"found {name}.{PATH}={str(path)[:80]}; expected a name")
+        chosen = checkpoint_type(path) or checkpoint_settings(path).get(TYPE)
+        check_registered(path)
+    if chosen is None:
+        return None
+    if not isinstance(chosen, str):
+        raise MemobenchError(f"found {name}.{TYPE}={str(chosen)[:80]}; expected a name")
+    if chosen not in known:
+        raise MemobenchError(f"there is no {name} {chosen!r}, {nearest(chosen, known)}")
+    return known[chosen]
+
+
+@cache
+def register_plugins() -> None:
+    """Let LeRobot find its plugins as its own commands do, once per process, without its log lines."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    with quiet():
+        register_third_party_plugins()
+
+
+def load_plugins(words: Mapping[str, str] | None = None) -> None:
+    """Register LeRobot's plugins, and import the packages that ``…discover_packages_path`` names."""
+    import lerobot.envs
+    import lerobot.policies
+    import lerobot.rewards  # noqa: F401 - they register LeRobot's own types
+    from lerobot.configs import parser
+
+    register_plugins()
+    for key, value in (words or {}).items():
+        if key.endswith(f".{PACKAGES}"):
+            try:
+                parser.load_plugin(value)
+            except Exception as error:  # a plug-in may raise anything
+                raise MemobenchError(f"{key}={value} cannot be imported as a package ({error})") from None
+
+
+# --- recipes and configuration files ---
+
+
+def recipes() -> dict[str, Path]:
+    """Return name -> file of every shipped recipe."""
+    folder = Path(str(resources.files("lerobot_memobench") / "configs"))
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def recipe_file(value: str) -> Path:
+    """Return the file of a recipe: a shipped recipe by its name, or a YAML or JSON file; ``./name`` is a file.
+
+    Raises:
+        MemobenchError: it does not exist.
+    """
+    known = recipes()
+    path = Path(value).expanduser()
+    if value in known:
+        return known[value]
+    if path.is_file():
+        return path
+    if "/" in value or path.suffix:
+        raise MemobenchError(f"{RECIPE}={value}: there is no such file; name a shipped recipe or a YAML file")
+    raise MemobenchError(f"there is no recipe {value!r}, {nearest(value, known)}")
+
+
+def resolve_recipe(words: Mapping[str, str]) -> dict[str, str]:
+    """Replace ``config=<recipe>`` by LeRobot's ``config_path=<file>``."""
+    if RECIPE not in words:
+        return dict(words)
+    if CONFIG_FILE in words:
+        raise MemobenchError(f"{RECIPE}={words[RECIPE]}: name one recipe, either by {RECIPE}= or by {CONFIG_FILE}=")
+    return {CONFIG_FILE: str(recipe_file(words[RECIPE])), **without(words, RECIPE)}
+
+
+def read_config_file(given: str | None) -> Settings:
+    """Return the content of the local file that ``config_path`` names, {} without one.
+
+    Raises:
+        MemobenchError: it cannot be read as settings.
+    """
+    if given is None:
+        return {}
+    path = Path(given).expanduser()
+    if path.is_dir():
+        path = path / TRAIN_CONFIG
+    if not path.is_file():
+        if looks_local(given) or path.suffix in (".yaml", ".yml", ".json"):
+            raise MemobenchError(f"{CONFIG_FILE}={given}: there is no such file")
+        return {}  # a repository: LeRobot fetches it
+    try:
+        content = yaml.safe_load(path.read_bytes())
+    except OSError as error:
+        raise MemobenchError(f"{CONFIG_FILE}={given} cannot be read ({error.strerror or error})") from None
+    except (yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:
+        # PyYAML also raises errors of dates, numbers and keys.
+        problem = " ".join(str(error).split())
+        raise MemobenchError(f"{CONFIG_FILE}={given} is neither YAML nor JSON: {problem}") from None
+    if not isinstance(content, dict):
+        raise MemobenchError(f"{CONFIG_FILE}={given} holds no settings; expected a mapping such as 'policy: …'")
+    return content
+
+
+def _settings_of_file(config: Any, given: str | None) -> Settings:
+    """Return the settings of a configuration file, or of a training's checkpoint in a folder or a repository."""
+    content = read_config_file(given)
+    if given is None or not hasattr(config, "from_pretrained") or (content and Path(given).suffix != ".json"):
+        return content
+    if content and not Path(given).is_dir() and Path(given).name != TRAIN_CONFIG:
+        return content
+    with quiet():  # LeRobot converts settings of its earlier versions
+        found = draccus.encode(config.from_pretrained(given))
+    assert isinstance(found, dict)
+    return found
+
+
+# --- values of the fields of a configuration class ---
+
+PLAIN = {bool: "true or false", int: "a whole number", float: "a number"}
+NULLS = ("null", "~")
+"""Texts that stand for no value, as in YAML; for a number or a truth value also ``none``."""
+
+
+def build(annotation: Any, given: Any, key: str = "") -> Any:
+    """Return the configuration of a class with these settings, or the value of a field.
+
+    Args:
+        key: name of the field or section, for messages; "" for the configuration of a command.
+
+    Raises:
+        MemobenchError: as of `value_of`, or the configuration's own.
+    """
+    value = value_of(key, annotation, given)
+    try:
+        with quiet():
+            return draccus.decode(annotation, value)
+    except (DecodingError, ParsingError) as error:
+        raise _explained(error, key) from error
+
+
+def _explained(error: Exception, key: str) -> MemobenchError:
+    """Return the innermost reason of draccus's chain of errors; the configurations' own errors stay as they are."""
+    reasons = [each for each in chain(error) if not isinstance(each, DecodingError | ParsingError)]
+    own = next((each for each in reasons if isinstance(each, MemobenchError)), None)
+    if own is not None:
+        return own
+    for each in reversed([*chain(error)]):
+        if isinstance(each, DecodingError):
+            name = ".".join(part for part in (key, *each.key_path) if part)
+            return MemobenchError(f"{name}: {' '.join(str(each.message).split())}".removeprefix(": "))
+    return MemobenchError(" ".join(str(reasons[-1] if reasons else error).split()))
+
+
+def typed(kind: Any, settings: Mapping[str, Any], before: str = "") -> Settings:
+    """Return nested settings with values of the types of a class's fields instead of texts.
+
+    A choice's ``path`` is replaced by the settings of that checkpoint, which the given ones override.
+
+    Raises:
+        MemobenchError: there is no setting of a name, with the nearest one; or it cannot have a value.
+    """
+    beneath: Settings = {}
+    if is_choice_type(kind):
+        name = before.rstrip(".")
+        chosen = chosen_class(kind, name, settings)
+        if chosen is None:
+            raise MemobenchError(f"{before}{next(iter(settings), '')!r} needs {name}=: name one before its settings")
+        beneath[TYPE] = next(key for key, value in registered(kind).items() if value is chosen)
+        if (path := settings.get(PATH)) is not None:
+            beneath |= {**checkpoint_settings(path), "pretrained_path": path}
+        kind = chosen
+    return merged(beneath, given_values(kind, settings, before))
+
+
+def given_values(kind: Any, settings: Mapping[str, Any], before: str) -> Settings:
+    """Return the values of settings of a class's fields, without ``path`` and ``type``. Errors as of `typed`."""
+    known, found = field_types(kind), {}
+    for name, value in settings.items():
+        if name in known:
+            found[name] = value_of(before + name, known[name], value)
+        elif name not in (PATH, TYPE):
+            keys = [f"{before}{key}" for key in known]
+            raise MemobenchError(f"there is no setting {before + name!r}, {nearest(before + name, keys)}")
+    return found
+
+
+def value_of(key: str, annotation: Any, value: Any) -> Any:
+    """Return a value of a field's type for a text; the values of files stay as they are.
+
+    Raises:
+        MemobenchError: the field cannot have this value.
+    """
+    kind = without_none(annotation)
+    is_section = dataclasses.is_dataclass(kind) or is_choice_type(kind)
+    if is_section and value in NULLS:
+        return None
+    if isinstance(value, Mapping):
+        if is_section:
+            return typed(kind, value, f"{key}." if key else "")
+        if typing.get_origin(kind) is dict and any(isinstance(each, Mapping) for each in value.values()):
+            return _checked_mapping(key, kind, value)
+        if kind in (*PLAIN, str, Path) or is_literal(kind) or is_enum(kind):
+            raise MemobenchError(f"there is no setting {f'{key}.{next(iter(value), "")}'!r}; {key} holds one value")
+        return value
+    if is_section and value is not None:
+        fields = field_types(kind) if dataclasses.is_dataclass(kind) else {TYPE: str}
+        raise MemobenchError(
+            f"{key}={str(value)[:80]}: {key} holds settings; expected one of them, such as {key}.{next(iter(fields))}="
+        )
+    text = value.lower() if isinstance(value, str) else value
+    is_null = value is None or value in NULLS or (kind in PLAIN and text == "none")  # `align=none` is a text
+    if is_null and type(None) in typing.get_args(annotation):
+        return None
+    if kind in PLAIN:
+        if isinstance(value, bool) and kind is not bool:
+            raise MemobenchError(f"{key}={value}: expected {PLAIN[kind]}")
+        try:
+            return draccus.decode(kind, text)
+        except (DecodingError, TypeError):
+            raise MemobenchError(f"{key}={str(value)[:80]}: expected {PLAIN[kind]}") from None
+    if not isinstance(value, str):
+        return str(value) if kind is str and type(value) in (int, float) else value
+    if is_literal(kind) or is_enum(kind):
+        return _listed(key, kind, value)
+    if kind in (str, Path):
+        return value
+    try:
+        found = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        problem = " ".join(str(error).split())
+        found = value
+        if value[:1] in "[{" and typing.get_origin(kind) is not dict:
+            raise MemobenchError(f"{key}={value[:80]} cannot be read ({problem})") from None
+    if typing.get_origin(kind) is dict and not isinstance(found, dict):
+        raise MemobenchError(f'{key}={value[:80]}: expected a mapping, such as {key}=\'{{"name": "other"}}\'')
+    return value if isinstance(found, str) else found
+
+
+def _checked_mapping(key: str, kind: Any, value: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a mapping of mappings, where the values of a field may be mappings."""
+    inner = (typing.get_args(kind) or (str, Any))[1]
+    if inner in (*PLAIN, str):
+        name = next(iter(value))
+        raise MemobenchError(f"found {key}.{name}=; {key} is one mapping: give {key}='{{\"{name}\": …}}'")
+    return value
+
+
+def _listed(key: str, kind: Any, value: str) -> str:
+    """Return the value of a literal or an enumeration."""
+    if is_literal(kind):
+        known = named = [str(each) for each in typing.get_args(kind)]
+    else:
+        named = list(kind.__members__)
+        known = [*(str(member.value) for member in kind), *named]
+    if value not in known:
+        raise MemobenchError(f"{key}={value}: {nearest(value, named)}")
+    return value
+
+
+def field_types(kind: Any) -> dict[str, Any]:
+    """Return field name -> annotation of a configuration class."""
+    hints = typing.get_type_hints(kind)
+    return {each.name: hints[each.name] for each in dataclasses.fields(kind)}
+
+
+def without_none(annotation: Any) -> Any:
+    """Return ``int`` for ``int | None``."""
+    parts = [part for part in typing.get_args(annotation) if part is not type(None)]
+    return parts[0] if is_union(annotation) and len(parts) == 1 else annotation
+
+
+def registered(kind: Any) -> dict[str, type]:
+    """Return name -> class of the types that are registered for a choice."""
+    return {str(name): choice for name, choice in kind.get_known_choices().items()}
+
+
+def registries(config: type) -> dict[str, dict[str, type]]:
+    """Return field -> name -> class of the types that may be chosen for it, such as for ``policy``."""
+    kinds = {name: without_none(annotation) for name, annotation in field_types(config).items()}
+    return {name: registered(kind) for name, kind in kinds.items() if is_choice_type(kind)}
+
+
+# --- the policy ---
+
+
+def policy_config(asked: Asked) -> PreTrainedConfig | None:
+    """Return the configuration of the policy, None without one.
+
+    Raises:
+        MemobenchError: the checkpoint is not complete, or as of `build`.
+    """
+    if (path := asked.get(f"policy.{PATH}")) is not None:
+        check_checkpoint(path)
+    found: PreTrainedConfig | None = asked.build_field("policy")
+    if found is not None:
+        check_sizes(found)
+    return found
