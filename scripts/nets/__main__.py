@@ -1,6 +1,6 @@
 """Record facts of the benchmark before a redesign, and compare them after each of its steps.
 
-    python -m scripts.nets record  [--net NAME]... [--out FILE]
+    python -m scripts.nets record  [--net NAME]... [--only TEXT] [--out FILE]
     python -m scripts.nets compare [--net NAME]... [--only TEXT] [--out FILE]
     python -m scripts.nets mutants [MUTANT]...
 
@@ -10,6 +10,7 @@ Parts that have run on the same sources are not run again; delete ``outputs/nets
 """
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -31,12 +32,15 @@ def run_net(net: str, only: str = "") -> store.Facts:
     command = [sys.executable, "-m", "scripts.nets", "run", "--net", net, "--only", only]
     paths = os.pathsep.join(map(str, (store.ROOT / "src", store.ROOT)))
     subprocess.run(command, cwd=store.ROOT, env={**os.environ, **ENVIRONMENT, "PYTHONPATH": paths}, check=True)
-    return run_here(net, only)
+    names = (name for name in parts_of(net) if only in name)
+    files = (store.part_file(store.work_folder(net), name) for name in names)
+    return {subject: facts for file in files for subject, facts in json.loads(file.read_text()).items()}
 
 
-def run_here(net: str, only: str) -> store.Facts:
-    """Run the parts of a net that have not run; return the facts of all."""
-    return store.run_parts(import_module(f"scripts.nets.{net}").parts(), store.work_folder(net), only)
+def parts_of(net: str) -> store.Parts:
+    """Return the parts of a net."""
+    parts: store.Parts = import_module(f"scripts.nets.{net}").parts()
+    return parts
 
 
 def compare(net: str, only: str, file: Path) -> int:
@@ -63,10 +67,11 @@ def main() -> int:
     nets = args.net or NETS
     match args.action:
         case "run":
-            run_here(nets[0], args.only)
+            store.run_parts(parts_of(nets[0]), store.work_folder(nets[0]), args.only)
         case "record":
             for net in nets:
-                store.write_record(net, run_net(net), args.out)
+                kept = store.read_record(args.out).get(net, {}).get("facts", {}) if args.only else {}
+                store.write_record(net, kept | run_net(net, args.only), args.out)
                 print(f"{net}: recorded; {args.out.stat().st_size // 1024} KiB", flush=True)
         case "compare":
             return max([compare(net, args.only, args.out) for net in nets])

@@ -49,7 +49,7 @@ def report(names: list[str]) -> int:
             shutil.copytree(ROOT / name, COPY / name, dirs_exist_ok=True)
         else:
             shutil.copy2(ROOT / name, COPY / name)
-    missed = 0
+    missed, env = 0, {**os.environ, "PYTHONPATH": "src"}
     for name in names or table():
         net, only, old, new = table()[name]
         file = place_of(old, COPY)
@@ -57,7 +57,7 @@ def report(names: list[str]) -> int:
         command = [sys.executable, "-m", "scripts.nets", "compare", "--net", net, "--only", only]
         try:
             file.write_text(text.replace(old, new))
-            done = subprocess.run(command, cwd=COPY, capture_output=True, text=True, check=False)
+            done = subprocess.run(command, cwd=COPY, env=env, capture_output=True, text=True, check=False)
         finally:
             file.write_text(text)
             os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))

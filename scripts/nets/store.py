@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from math import isclose
 from pathlib import Path
+from traceback import print_exc
 from typing import Any
 
 import numpy as np
@@ -59,20 +60,27 @@ def work_folder(net: str) -> Path:
     return ROOT / "outputs" / "nets" / source / net
 
 
-def run_parts(parts: Parts, folder: Path, only: str) -> Facts:
-    """Run the parts whose name contains ``only``, except for those that have run; return the facts of all of them."""
-    done, found = folder / "parts", Facts()
-    done.mkdir(parents=True, exist_ok=True)
+def run_parts(parts: Parts, folder: Path, only: str) -> None:
+    """Run the parts whose name contains ``only``, except for those that have run; an error is the fact ``error``."""
+    (folder / "parts").mkdir(parents=True, exist_ok=True)
     for number, (name, part) in enumerate(parts.items()):
-        file = done / f"{digest(name)}.json"
-        if only in name and not file.exists():
-            print(f"  {folder.name} {number + 1}/{len(parts)}: {name}", flush=True)
-            draft = file.with_suffix(".draft")
-            draft.write_text(json.dumps(part(folder=folder)))
-            draft.rename(file)
-        if only in name:
-            found |= json.loads(file.read_text())
-    return found
+        file = part_file(folder, name)
+        if only not in name or (file.exists() and "error" not in json.loads(file.read_text()).get(name, {})):
+            continue
+        print(f"  {folder.name} {number + 1}/{len(parts)}: {name}", flush=True)
+        try:
+            facts = part(folder=folder)
+        except Exception as error:
+            print_exc()
+            facts = {name: {"error": str(error)[-200:]}}
+        draft = file.with_suffix(".draft")
+        draft.write_text(json.dumps(facts))
+        draft.rename(file)
+
+
+def part_file(folder: Path, name: str) -> Path:
+    """Return the file with the facts of a part."""
+    return folder / "parts" / f"{digest(name)}.json"
 
 
 def machine() -> dict[str, str]:
