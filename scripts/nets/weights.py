@@ -30,12 +30,13 @@ def train(inputs: str, memory: str, folder: Path) -> Facts:
     """Train a policy for a few updates; return the facts of its losses and weights."""
     from safetensors.numpy import load_file
 
-    dataset, out = folder / "dataset", folder / f"{inputs}_{memory}"
+    dataset, out = folder / f"{inputs}_dataset", folder / f"{inputs}_{memory}"
     if not (dataset / "meta" / "info.json").exists():
-        succeed("memobench", "generate", "--tasks", TASKS, "--episodes", 1, "--out", dataset)
+        images = "--images" if inputs == "pixels" else "--no-images"
+        succeed("memobench", "generate", "--tasks", TASKS, "--episodes", 1, images, "--out", dataset)
     chosen = ("policy=memobench_mem", f"policy.memory={memory}", f"perception={inputs}", f"dataset={dataset}")
     shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
-    align = "none" if memory == "none" else "contrastive"
+    align = "none" if memory in ("none", "keyframes") else "contrastive"  # these have nothing to align
     succeed("lerobot", "train", *chosen, *SETTINGS, f"align={align}", "num_workers=0", f"output_dir={out}")
     found: Facts = {}
     for row in pd.read_csv(out / "losses.csv").itertuples():
