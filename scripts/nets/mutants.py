@@ -14,13 +14,13 @@ from scripts.nets.store import ROOT
 COPY = ROOT / "outputs" / "mutants"
 COPIED = ("src", "scripts", "research", "results", "docs", "README.md", "pyproject.toml")
 MUTANTS = """
-hold ~ logs ~ suite=strict tasks=4,24 ~ self._held = steps + -( ~ self._held = steps + 1 + -(
+hold ~ logs ~ difficulty=hard ~ self._held = steps + -( ~ self._held = steps + 1 + -(
 cameras ~ starts ~ turn_it_off-v0 ~ "agentview": AGENTVIEW, "wrist": robot ~ "wrist": AGENTVIEW, "agentview": robot
-predicate ~ executions ~ published object ~ ON_DISTANCE = 0.03 ~ ON_DISTANCE = 0.01
+predicate ~ executions ~ published 24 ~ ON_DISTANCE = 0.03 ~ ON_DISTANCE = 0.01
 normalisation ~ weights ~ objects none ~ "STATE": mode, ~ "STATE": NormalizationMode.IDENTITY,
 loss ~ weights ~ objects motion ~ per_sample + loss, total + loss.mean() ~ per_sample, total
 salt ~ actions ~ memobench_strict put_only ~ stream, *salted] ~ stream]
-held ~ executions ~ strict object ~ append(episode.phase == EXECUTION and not episode.action ~ append(not episode.action
+held ~ executions ~ strict 24 ~ append(episode.phase == EXECUTION and not episode.action ~ append(not episode.action
 steps ~ logs ~ tasks=1,12,24,28 ~ "steps": episode.exec_steps, ~ "steps": episode.step_index,
 pauses ~ logs ~ pause_steps=15 ~ _whole_chunks(settings.pause_steps, self._chunk) ~ _whole_chunks(0, self._chunk)
 interval ~ commands ~ recompute ~ 1.959963984540054 ~ 1.6448536269514722

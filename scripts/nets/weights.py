@@ -1,7 +1,7 @@
 """Net ``weights``: losses and weights after twelve updates of each memory, from objects and from pictures.
 
 `lerobot train policy=memobench_mem size=small` on two demonstrations that the expert records here. Names of tensors are
-a fact of their own, so that a renamed module changes no other one. About 6 CPU minutes.
+a fact of their own, so that a renamed module changes no other one. About 2 CPU minutes.
 """
 
 import shutil
