@@ -2,7 +2,7 @@
 
 `lerobot eval` with cheap policies, one command per group of settings. The facts are the fields of the lines of
 ``episodes.jsonl``, of ``evaluation.json`` and of ``report.json``; of fields that differ from run to run (times, paths,
-versions, commit) only the type. About 4 CPU minutes.
+versions, commit) only the type. Batch sizes follow from the number of cores. About 3 CPU minutes.
 """
 
 import json
@@ -22,12 +22,12 @@ EVALUATIONS = (
     "tasks=4,7 episodes=1",
     f"{RANDOM} tasks=1,12,24,28 episodes=1 horizon=30",
     "suite=strict tasks=4,24 episodes=1",
-    f"{SHIPPED} tasks=4 episodes=2 batch_size=2 split=validation horizon=120",
+    f"{SHIPPED} tasks=4 episodes=2 split=validation horizon=120",
     "suite=libero_object policy=memobench_random tasks=0,1 episodes=1 horizon=20 policy.seed=3",
-    f"{BLIND} tasks=21,26 referent=random prompt_in=steps episodes=2 batch_size=2 horizon=60 seed=40",
+    f"{BLIND} tasks=21,26 referent=random prompt_in=steps episodes=2 horizon=60 seed=40",
     f"{BLIND} tasks=4,7 episodes=1 pause_steps=15 speed=0.5 horizon=120",
     f"{RANDOM} suite=strict difficulty=hard tasks=4 episodes=1 horizon=20 env.delay_steps=2 replan=4",
-    f"{BLIND} tasks=21 referent=random evidence=true episodes=3 batch_size=3 horizon=60",
+    f"{BLIND} tasks=21 referent=random evidence=true episodes=3 horizon=60",
     f"{SHIPPED} tasks=24 episodes=1 interference=1 horizon=60",
     f"{SHIPPED} tasks=24 episodes=1 corrupt=delete horizon=60",
     f"{RANDOM} protocol=upstream tasks=7 episodes=1 horizon=20",

@@ -3,6 +3,7 @@
 Two seeds of each task of ``published`` and ``strict``, one initial state of each task of LIBERO. About 8 CPU minutes.
 """
 
+import re
 from collections import defaultdict
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,8 @@ from scripts.nets.store import Facts, Parts, digest, flatten
 SEEDS = (7, 8)
 GROUPS = ("body", "jnt", "dof", "geom", "site", "mesh", "tex", "mat", "light", "cam", "actuator", "name", "eq")
 """Beginnings of the names of a model's fields that are hashed together; the others form one more group."""
+LEFT_OUT = re.compile("^_|path|^nbuffer$|^signature$")
+"""Fields that depend on paths of files, and private ones."""
 
 
 def parts() -> Parts:
@@ -52,7 +55,7 @@ def model_hashes(model: Any) -> dict[str, str]:
     """Return the hash of each group of a model's numeric fields, sizes, options and names."""
     groups: dict[str, list[Any]] = defaultdict(list)
     for struct in (model, model.opt, model.stat):
-        for field in (each for each in sorted(dir(struct)) if not each.startswith("_")):
+        for field in (each for each in sorted(dir(struct)) if not LEFT_OUT.search(each)):
             value = getattr(struct, field)
             if isinstance(value, np.ndarray | int | float | bytes):
                 group = next((each for each in GROUPS if field.startswith(each)), "other")
