@@ -44,6 +44,7 @@ def place_of(text: str, root: Path) -> Path:
 
 def report(names: list[str]) -> int:
     """Print for each mutant whether its net notices it; return 1 if one is missed."""
+    shutil.rmtree(COPY / "outputs", ignore_errors=True)  # of earlier nets
     for name in COPIED:  # with numba's caches, which depend on paths and times
         if (ROOT / name).is_dir():
             shutil.copytree(ROOT / name, COPY / name, dirs_exist_ok=True)
