@@ -1,23 +1,23 @@
-"""Collect the visual geoms of a model as one list of triangles.
+"""Collect the geoms of a model as one list of triangles.
 
-Each visual geom is a row of the list. A small table with pose, colour and material of each row is updated per frame;
+Each geom is a row of the list. A small table with pose, colour and material of each row is updated per frame;
 the list is built once per scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.shapes import Triangles, box_cells, pieces_of, triangles_of
-from lerobot_memobench.sim.raster.textures import cube_coordinates, flat_coordinates, layers_of
+from mujoco_raster.shapes import Triangles, box_cells, pieces_of, triangles_of
+from mujoco_raster.textures import cube_coordinates, flat_coordinates, layers_of
 
-VISUAL_GROUP = 1
-"""Group of visible geoms; other groups are for contacts."""
+DEFAULT_GROUPS = (0, 1, 2)
+"""Geom groups that MuJoCo's renderer draws by default."""
 TABLE_LINES = 5
 """Lines of four numbers per row of the table: pose (3), colour, material."""
 
@@ -68,17 +68,20 @@ class DrawList:
         table[:, 4] = self.materials
 
 
-def build_draw_list(model: mujoco.MjModel, meshes: Mapping[str, Triangles] | None = None) -> DrawList:
-    """Collect the visual geoms of a model, with sharp mesh edges as MuJoCo's renderer.
+def build_draw_list(
+    model: mujoco.MjModel, meshes: Mapping[str, Triangles] | None = None, groups: Sequence[int] = DEFAULT_GROUPS
+) -> DrawList:
+    """Collect the geoms of some groups, with sharp mesh edges as MuJoCo's renderer.
 
     Args:
         model: compiled scene.
         meshes: replacements of the scene's meshes by name.
+        groups: geom groups to draw.
 
     Raises:
-        MemobenchError: a visual geom has an unsupported type.
+        RasterError: a visual geom has an unsupported type.
     """
-    visual = np.flatnonzero(model.geom_group == VISUAL_GROUP)
+    visual = np.flatnonzero(np.isin(model.geom_group, groups))
     moves = model.body_weldid[model.geom_bodyid[visual]] != 0
     layers, layer_of = layers_of(model)
     ids = [*visual[~moves].tolist(), *visual[moves].tolist()]

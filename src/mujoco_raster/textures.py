@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.compiled import compiled
-from lerobot_memobench.sim.raster.shapes import Triangles
+from mujoco_raster.compiled import compiled
+from mujoco_raster.shapes import Triangles
 
 LAYER_SIZE = 512
 """Side of a texture layer, pixels; a power of two, the largest size of this package's textures."""

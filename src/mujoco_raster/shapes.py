@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
+from mujoco_raster.errors import RasterError
 
 ROUND_SIDES = 32
 """Sides of cylinders and spheres."""
@@ -32,7 +32,7 @@ def triangles_of(model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangle
         meshes: replacements of the model's meshes by name.
 
     Raises:
-        MemobenchError: the geom's type is not supported.
+        RasterError: the geom's type is not supported.
     """
     kind = mujoco.mjtGeom(int(model.geom_type[geom]))
     size = np.asarray(model.geom_size[geom])
@@ -51,7 +51,7 @@ def triangles_of(model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangle
             return _ellipsoid(size)
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
             return _capsule(float(size[0]), float(size[1]))
-    raise MemobenchError(
+    raise RasterError(
         f"geom {model.geom(geom).name!r} has the type {kind.name.removeprefix('mjGEOM_').lower()}, which is not drawn; "
         "use planes, boxes, cylinders, spheres, ellipsoids, capsules and meshes for visual geoms"
     )

@@ -16,13 +16,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.raster.drawlist import DrawList, Floats, Image, Mirror
-from lerobot_memobench.sim.raster.geometry import Shapes, Target, clip_space, draw_triangles
-from lerobot_memobench.sim.raster.highlights import Highlight, fill_table, table_of, with_discs
-from lerobot_memobench.sim.raster.shading import PICTURE, TRANSLUCENT, Surfaces, scratch, shade
-from lerobot_memobench.sim.raster.textures import LAYER_SIZE, levels_of
-from lerobot_memobench.sim.raster.view import Lights, SceneLights, camera_matrix, clipping, cropped, mirrored
+from mujoco_raster.drawlist import DrawList, Floats, Image, Mirror
+from mujoco_raster.errors import RasterError
+from mujoco_raster.geometry import Shapes, Target, clip_space, draw_triangles
+from mujoco_raster.highlights import Highlight, fill_table, table_of, with_discs
+from mujoco_raster.shading import PICTURE, TRANSLUCENT, Surfaces, scratch, shade
+from mujoco_raster.textures import LAYER_SIZE, levels_of
+from mujoco_raster.view import Lights, SceneLights, camera_matrix, clipping, cropped, mirrored
 
 MAX_COORDINATE = 1e6
 """Largest coordinate in a scene, m."""
@@ -124,14 +124,14 @@ class Rasterizer:
         """Fill the table with a state and return a camera's view of it.
 
         Raises:
-            MemobenchError: a pose is not finite; compiled functions would write out of bounds.
+            RasterError: a pose is not finite; compiled functions would write out of bounds.
         """
         fill_table(self._table, self._list, model, data, highlights)
         view = View(self, model, data, camera)
         rows = len(self._rows) + len(highlights)
         for numbers in (self._table[:rows, :3], view.matrix):
             if numbers.size and not float(np.abs(numbers).max()) < MAX_COORDINATE:
-                raise MemobenchError(
+                raise RasterError(
                     f"a drawn body, camera or highlight is not within {MAX_COORDINATE:g} m; expected a finite state"
                 )
         return view

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.drawlist import Floats
+from mujoco_raster.drawlist import Floats
 
 # --- cameras ---
 

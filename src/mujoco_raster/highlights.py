@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.raster.drawlist import TABLE_LINES, VERTEX, DrawList, Floats
-from lerobot_memobench.sim.raster.shapes import disc
+from mujoco_raster.drawlist import TABLE_LINES, VERTEX, DrawList, Floats
+from mujoco_raster.errors import RasterError
+from mujoco_raster.shapes import disc
 
 HIGHLIGHTS = 16
 """Maximum number of highlights in a frame."""
@@ -54,10 +54,10 @@ def fill_table(
     """Write the present state of a list's rows and the highlights into a table.
 
     Raises:
-        MemobenchError: there are more than `HIGHLIGHTS` highlights.
+        RasterError: there are more than `HIGHLIGHTS` highlights.
     """
     if len(highlights) > HIGHLIGHTS:
-        raise MemobenchError(f"there are {len(highlights)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
+        raise RasterError(f"there are {len(highlights)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
     rows = len(draw_list.geoms)
     draw_list.fill(table[:rows], model, data)
     for row, mark in zip(table[rows:], highlights, strict=False):
