@@ -13,7 +13,6 @@ from numba.core import caching, config
 
 from mujoco_raster.compiled import compiled
 from mujoco_raster.drawlist import build_draw_list
-from mujoco_raster.errors import RasterError
 
 # --- compiled functions ---
 
@@ -68,11 +67,3 @@ def test_draw_list_has_outward_faces() -> None:
         normals = draw_list.vertices["normal"][mine[:, 0]]
         assert np.all(np.einsum("ij,ij->i", normals, np.cross(b - a, c - a)) >= -1e-9)
     np.testing.assert_allclose(np.linalg.norm(draw_list.vertices["normal"], axis=1), 1, atol=1e-5)
-
-
-def test_shape_that_is_not_drawn() -> None:
-    spec = mujoco.MjSpec()
-    spec.add_hfield(name="hills", size=[1, 1, 1, 0.1], nrow=2, ncol=2, userdata=[0.0, 1.0, 1.0, 0.0])
-    spec.worldbody.add_geom(name="land", type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="hills", group=1)
-    with pytest.raises(RasterError, match="'land' has the type hfield, which is not drawn"):
-        build_draw_list(spec.compile())

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import mujoco
-import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from mujoco_raster.drawlist import DrawList, Image
@@ -61,10 +60,9 @@ class Supersampled:
         self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight] = ()
     ) -> Image:
         """Return a camera's image; see `Renderer`."""
-        fine = self.renderer.draw(model, data, camera, highlights)
-        height, width, channels = fine.shape
-        total = fine.reshape(height // 2, 2, width // 2, 2, channels).sum(axis=(1, 3), dtype=np.uint16)
-        return ((total + 2) // 4).astype(np.uint8)
+        from mujoco_raster.rasterizer import mean_of_four
+
+        return mean_of_four(self.renderer.draw(model, data, camera, highlights))
 
 
 CACHED_RENDERERS = 4
