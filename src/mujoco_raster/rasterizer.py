@@ -263,7 +263,7 @@ class View:
         of = self._of = rasterizer
         self.camera = camera
         self.matrix = camera_matrix(model, camera)
-        self.eye = camera.eye.astype(np.float32)
+        self.eye: NDArray[np.floating] = camera.eye.astype(np.float32)
         self.target = of._target
         self._near, self.far = (np.float32(distance) for distance in clipping(model))
         self._lights: Lights = of._scene_lights.update(data, camera)

@@ -61,7 +61,7 @@ def pixels_of(model: mujoco.MjModel, texture: int) -> NDArray[np.uint8]:
     """
     shape = int(model.tex_height[texture]), int(model.tex_width[texture]), int(model.tex_nchannel[texture])
     start = int(model.tex_adr[texture])
-    pixels = np.asarray(model.tex_data[start : start + math.prod(shape)]).reshape(shape)
+    pixels: NDArray[np.uint8] = np.asarray(model.tex_data[start : start + math.prod(shape)]).reshape(shape)
     pixels = pixels[..., :3] if shape[2] >= 3 else pixels[..., [0, 0, 0]]
     if model.tex_colorspace[texture] != mujoco.mjtColorSpace.mjCOLORSPACE_SRGB.value:
         return pixels
