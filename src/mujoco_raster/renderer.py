@@ -214,7 +214,11 @@ def _known(given: str, names: Sequence[str]) -> str:
 
 def not_drawn(model: mujoco.MjModel) -> list[str]:
     """Return the objects of a model that MuJoCo's renderer draws by default and this package does not."""
-    joint = mujoco.mjtWrap.mjWRAP_JOINT.value
-    spatial = sum(model.wrap_type[start] != joint for start in model.tendon_adr)
-    counts = {"skin": model.nskin, "flex": model.nflex, "spatial tendon": int(spatial)}
-    return [f"{count} {name}{'s' if count > 1 and name != 'flex' else ''}" for name, count in counts.items() if count]
+    joint, ray = mujoco.mjtWrap.mjWRAP_JOINT.value, mujoco.mjtSensor.mjSENS_RANGEFINDER.value
+    counts = {
+        "skins": model.nskin,
+        "flexes": model.nflex,
+        "spatial tendons": sum(int(model.wrap_type[start] != joint) for start in model.tendon_adr),
+        "rangefinder rays": int((model.sensor_type == ray).sum()),
+    }
+    return [f"{name} ({count})" for name, count in counts.items() if count]

@@ -16,20 +16,26 @@ MIN_NORMAL_COSINE = 0.8
 """Smallest cosine between vertex and face normal of a smooth corner; otherwise MuJoCo uses the face normal."""
 INFINITE_PLANE_FACTOR = 1.05
 """Half side of an infinite plane, in units of the far clipping distance."""
-MAX_PLANE_CELLS = 40
-"""Maximum number of cells per side of a plane."""
+MAX_PLANE_CELLS = 200
+"""Maximum number of cells per side of a plane in MuJoCo's renderer."""
 
 Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
 """Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
 
 
-def triangles_of(model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangles] | None = None) -> Triangles:
+def triangles_of(
+    model: mujoco.MjModel,
+    geom: int,
+    meshes: Mapping[str, Triangles] | None = None,
+    plane_cells: int = MAX_PLANE_CELLS,
+) -> Triangles:
     """Return a geom's triangles in its own frame.
 
     Args:
         model: compiled scene.
         geom: id of the geom.
         meshes: replacements of the model's meshes by name.
+        plane_cells: maximum number of cells per side of a plane.
     """
     size = np.asarray(model.geom_size[geom])
     match mujoco.mjtGeom(int(model.geom_type[geom])):
@@ -38,7 +44,7 @@ def triangles_of(model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangle
         case mujoco.mjtGeom.mjGEOM_HFIELD:
             return _height_field(model, int(model.geom_dataid[geom]))
         case mujoco.mjtGeom.mjGEOM_PLANE:
-            return _plane(size, INFINITE_PLANE_FACTOR * float(model.vis.map.zfar * model.stat.extent))
+            return _plane(size, INFINITE_PLANE_FACTOR * float(model.vis.map.zfar * model.stat.extent), plane_cells)
         case kind:
             return primitive(int(kind), size)
 
@@ -228,12 +234,12 @@ def box_cells(model: mujoco.MjModel, geom: int) -> Triangles:
     return _joined(sides)
 
 
-def _plane(size: NDArray[np.floating], endless: float) -> Triangles:
+def _plane(size: NDArray[np.floating], endless: float, most: int) -> Triangles:
     """Return a subdivided plane from half sides and cell size; a half side of 0 is infinite."""
     x, y = np.where(size[:2] > 0, size[:2], endless)
     corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)])
     cells = int(np.ceil(max(x, y) / max(float(size[2]), 1e-9))) + 1
-    return _cells(corners, np.array([0.0, 0.0, 1.0]), min(cells, MAX_PLANE_CELLS))
+    return _cells(corners, np.array([0.0, 0.0, 1.0]), min(cells, most))
 
 
 def _cells(corners: NDArray[np.floating], normal: NDArray[np.floating], cells: int) -> Triangles:
