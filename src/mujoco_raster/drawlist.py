@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoco_raster.shapes import MAX_PLANE_CELLS, Triangles, box_cells, in_pieces, pieces_of, primitive, triangles_of
+from mujoco_raster.shapes import Triangles, box_cells, in_pieces, pieces_of, primitive, triangles_of
 from mujoco_raster.textures import cube_coordinates, flat_coordinates, layers_of, sky_box, skybox_of, texture_of
 
 DEFAULT_GROUPS = (0, 1, 2)
@@ -91,7 +91,7 @@ def build_draw_list(
     site_groups: Sequence[int] = (),
     *,
     sky: bool = False,
-    plane_cells: int = MAX_PLANE_CELLS,
+    coarse: bool = False,
 ) -> DrawList:
     """Collect the geoms and sites of some groups, with sharp mesh edges as MuJoCo's renderer.
 
@@ -101,13 +101,15 @@ def build_draw_list(
         groups: geom groups to draw.
         site_groups: site groups to draw.
         sky: whether to draw the model's skybox, if it has one.
-        plane_cells: maximum number of cells per side of a plane; light is computed at their corners.
+        coarse: whether to divide planes and boxes, at whose corners light is computed, only as far as LIBERO's scenes
+            show it, and to draw the lower id where two geoms coincide; MuJoCo draws the higher one.
     """
     visual = np.flatnonzero(np.isin(model.geom_group, groups))
     moves = model.body_weldid[model.geom_bodyid[visual]] != 0
     layers, layer_of = layers_of(model, sky=sky)
-    ids = [*visual[~moves].tolist(), *visual[moves].tolist()]
-    parts = [(geom, *part) for geom in ids for part in _textured(model, geom, meshes, layer_of, plane_cells)]
+    order = 1 if coarse else -1  # the first of equally near triangles is kept
+    ids = [*visual[~moves][::order].tolist(), *visual[moves][::order].tolist()]
+    parts = [(geom, *part) for geom in ids for part in _textured(model, geom, meshes, layer_of, coarse)]
     rows = np.array([geom for geom, _, _ in parts], dtype=np.int64)
     materials = [(*_material(model, int(model.geom_matid[geom])), layer) for geom, layer, _ in parts]
     sites = np.flatnonzero(np.isin(model.site_group, site_groups))
@@ -157,7 +159,7 @@ def _textured(
     geom: int,
     meshes: Mapping[str, Triangles] | None,
     layer_of: dict[int, tuple[int, ...]],
-    plane_cells: int,
+    coarse: bool,
 ) -> Iterator[tuple[int, Triangles]]:
     """Yield texture layers of a geom and their triangles with texture coordinates."""
     material = int(model.geom_matid[geom])
@@ -165,9 +167,10 @@ def _textured(
     layers = layer_of.get(texture, (0,))
     kind, mesh = int(model.geom_type[geom]), int(model.geom_dataid[geom])
     is_mesh = kind == mujoco.mjtGeom.mjGEOM_MESH.value
-    # MuJoCo computes light at vertices and subdivides boxes, which is visible with textures and spots only.
-    fine = kind == mujoco.mjtGeom.mjGEOM_BOX.value and (texture in layer_of or _has_spots(model))
-    shape = box_cells(model, geom) if fine else triangles_of(model, geom, meshes, plane_cells)
+    # MuJoCo computes light at vertices and subdivides boxes, which is visible with textures and spots, and where two
+    # boxes coincide.
+    fine = kind == mujoco.mjtGeom.mjGEOM_BOX.value and (not coarse or texture in layer_of or _has_spots(model))
+    shape = box_cells(model, geom) if fine else triangles_of(model, geom, meshes, coarse=coarse)
     mapped = is_mesh and (bool(shape[2].any()) or model.mesh_texcoordadr[mesh] >= 0)
     if is_mesh and len(shape[3]) > MAX_PIECE_TRIANGLES and model.mesh(mesh).name not in (meshes or {}):
         shape = in_pieces(shape, MAX_PIECE_TRIANGLES)

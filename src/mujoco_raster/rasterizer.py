@@ -48,9 +48,10 @@ class Rasterizer:
         model: model with lights and clipping planes.
         draw_list: triangles to draw.
         width, height: size of the frames, pixels.
+        averaged: number of pixels that are averaged to one; textures are as coarse as for that one, as in OpenGL.
     """
 
-    def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int) -> None:
+    def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int, averaged: int = 1) -> None:
         self._list, self._width, self._height = draw_list, width, height
         self._scene_lights = SceneLights(model)
         self._table = table_of(draw_list)
@@ -62,6 +63,7 @@ class Rasterizer:
             vertices["row"].astype(np.int32),
             levels_of(draw_list.layers),
             LAYER_SIZE,
+            float(averaged * LAYER_SIZE**2),
         )
         self._rows = np.arange(draw_list.objects, dtype=np.int32)
         self._sky = draw_list.objects + np.arange(draw_list.sky, dtype=np.int32)

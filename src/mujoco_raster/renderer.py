@@ -165,7 +165,7 @@ class Renderer:
     def _make_rasterizer(self, groups: Groups) -> Rasterizer:
         factor = 2 if self._samples == 4 else 1
         draw_list = build_draw_list(self._model, groups=groups[0], site_groups=groups[1], sky=True)
-        return Rasterizer(self._model, draw_list, factor * self._width, factor * self._height)
+        return Rasterizer(self._model, draw_list, factor * self._width, factor * self._height, self._samples)
 
     # --- images ---------------------------------------------------------------------------------------------
 

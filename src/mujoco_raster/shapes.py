@@ -16,18 +16,15 @@ MIN_NORMAL_COSINE = 0.8
 """Smallest cosine between vertex and face normal of a smooth corner; otherwise MuJoCo uses the face normal."""
 INFINITE_PLANE_FACTOR = 1.05
 """Half side of an infinite plane, in units of the far clipping distance."""
-MAX_PLANE_CELLS = 200
-"""Maximum number of cells per side of a plane in MuJoCo's renderer."""
+MAX_PLANE_CELLS, COARSE_PLANE_CELLS = 200, 40
+"""Maximum number of cells per side of a plane, as in MuJoCo's renderer, and of a coarse one."""
 
 Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
 """Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
 
 
 def triangles_of(
-    model: mujoco.MjModel,
-    geom: int,
-    meshes: Mapping[str, Triangles] | None = None,
-    plane_cells: int = MAX_PLANE_CELLS,
+    model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangles] | None = None, *, coarse: bool = False
 ) -> Triangles:
     """Return a geom's triangles in its own frame.
 
@@ -35,7 +32,7 @@ def triangles_of(
         model: compiled scene.
         geom: id of the geom.
         meshes: replacements of the model's meshes by name.
-        plane_cells: maximum number of cells per side of a plane.
+        coarse: whether a plane has at most `COARSE_PLANE_CELLS` cells per side.
     """
     size = np.asarray(model.geom_size[geom])
     match mujoco.mjtGeom(int(model.geom_type[geom])):
@@ -44,7 +41,8 @@ def triangles_of(
         case mujoco.mjtGeom.mjGEOM_HFIELD:
             return _height_field(model, int(model.geom_dataid[geom]))
         case mujoco.mjtGeom.mjGEOM_PLANE:
-            return _plane(size, INFINITE_PLANE_FACTOR * float(model.vis.map.zfar * model.stat.extent), plane_cells)
+            endless = INFINITE_PLANE_FACTOR * float(model.vis.map.zfar * model.stat.extent)
+            return _plane(size, endless, COARSE_PLANE_CELLS if coarse else MAX_PLANE_CELLS)
         case kind:
             return primitive(int(kind), size)
 

@@ -57,13 +57,14 @@ def texture_of(model: mujoco.MjModel, material: int) -> int:
 def pixels_of(model: mujoco.MjModel, texture: int) -> NDArray[np.uint8]:
     """Return the image (height, width, 3) of a texture; an alpha channel is left out, and grey repeated.
 
-    MuJoCo's renderer converts a file that is marked as sRGB to linear values, which are darker, and no other file.
+    MuJoCo's renderer converts flat textures that are marked as sRGB to linear values, which are darker, and no others.
     """
     shape = int(model.tex_height[texture]), int(model.tex_width[texture]), int(model.tex_nchannel[texture])
     start = int(model.tex_adr[texture])
     pixels: NDArray[np.uint8] = np.asarray(model.tex_data[start : start + math.prod(shape)]).reshape(shape)
     pixels = pixels[..., :3] if shape[2] >= 3 else pixels[..., [0, 0, 0]]
-    if model.tex_colorspace[texture] != mujoco.mjtColorSpace.mjCOLORSPACE_SRGB.value:
+    flat = model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D
+    if not flat or model.tex_colorspace[texture] != mujoco.mjtColorSpace.mjCOLORSPACE_SRGB.value:
         return pixels
     value = np.arange(256) / 255
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

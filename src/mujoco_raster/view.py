@@ -152,7 +152,7 @@ class SceneLights:
     def __init__(self, model: mujoco.MjModel) -> None:
         self._ids = ids = active_lights(model)
         head, count = model.vis.headlight, 1 + len(ids)
-        on = float(head.active)
+        on = float(head.active != 0)  # 2 is the default of MuJoCo 4
         self.lights = Lights(
             to=np.zeros((count, 3), np.float32),
             placed=np.concatenate([[False], model.light_type[ids] != _PARALLEL]),

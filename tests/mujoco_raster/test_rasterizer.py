@@ -60,7 +60,8 @@ def test_draw_list_has_outward_faces() -> None:
     draw_list = build_draw_list(spec.compile(), groups=(1,))
     assert len(draw_list.geoms) == len(kinds)
     faces = draw_list.triangles
-    for row, (_, expected) in enumerate(kinds.values()):
+    for row, geom in enumerate(draw_list.geoms):
+        _, expected = list(kinds.values())[geom]
         mine = faces[draw_list.vertices["row"][faces[:, 0]] == row]
         a, b, c = (draw_list.vertices["position"][mine[:, k]].astype(float) for k in range(3))
         assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(expected, rel=0.03)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mujoco_raster import RasterError, Renderer
+from mujoco_raster.textures import pixels_of
 
 GEOM, SITE = mujoco.mjtObj.mjOBJ_GEOM.value, mujoco.mjtObj.mjOBJ_SITE.value
 
@@ -132,6 +133,45 @@ def test_groups_sites_and_transparent_geoms() -> None:
     assert seen() == default
 
 
+def test_of_coincident_geoms_the_last_is_seen() -> None:
+    """As in MuJoCo; models often have a visual geom in the place of a geom for contacts."""
+    box = '<geom type="box" size=".3 .2 .1" euler="10 20 30" material="{}"/>'
+    model, data = scene(
+        f"{box.format('plain')}{box.format('marked')}<body><freejoint/>{box.format('marked')}{box.format('plain')}</body>",
+        '<texture name="t" type="cube" builtin="checker" rgb1="1 0 0" rgb2="0 1 0" width="8" height="48"/>'
+        '<material name="marked" texture="t"/><material name="plain"/>',
+    )
+    _, _, ids, _ = images(model, data)
+    assert set(np.unique(ids)) == {-1, 1}  # fixed geoms before moving ones, of which MuJoCo would draw 3
+    model, data = scene(
+        f"<body><freejoint/>{box.format('plain')}{box.format('plain')}</body>", '<material name="plain"/>'
+    )
+    _, _, ids, _ = images(model, data)
+    assert set(np.unique(ids)) == {-1, 1}
+
+
+def test_channels_and_colour_spaces_of_textures() -> None:
+    """Alpha is left out, grey is repeated, and only flat textures are converted from sRGB, as in MuJoCo."""
+    spec = mujoco.MjSpec()
+    linear, srgb = mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR, mujoco.mjtColorSpace.mjCOLORSPACE_SRGB
+    flat, cube = mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtTexture.mjTEXTURE_CUBE
+    expected = []
+    for kind, space, pixel, colour in (
+        (flat, linear, [10, 20, 30, 128], [10, 20, 30]),
+        (flat, linear, [77], [77, 77, 77]),
+        (flat, srgb, [255, 128, 0], [255, 55, 0]),  # ((128 / 255 + 0.055) / 1.055) ** 2.4 = 0.2158
+        (cube, srgb, [255, 128, 0], [255, 128, 0]),
+    ):
+        texture = spec.add_texture(name=str(len(expected)), type=kind, colorspace=space, nchannel=len(pixel))
+        texture.width = texture.height = 2
+        texture.data = bytes(pixel * 4)
+        expected.append(colour)
+    spec.worldbody.add_geom(size=[0.1, 0.1, 0.1])
+    model = spec.compile()
+    for number, colour in enumerate(expected):
+        np.testing.assert_array_equal(pixels_of(model, number), np.tile(np.array(colour, np.uint8), (2, 2, 1)))
+
+
 def test_render_returns_the_scene_of_the_update() -> None:
     """Later steps change it at the next update only; ``out`` is filled; modes can be changed between images."""
     model, data = scene('<body><joint type="slide" axis="1 0 0"/><geom size=".2" rgba="1 1 1 1"/></body>')
@@ -178,6 +218,18 @@ def test_sky_is_behind_everything_and_in_its_direction() -> None:
     above, *_ = images(model, data, "up")
     assert (above[..., 2] > above[..., 1]).all()
     assert (images(model, data, size=50)[0].max((0, 1)) > 0).all()
+
+
+def test_headlight_is_on_or_off() -> None:
+    """MuJoCo 4 marks a headlight that a model does not set with 2."""
+    model, data = scene('<geom size=".3" rgba="1 1 1 1"/>')
+    seen = {}
+    for active in (0, 1, 2):
+        model.vis.headlight.active = active
+        seen[active] = images(model, data)[0]
+    assert not seen[0].any()
+    assert 100 < seen[1].max() < 255
+    np.testing.assert_array_equal(seen[1], seen[2])
 
 
 def test_free_camera_and_intrinsics() -> None:

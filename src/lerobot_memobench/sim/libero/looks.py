@@ -35,8 +35,6 @@ MAX_THINNED_SIZE = 0.5
 """Largest size of simplified meshes, m; larger ones are static and drawn once per scene."""
 MIN_NORMAL_COSINE = 0.96
 """Smallest cosine between vertex and face normal of a smooth corner of a simplified mesh."""
-PLANE_CELLS = 40
-"""Maximum number of cells per side of a plane, with which all published frames were drawn."""
 PLACEHOLDER_POINTS = np.array([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], dtype=np.float64)
 PLACEHOLDER_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """Box placeholder of a mesh; the compiler does not change its frame."""
@@ -73,7 +71,7 @@ def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
     model = spec.compile()
     _set_frames(model, meshes)
     shapes = {name: _shape(arrays) for name, arrays in meshes.items()}
-    return model, build_draw_list(model, shapes, (VISUAL_GROUP,), plane_cells=PLANE_CELLS)
+    return model, build_draw_list(model, shapes, (VISUAL_GROUP,), coarse=True)
 
 
 # --- cache files ---
