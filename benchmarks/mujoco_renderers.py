@@ -137,7 +137,7 @@ def main() -> None:
     if len(given.backends) == 1 and os.environ.get("MUJOCO_GL") == given.backends[0]:
         compare(given.backends[0], given.models, given.frames, given.sheet)
         return
-    print("| model | size | backend | MuJoCo, ms | 1 sample, ms | 4 samples, ms | ratio | ratio | error | error |")
+    print("| model | size | backend | MuJoCo, ms | 1 sample, ms | 4 samples, ms | ratio, 1 | 4 | difference, 1 | 4 |")
     print("|---|---|---|---|---|---|---|---|---|---|", flush=True)
     for backend in given.backends:
         command = [sys.executable, "-W", "ignore", __file__, "--backends", backend, "--frames", str(given.frames)]

@@ -11,11 +11,13 @@ import copy
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoco_raster.compiled import compiled
 from mujoco_raster.drawlist import DrawList, Floats, Image, Mirror
 from mujoco_raster.errors import RasterError
 from mujoco_raster.geometry import Integers, Shapes, Target, clip_space, draw_triangles
@@ -265,7 +267,7 @@ class View:
         of = self._of = rasterizer
         self.camera = camera
         self.matrix = camera_matrix(model, camera)
-        self.eye: NDArray[np.floating] = camera.eye.astype(np.float32)
+        self.eye: NDArray[np.floating] = camera.position.astype(np.float32)
         self.target = of._target
         self._near, self.far = (np.float32(distance) for distance in clipping(model))
         self._lights: Lights = of._scene_lights.update(data, camera)
@@ -304,8 +306,19 @@ class View:
 def mean_of_four(image: Image) -> Image:
     """Return an image of half the height and width, whose pixels are the rounded means of four."""
     height, width, channels = image.shape
-    total = image.reshape(height // 2, 2, width // 2, 2, channels).sum(axis=(1, 3), dtype=np.uint16)
-    return ((total + 2) // 4).astype(np.uint8)
+    means = np.empty((height // 2, width // 2, channels), np.uint8)
+    _average(image, means)
+    return means
+
+
+@compiled
+def _average(image: Any, means: Any) -> None:
+    for y in range(means.shape[0]):
+        for x in range(means.shape[1]):
+            for c in range(3):
+                above = np.int32(image[2 * y, 2 * x, c]) + np.int32(image[2 * y, 2 * x + 1, c])
+                below = np.int32(image[2 * y + 1, 2 * x, c]) + np.int32(image[2 * y + 1, 2 * x + 1, c])
+                means[y, x, c] = (above + below + np.int32(2)) // np.int32(4)
 
 
 def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:

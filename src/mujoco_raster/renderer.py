@@ -34,7 +34,7 @@ class Renderer:
     Args:
         model: compiled model; what it contains and is not drawn is named in one warning, see `not_drawn`.
         height, width: size of the images, pixels; the model's offscreen buffer does not limit it.
-        samples: samples per pixel, 1 or 4. MuJoCo's default is 4; 4 take about four times as long as 1.
+        samples: samples per pixel, 1 or 4. MuJoCo's default is 4.
 
     Raises:
         RasterError: the size or the number of samples is not possible.
@@ -144,8 +144,6 @@ class Renderer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # --- scene ----------------------------------------------------------------------------------------------
-
     def _camera(self, data: mujoco.MjData, camera: int | str | mujoco.MjvCamera) -> Camera:
         """Return a camera in the state of ``data``, computed by MuJoCo."""
         model = self._model
@@ -166,8 +164,6 @@ class Renderer:
         factor = 2 if self._samples == 4 else 1
         draw_list = build_draw_list(self._model, groups=groups[0], site_groups=groups[1], sky=True)
         return Rasterizer(self._model, draw_list, factor * self._width, factor * self._height, self._samples)
-
-    # --- images ---------------------------------------------------------------------------------------------
 
     def _colours(self, view: View) -> Image:
         image = self._rasterizer.draw_view(view)

@@ -24,13 +24,13 @@ def clipping(model: mujoco.MjModel) -> tuple[float, float]:
 class Camera(NamedTuple):
     """Pose and field of view of a camera in one state.
 
-    ``eye``: position (3,), m; ``frame``: rotation (3, 3), whose columns are the image's right, its top, and the
+    ``position``: (3,), m; ``frame``: rotation (3, 3), whose columns are the image's right, its top, and the
     direction towards the viewer; ``scale``: 1 / tan of half the horizontal and half the vertical field of view;
     ``shift``: offset of the image's centre from the optical axis, in half widths and half heights; ``still``: whether
     the camera is fixed to the world.
     """
 
-    eye: NDArray[np.floating]
+    position: NDArray[np.floating]
     frame: NDArray[np.floating]
     scale: tuple[float, float]
     shift: tuple[float, float]
@@ -77,7 +77,7 @@ def camera_matrix(model: mujoco.MjModel, camera: Camera) -> Floats:
     """
     near, far = clipping(model)
     frame = camera.frame
-    view = np.concatenate([frame.T, -(frame.T @ camera.eye)[:, None]], axis=1)
+    view = np.concatenate([frame.T, -(frame.T @ camera.position)[:, None]], axis=1)
     matrix = np.empty((4, 4), dtype=np.float32)
     matrix[0] = camera.scale[0] * view[0] + camera.shift[0] * view[2]
     matrix[1] = -camera.scale[1] * view[1] - camera.shift[1] * view[2]
