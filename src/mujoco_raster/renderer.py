@@ -28,7 +28,7 @@ Groups = tuple[tuple[int, ...], tuple[int, ...]]
 class Renderer:
     """Draw a model on the CPU without OpenGL; equal inputs give equal bits on every x86-64 processor.
 
-    Poses, colours and alpha of geoms and sites are read at each `update_scene`. Meshes, textures, materials and the
+    Poses, colours and alpha of geoms and sites are read at each `update_scene`. Shapes, textures, materials and the
     colours of lights are read once: create a new renderer after changing them. A renderer serves one thread at a time.
 
     Args:
@@ -189,11 +189,12 @@ def camera_id(model: mujoco.MjModel, camera: int | str) -> int:
     Raises:
         RasterError: there is no such camera.
     """
-    names = [model.camera(k).name for k in range(model.ncam)]
     if isinstance(camera, str):
-        if camera in names:
-            return names.index(camera)
-        raise RasterError(f"the model has no camera {camera!r}; {_known(camera, [name for name in names if name])}")
+        number = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA.value, camera))
+        if number < 0:
+            names = [name for k in range(model.ncam) if (name := model.camera(k).name)]
+            raise RasterError(f"the model has no camera {camera!r}; {_known(camera, names)}")
+        return number
     if not -1 <= camera < model.ncam:
         raise RasterError(f"the model has {model.ncam} cameras and no camera {camera}; -1 is the free camera")
     return int(camera)
