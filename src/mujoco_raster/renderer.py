@@ -32,8 +32,9 @@ class Renderer:
     colours of lights are read once: create a new renderer after changing them. A renderer serves one thread at a time.
 
     Args:
-        model: compiled model; what it contains and is not drawn is named in one warning, see `not_drawn`.
-        height, width: size of the images, pixels; the model's offscreen buffer does not limit it.
+        model: compiled model; one warning names its objects that are not drawn, see `not_drawn`.
+        height: height of the images, pixels; the model's offscreen buffer does not limit it.
+        width: width of the images, pixels.
         samples: samples per pixel, 1 or 4. MuJoCo's default is 4.
 
     Raises:

@@ -64,9 +64,8 @@ def scene_camera(scene: mujoco.MjvScene, height: int, width: int, still: bool) -
     frame = np.column_stack([np.cross(up, backward), up, backward])
     near, half_height = float(camera.frustum_near), (camera.frustum_top - camera.frustum_bottom) / 2
     half_width = float(camera.frustum_width) or half_height * width / height
-    middle = (camera.frustum_top + camera.frustum_bottom) / 2
     scale = near / half_width, near / half_height
-    shift = camera.frustum_center / half_width, middle / half_height
+    shift = camera.frustum_center / half_width, (camera.frustum_top + camera.frustum_bottom) / 2 / half_height
     return Camera(np.array(camera.pos, np.float64), frame, scale, shift, still)
 
 
