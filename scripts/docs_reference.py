@@ -65,6 +65,7 @@ PUBLIC = {
     "Comparison": ("evaluation.comparison", "Comparison Difference compare"),
     "Datasets": ("datasets.lerobot_format.reading", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
+    "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
     "Errors": ("errors", "MemobenchError"),
     "Constants": ("protocol", ""),
 }
@@ -436,10 +437,9 @@ def python_page() -> str:
     """Return the page of the Python API, which mkdocstrings completes."""
     parts = ["# Python API", "Public modules. All others may change between versions."]
     for heading, (module, names) in PUBLIC.items():
+        module = module if module == "mujoco_raster" else f"lerobot_memobench.{module}"
         parts.append(f"## {heading}")
-        parts += [f"::: lerobot_memobench.{module}.{name}" for name in names.split()] or [
-            f"::: lerobot_memobench.{module}"
-        ]
+        parts += [f"::: {module}.{name}" for name in names.split()] or [f"::: {module}"]
     return "\n\n".join(parts) + "\n"
 
 

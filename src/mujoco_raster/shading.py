@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.compiled import compiled
+from mujoco_raster.compiled import compiled
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int32]
@@ -41,7 +41,8 @@ class Surfaces(NamedTuple):
     """Vertex attributes and textures of a scene.
 
     ``normal``: (N, 3) in the frames of the rows; ``uv``: (N, 2); ``row``: (N,); ``texels``: all levels of all layers,
-    one byte of red, green and blue each per integer; ``side``: side of the first level, a power of two.
+    one byte of red, green and blue each per integer; ``side``: side of the first level, a power of two; ``detail``: its
+    area, times the pixels that are averaged to one.
     """
 
     normal: Floats
@@ -49,6 +50,7 @@ class Surfaces(NamedTuple):
     row: Integers
     texels: Integers
     side: int
+    detail: float
 
 
 class Scratch(NamedTuple):
@@ -139,7 +141,8 @@ def shade(
                     _fill(work.planes, slot, pixel, width, here, count, textured, work.ramp, t, i)
                     if textured:
                         _choose_levels(
-                            work.planes, slot, pixel, width, here, count, layer * size, side, work.ramp, t, i
+                            *(work.planes, slot, pixel, width, here, count, layer * size),
+                            *(surfaces.detail, work.ramp, t, i),
                         )
                     done += here
                     count += here
@@ -352,7 +355,7 @@ def _fill(
 
 @compiled
 def _choose_levels(
-    planes: Any, slot: Any, pixel: Any, width: Any, length: Any, count: Any, offset: Any, side: Any, ramp: Any,
+    planes: Any, slot: Any, pixel: Any, width: Any, length: Any, count: Any, offset: Any, detail: Any, ramp: Any,
     t: Any, i: Any,
 ) -> None:  # fmt: skip
     """Choose mipmap levels from the number of texels per pixel at both ends of a run."""
@@ -367,7 +370,7 @@ def _choose_levels(
         u, v = (a * x + b * y + c) * distance, (p * x + q * y + r) * distance
         u_across, u_down, v_across, v_down = a - u * e, b - u * f, p - v * e, q - v * f
         covered = max(u_across * u_across + v_across * v_across, u_down * u_down + v_down * v_down)
-        level = 0.5 * _rough_log2(max(covered * (distance * distance) * (side * side), 1e-12))
+        level = 0.5 * _rough_log2(max(covered * (distance * distance) * detail, 1e-12))
         if end == 0:
             first = level
         else:

@@ -1,4 +1,4 @@
-"""Draw prompt highlights as translucent discs, appended to the rows of a scene."""
+"""Draw highlights: translucent discs that mark positions, appended to the rows of a draw list."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.raster.drawlist import TABLE_LINES, VERTEX, DrawList, Floats
-from lerobot_memobench.sim.raster.shapes import disc
+from mujoco_raster.drawlist import TABLE_LINES, VERTEX, DrawList, Floats
+from mujoco_raster.errors import RasterError
+from mujoco_raster.shapes import disc
 
 HIGHLIGHTS = 16
 """Maximum number of highlights in a frame."""
@@ -33,7 +33,7 @@ def with_discs(draw_list: DrawList) -> tuple[NDArray[np.void], NDArray[np.int32]
     positions, normals, uv, triangles = disc()
     discs = np.zeros((HIGHLIGHTS, len(positions)), dtype=VERTEX)
     discs["position"], discs["normal"], discs["uv"] = positions, normals, uv
-    discs["row"] = len(draw_list.geoms) + np.arange(HIGHLIGHTS)[:, None]
+    discs["row"] = len(draw_list.materials) + np.arange(HIGHLIGHTS)[:, None]
     starts = len(draw_list.vertices) + len(positions) * np.arange(HIGHLIGHTS)[:, None, None]
     vertices = np.concatenate([draw_list.vertices, discs.ravel()])
     return vertices, np.concatenate([draw_list.triangles, (triangles + starts).reshape(-1, 3)]).astype(np.int32)
@@ -41,7 +41,7 @@ def with_discs(draw_list: DrawList) -> tuple[NDArray[np.void], NDArray[np.int32]
 
 def table_of(draw_list: DrawList) -> Floats:
     """Return a table (rows, TABLE_LINES, 4) for the rows of a list and of highlights."""
-    return np.zeros((len(draw_list.geoms) + HIGHLIGHTS, TABLE_LINES, 4), dtype=np.float32)
+    return np.zeros((len(draw_list.materials) + HIGHLIGHTS, TABLE_LINES, 4), dtype=np.float32)
 
 
 def fill_table(
@@ -54,11 +54,11 @@ def fill_table(
     """Write the present state of a list's rows and the highlights into a table.
 
     Raises:
-        MemobenchError: there are more than `HIGHLIGHTS` highlights.
+        RasterError: there are more than `HIGHLIGHTS` highlights.
     """
     if len(highlights) > HIGHLIGHTS:
-        raise MemobenchError(f"there are {len(highlights)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
-    rows = len(draw_list.geoms)
+        raise RasterError(f"there are {len(highlights)} highlights in a frame; at most {HIGHLIGHTS} can be drawn")
+    rows = len(draw_list.materials)
     draw_list.fill(table[:rows], model, data)
     for row, mark in zip(table[rows:], highlights, strict=False):
         row[:3] = np.diag([mark.radius, mark.radius, DISC_HALF_HEIGHT]) @ np.eye(3, 4)

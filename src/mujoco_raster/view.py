@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.drawlist import Floats
+from mujoco_raster.drawlist import Floats
+from mujoco_raster.errors import RasterError
 
 # --- cameras ---
 
@@ -20,23 +21,65 @@ def clipping(model: mujoco.MjModel) -> tuple[float, float]:
     return near, far
 
 
-def camera_matrix(model: mujoco.MjModel, data: mujoco.MjData, camera: int, height: int, width: int) -> Floats:
-    """Return the matrix (4, 4) from the world to a camera's clip space, upside down.
+class Camera(NamedTuple):
+    """Pose and field of view of a camera in one state.
 
-    The first row of the image is therefore the top one; the orientation of faces is reversed.
+    ``position``: (3,), m; ``frame``: rotation (3, 3), whose columns are the image's right, its top, and the
+    direction towards the viewer; ``scale``: 1 / tan of half the horizontal and half the vertical field of view;
+    ``shift``: offset of the image's centre from the optical axis, in half widths and half heights; ``still``: whether
+    the camera is fixed to the world.
+    """
+
+    position: NDArray[np.floating]
+    frame: NDArray[np.floating]
+    scale: tuple[float, float]
+    shift: tuple[float, float]
+    still: bool
+
+
+def model_camera(model: mujoco.MjModel, data: mujoco.MjData, camera: int, height: int, width: int) -> Camera:
+    """Return a camera of a model, from its vertical field of view.
 
     Args:
         model, data: state to draw.
         camera: id of the camera.
         height, width: size of a frame, pixels.
     """
-    eye, frame = data.cam_xpos[camera], data.cam_xmat[camera].reshape(3, 3)
-    near, far = clipping(model)
     slope = 1.0 / math.tan(math.radians(float(model.cam_fovy[camera])) / 2)
-    view = np.concatenate([frame.T, -(frame.T @ eye)[:, None]], axis=1)
+    still = bool(model.body_weldid[model.cam_bodyid[camera]] == 0)
+    frame = data.cam_xmat[camera].reshape(3, 3)
+    return Camera(data.cam_xpos[camera], frame, (slope * height / width, slope), (0.0, 0.0), still)
+
+
+def scene_camera(scene: mujoco.MjvScene, height: int, width: int, still: bool) -> Camera:
+    """Return the camera of an abstract scene after `mujoco.mjv_updateCamera`, at single precision as in OpenGL.
+
+    Raises:
+        RasterError: the camera is orthographic.
+    """
+    camera = mujoco.mjv_averageCamera(*scene.camera[:2])
+    if camera.orthographic:
+        raise RasterError("the camera is orthographic, which is not drawn; use a perspective camera")
+    backward, up = -np.array(camera.forward, np.float64), np.array(camera.up, np.float64)
+    frame = np.column_stack([np.cross(up, backward), up, backward])
+    near, half_height = float(camera.frustum_near), (camera.frustum_top - camera.frustum_bottom) / 2
+    half_width = float(camera.frustum_width) or half_height * width / height
+    scale = near / half_width, near / half_height
+    shift = camera.frustum_center / half_width, (camera.frustum_top + camera.frustum_bottom) / 2 / half_height
+    return Camera(np.array(camera.pos, np.float64), frame, scale, shift, still)
+
+
+def camera_matrix(model: mujoco.MjModel, camera: Camera) -> Floats:
+    """Return the matrix (4, 4) from the world to a camera's clip space, upside down.
+
+    The first row of the image is therefore the top one; the orientation of faces is reversed.
+    """
+    near, far = clipping(model)
+    frame = camera.frame
+    view = np.concatenate([frame.T, -(frame.T @ camera.position)[:, None]], axis=1)
     matrix = np.empty((4, 4), dtype=np.float32)
-    matrix[0] = slope * height / width * view[0]
-    matrix[1] = -slope * view[1]
+    matrix[0] = camera.scale[0] * view[0] + camera.shift[0] * view[2]
+    matrix[1] = -camera.scale[1] * view[1] - camera.shift[1] * view[2]
     matrix[2] = (far + near) / (near - far) * view[2]
     matrix[2, 3] += 2 * far * near / (near - far)
     matrix[3] = -view[2]
@@ -108,7 +151,7 @@ class SceneLights:
     def __init__(self, model: mujoco.MjModel) -> None:
         self._ids = ids = active_lights(model)
         head, count = model.vis.headlight, 1 + len(ids)
-        on = float(head.active)
+        on = float(head.active != 0)  # 2 is the default of MuJoCo 4
         self.lights = Lights(
             to=np.zeros((count, 3), np.float32),
             placed=np.concatenate([[False], model.light_type[ids] != _PARALLEL]),
@@ -123,11 +166,11 @@ class SceneLights:
         self.lights.cone[1:, 0] = np.where(cutoff >= 180.0, -1.0, np.cos(np.radians(cutoff)))
         self.lights.cone[1:, 1] = model.light_exponent[ids]
 
-    def update(self, data: mujoco.MjData, camera: int) -> Lights:
+    def update(self, data: mujoco.MjData, camera: Camera) -> Lights:
         """Return the lights of a state, with the headlight at a camera; overwritten by the next call."""
         lights = self.lights
         axis = data.light_xdir[self._ids]
-        lights.to[0] = data.cam_xmat[camera].reshape(3, 3)[:, 2]
+        lights.to[0] = camera.frame[:, 2]
         lights.axis[1:] = axis
         lights.to[1:] = np.where(lights.placed[1:, None], data.light_xpos[self._ids], -axis)
         return lights

@@ -1,4 +1,4 @@
-"""Triangulate MuJoCo's geoms in their own frames: meshes, planes, boxes, cylinders, spheres, capsules."""
+"""Triangulate MuJoCo's geoms in their own frames: primitives, meshes and height fields."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
+from mujoco_raster.errors import RasterError
 
 ROUND_SIDES = 32
 """Sides of cylinders and spheres."""
@@ -16,33 +16,50 @@ MIN_NORMAL_COSINE = 0.8
 """Smallest cosine between vertex and face normal of a smooth corner; otherwise MuJoCo uses the face normal."""
 INFINITE_PLANE_FACTOR = 1.05
 """Half side of an infinite plane, in units of the far clipping distance."""
-MAX_PLANE_CELLS = 40
-"""Maximum number of cells per side of a plane."""
+MAX_PLANE_CELLS, COARSE_PLANE_CELLS = 200, 40
+"""Maximum number of cells per side of a plane, as in MuJoCo's renderer, and of a coarse one."""
 
 Triangles = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating], NDArray[np.integer]]
 """Positions (N, 3), normals (N, 3), texture coordinates (N, 2), triangles (M, 3)."""
 
 
-def triangles_of(model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangles] | None = None) -> Triangles:
+def triangles_of(
+    model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangles] | None = None, *, coarse: bool = False
+) -> Triangles:
     """Return a geom's triangles in its own frame.
 
     Args:
         model: compiled scene.
         geom: id of the geom.
         meshes: replacements of the model's meshes by name.
+        coarse: whether a plane has at most `COARSE_PLANE_CELLS` cells per side.
+    """
+    size = np.asarray(model.geom_size[geom])
+    match mujoco.mjtGeom(int(model.geom_type[geom])):
+        case mujoco.mjtGeom.mjGEOM_MESH | mujoco.mjtGeom.mjGEOM_SDF:
+            return _named_mesh(model, int(model.geom_dataid[geom]), meshes or {})
+        case mujoco.mjtGeom.mjGEOM_HFIELD:
+            return _height_field(model, int(model.geom_dataid[geom]))
+        case mujoco.mjtGeom.mjGEOM_PLANE:
+            endless = INFINITE_PLANE_FACTOR * float(model.vis.map.zfar * model.stat.extent)
+            return _plane(size, endless, COARSE_PLANE_CELLS if coarse else MAX_PLANE_CELLS)
+        case kind:
+            return primitive(int(kind), size)
+
+
+def primitive(kind: int, size: NDArray[np.floating]) -> Triangles:
+    """Return a box, cylinder, sphere, ellipsoid or capsule in its own frame.
+
+    Args:
+        kind: `mujoco.mjtGeom` value.
+        size: MuJoCo's sizes (3,), m.
 
     Raises:
-        MemobenchError: the geom's type is not supported.
+        RasterError: the type has no such shape.
     """
-    kind = mujoco.mjtGeom(int(model.geom_type[geom]))
-    size = np.asarray(model.geom_size[geom])
-    match kind:
-        case mujoco.mjtGeom.mjGEOM_MESH:
-            return _named_mesh(model, int(model.geom_dataid[geom]), meshes or {})
+    match mujoco.mjtGeom(kind):
         case mujoco.mjtGeom.mjGEOM_BOX:
             return _box(size)
-        case mujoco.mjtGeom.mjGEOM_PLANE:
-            return _plane(size, INFINITE_PLANE_FACTOR * float(model.vis.map.zfar * model.stat.extent))
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
             return _revolve([(0, 1), (1, 1), (1, 1), (1, -1), (1, -1), (0, -1)], [2, 2, 0, 0, -2, -2], size[[0, 0, 1]])
         case mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -51,10 +68,42 @@ def triangles_of(model: mujoco.MjModel, geom: int, meshes: Mapping[str, Triangle
             return _ellipsoid(size)
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
             return _capsule(float(size[0]), float(size[1]))
-    raise MemobenchError(
-        f"geom {model.geom(geom).name!r} has the type {kind.name.removeprefix('mjGEOM_').lower()}, which is not drawn; "
-        "use planes, boxes, cylinders, spheres, ellipsoids, capsules and meshes for visual geoms"
+    raise RasterError(
+        f"the geom type {mujoco.mjtGeom(kind).name} is not drawn; use a primitive, a mesh or a height field"
     )
+
+
+def _height_field(model: mujoco.MjModel, field: int) -> Triangles:
+    """Return a height field's surface with smooth normals, on a box that reaches below it."""
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    half_x, half_y, top, bottom = (float(length) for length in model.hfield_size[field])
+    start = int(model.hfield_adr[field])
+    heights = np.asarray(model.hfield_data[start : start + rows * columns], np.float64).reshape(rows, columns) * top
+    x, y = np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows)
+    along_y, along_x = np.gradient(heights, y, x)
+    grid = np.stack([*np.meshgrid(x, y), heights], axis=2)
+    normals = np.stack([-along_x, -along_y, np.ones_like(heights)], axis=2)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    uv = np.stack(np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows)), axis=2)
+    first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    faces = [np.column_stack([first, first + 1, first + columns + 1])]
+    faces += [np.column_stack([first, first + columns + 1, first + columns])]
+    surface = grid.reshape(-1, 3), normals.reshape(-1, 3), uv.reshape(-1, 2), np.concatenate(faces)
+    borders = grid[0], grid[:, -1], grid[-1, ::-1], grid[::-1, 0]
+    return _joined([surface, *(_wall(border, -bottom) for border in borders)])
+
+
+def _wall(border: NDArray[np.float64], bottom: float) -> Triangles:
+    """Return the vertical side below a border (N, 3), which runs to the right as seen from outside."""
+    lower = border.copy()
+    lower[:, 2] = bottom
+    along = border[-1] - border[0]
+    normal = np.array([along[1], -along[0], 0.0]) / max(float(np.hypot(along[0], along[1])), 1e-12)
+    k = np.arange(len(border) - 1)
+    low = k + len(border)
+    faces = np.concatenate([np.column_stack([low, low + 1, k + 1]), np.column_stack([low, k + 1, k])])
+    count = 2 * len(border)
+    return np.concatenate([border, lower]), np.tile(normal, (count, 1)), np.zeros((count, 2)), faces
 
 
 def _named_mesh(model: mujoco.MjModel, mesh: int, meshes: Mapping[str, Triangles]) -> Triangles:
@@ -183,12 +232,12 @@ def box_cells(model: mujoco.MjModel, geom: int) -> Triangles:
     return _joined(sides)
 
 
-def _plane(size: NDArray[np.floating], endless: float) -> Triangles:
+def _plane(size: NDArray[np.floating], endless: float, most: int) -> Triangles:
     """Return a subdivided plane from half sides and cell size; a half side of 0 is infinite."""
     x, y = np.where(size[:2] > 0, size[:2], endless)
     corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)])
     cells = int(np.ceil(max(x, y) / max(float(size[2]), 1e-9))) + 1
-    return _cells(corners, np.array([0.0, 0.0, 1.0]), min(cells, MAX_PLANE_CELLS))
+    return _cells(corners, np.array([0.0, 0.0, 1.0]), min(cells, most))
 
 
 def _cells(corners: NDArray[np.floating], normal: NDArray[np.floating], cells: int) -> Triangles:

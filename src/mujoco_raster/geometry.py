@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.compiled import compiled
+from mujoco_raster.compiled import compiled
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int32]

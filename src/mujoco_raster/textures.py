@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,8 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.raster.compiled import compiled
-from lerobot_memobench.sim.raster.shapes import Triangles
+from mujoco_raster.compiled import compiled
+from mujoco_raster.shapes import Triangles
 
 LAYER_SIZE = 512
 """Side of a texture layer, pixels; a power of two, the largest size of this package's textures."""
@@ -22,13 +23,13 @@ _DOWN = ((1, -1), (1, -1), (2, 1), (2, -1), (1, -1), (1, -1))
 """Axis and direction of the image on each side of a cube (OpenGL 2.1, table 3.21)."""
 
 
-def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple[int, ...]]]:
+def layers_of(model: mujoco.MjModel, *, sky: bool = False) -> tuple[NDArray[np.uint8], dict[int, tuple[int, ...]]]:
     """Return a model's textures at one size, and texture id → its layer (six for a cube); layer 0 is white."""
     layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
     layer_of: dict[int, tuple[int, ...]] = {}
     known: dict[bytes, int] = {}  # the sides of a cube often share an image
     for texture in range(model.ntex):
-        if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX or model.tex_nchannel[texture] != 3:
+        if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX and not (sky and texture == skybox_of(model)):
             continue
         for picture in _pictures(model, texture, pixels_of(model, texture)):
             content = picture.tobytes()
@@ -39,15 +40,31 @@ def layers_of(model: mujoco.MjModel) -> tuple[NDArray[np.uint8], dict[int, tuple
     return np.stack(layers), layer_of
 
 
-def pixels_of(model: mujoco.MjModel, texture: int) -> NDArray[np.uint8]:
-    """Return the image (height, width, 3) of a texture with three channels.
+def skybox_of(model: mujoco.MjModel) -> int:
+    """Return the texture id of a model's skybox, -1 without one."""
+    return next((k for k in range(model.ntex) if model.tex_type[k] == mujoco.mjtTexture.mjTEXTURE_SKYBOX), -1)
 
-    MuJoCo's renderer converts a file that is marked as sRGB to linear values, which are darker, and no other file.
+
+def texture_of(model: mujoco.MjModel, material: int) -> int:
+    """Return the id of a material's colour texture, -1 for none or without a material."""
+    if material < 0:
+        return -1
+    roles = mujoco.mjtTextureRole.mjTEXROLE_RGB.value, mujoco.mjtTextureRole.mjTEXROLE_RGBA.value
+    rgb, rgba = (int(model.mat_texid[material, role]) for role in roles)
+    return rgb if rgb >= 0 else rgba
+
+
+def pixels_of(model: mujoco.MjModel, texture: int) -> NDArray[np.uint8]:
+    """Return the image (height, width, 3) of a texture; an alpha channel is left out, and grey repeated.
+
+    MuJoCo's renderer converts flat textures that are marked as sRGB to linear values, which are darker, and no others.
     """
-    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+    shape = int(model.tex_height[texture]), int(model.tex_width[texture]), int(model.tex_nchannel[texture])
     start = int(model.tex_adr[texture])
-    pixels = np.asarray(model.tex_data[start : start + 3 * height * width]).reshape(height, width, 3)
-    if model.tex_colorspace[texture] != mujoco.mjtColorSpace.mjCOLORSPACE_SRGB.value:
+    pixels: NDArray[np.uint8] = np.asarray(model.tex_data[start : start + math.prod(shape)]).reshape(shape)
+    pixels = pixels[..., :3] if shape[2] >= 3 else pixels[..., [0, 0, 0]]
+    flat = model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D
+    if not flat or model.tex_colorspace[texture] != mujoco.mjtColorSpace.mjCOLORSPACE_SRGB.value:
         return pixels
     value = np.arange(256) / 255
     linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
@@ -152,3 +169,21 @@ def cube_coordinates(model: mujoco.MjModel, geom: int, shape: Triangles) -> Iter
         # Do not wrap at the cube's edges.
         inside = np.clip(np.stack(uv, axis=1), 0.5 / LAYER_SIZE, 1 - 0.5 / LAYER_SIZE)
         yield int(side), (points[mine], normals[mine], inside, index.reshape(-1, 3))
+
+
+def sky_box(side: int) -> Triangles:
+    """Return one side of the sky, a cube of half size 1 seen from inside, in the world's axes.
+
+    MuJoCo's skyboxes have y up: their axes x, y, z are the world's x, z, −y.
+    """
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=np.float64)
+    corners = np.empty((4, 3))
+    corners[:, side // 2] = 1 - 2 * (side % 2)
+    for (axis, sign), coordinate in zip((_ACROSS[side], _DOWN[side]), square.T, strict=True):
+        corners[:, axis] = sign * (2 * coordinate - 1)
+    points = corners[:, [0, 2, 1]] * [1, -1, 1]
+    outward = np.cross(points[1] - points[0], points[2] - points[0]) @ points[0] > 0
+    triangles = np.array([(0, 2, 1), (0, 3, 2)] if outward else [(0, 1, 2), (0, 2, 3)])
+    # Do not wrap at the cube's edges.
+    uv = np.clip(square, 0.5 / LAYER_SIZE, 1 - 0.5 / LAYER_SIZE)
+    return points, -points / math.sqrt(3), uv, triangles
