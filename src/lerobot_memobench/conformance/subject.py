@@ -26,7 +26,7 @@ from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.policies.convention import chosen_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import CLOCK
-from lerobot_memobench.run.command_line import PATH, SHORT_FORMS, has_setting, parse_words, policy_config, read_words
+from lerobot_memobench.run.command_line import PATH, SHORT_FORMS, parse_words, policy_config, read_words, setting_kind
 from lerobot_memobench.run.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
@@ -177,7 +177,7 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
     check_device(asked.get("policy.device"))
     if not torch.cuda.is_available():
         asked = asked.default("policy.device", "cpu")
-    if has_setting(asked, "policy.n_action_steps"):
+    if setting_kind(asked, "policy.n_action_steps") is not None:
         asked = asked.default("policy.n_action_steps", REPLAN)
     config: Any = policy_config(asked)
     if config is None:

@@ -195,7 +195,7 @@ def read_words(command: str, words: Mapping[str, str]) -> Asked:
     choices = registries(config)
     config_path = words.get(CONFIG_FILE)
     file = _settings_of_file(config, config_path)
-    found: dict[str, str] = {}
+    found: dict[str, Any] = {}
     for key in choices:  # `policy: act` in a file is `policy=act`
         if isinstance(file.get(key), str):
             file[key] = nested(choice_settings(config, key, file[key]))[key]
@@ -217,20 +217,20 @@ def read_words(command: str, words: Mapping[str, str]) -> Asked:
             raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, names)}")
     for key in [key for key in found if key in short and key not in field_types(config)]:
         # replan= sets the policy's interval and the environment's, for the log; either may not exist.
-        fields = [each for each in short[key] if has_setting(asked, each)]
-        if not fields:
+        kinds = {full: kind for full in short[key] if (kind := setting_kind(asked, full)) is not None}
+        if not kinds:
             raise _without_field(asked, key, short[key][0])
-        found |= dict.fromkeys(fields, found[key])
+        found |= {full: value_of(key, kind, found[key]) for full, kind in kinds.items()}
         del found[key]
     return asked
 
 
-def has_setting(asked: Asked, key: str) -> bool:
-    """Return whether the command has a setting of this full name, with the choices that are made."""
+def setting_kind(asked: Asked, key: str) -> Any:
+    """Return the type of a setting of this full name, None where the choices that are made have none."""
     section, _, name = key.partition(".")
     kind = without_none(field_types(asked.config)[section])
     chosen = chosen_class(kind, section, asked.get(section) or {}) if is_choice_type(kind) else kind
-    return chosen is not None and name in field_types(chosen)
+    return None if chosen is None else field_types(chosen).get(name)
 
 
 def _without_field(asked: Asked, key: str, full: str) -> MemobenchError:
