@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import typing
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import metadata, resources
@@ -135,7 +135,7 @@ def is_of_benchmark(words: Mapping[str, str]) -> bool:
 
 
 @dataclass(frozen=True)
-class Asked:
+class CommandSettings:
     """The settings of one of LeRobot's commands, as a command line and its configuration file ask for them.
 
     Changes return another object.
@@ -163,7 +163,7 @@ class Asked:
             found = found.get(part) if isinstance(found, Mapping) else None
         return found
 
-    def default(self, key: str, value: object) -> Asked:
+    def default(self, key: str, value: object) -> CommandSettings:
         """Return settings with a value, unless one is given."""
         return replace(self, file=merged(nested({key: value}), self.file))
 
@@ -181,7 +181,7 @@ class Asked:
         return None if given is None else build(field_types(self.config)[name], given, name)
 
 
-def read_words(command: str, words: Mapping[str, str]) -> Asked:
+def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
     """Return the settings that the words of ``lerobot eval`` or ``lerobot train`` ask for.
 
     Raises:
@@ -211,7 +211,7 @@ def read_words(command: str, words: Mapping[str, str]) -> Asked:
             del file[key]  # settings of another choice
     if "dataset.repo_id" in found and isinstance(file.get(DATASET), Mapping):
         file[DATASET] = without(file[DATASET], "root", "repo_id")
-    asked, short = Asked(config, found, file, config_path), SHORT_FORMS[command]
+    asked, short = CommandSettings(config, found, file, config_path), SHORT_FORMS[command]
     for key in found:
         if "." not in key and key not in (names := (*field_types(config), *short)):
             raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, names)}")
@@ -225,7 +225,7 @@ def read_words(command: str, words: Mapping[str, str]) -> Asked:
     return asked
 
 
-def setting_kind(asked: Asked, key: str) -> Any:
+def setting_kind(asked: CommandSettings, key: str) -> Any:
     """Return the type of a setting of this full name, None where the choices that are made have none."""
     section, _, name = key.partition(".")
     kind = without_none(field_types(asked.config)[section])
@@ -233,7 +233,7 @@ def setting_kind(asked: Asked, key: str) -> Any:
     return None if chosen is None else field_types(chosen).get(name)
 
 
-def _without_field(asked: Asked, key: str, full: str) -> MemobenchError:
+def _without_field(asked: CommandSettings, key: str, full: str) -> MemobenchError:
     section, _, name = full.partition(".")
     kind = without_none(field_types(asked.config)[section])
     chosen = chosen_class(kind, section, asked.get(section) or {})
@@ -256,10 +256,8 @@ def nested(words: Mapping[str, Any]) -> Settings:
             node = node.setdefault(part, {})
             if not isinstance(node, dict):
                 raise MemobenchError(f"found {key}= and {part}={words.get(part, '')}; give one of them")
-        if isinstance(node.get(last), dict) != isinstance(value, dict) and last in node:
-            raise MemobenchError(
-                f"found {key}={str(value)[:80]}; {key} holds settings, such as {key}.{next(iter(node[last]))}="
-            )
+        if isinstance(node.get(last), dict):
+            raise MemobenchError(f"found {key}={str(value)[:80]} and {key}.{next(iter(node[last]))}=; give one of them")
         node[last] = value
     return found
 
@@ -274,15 +272,6 @@ def merged(*layers: Mapping[str, Any]) -> Settings:
             both = isinstance(value, Mapping) and isinstance(found.get(key), Mapping)
             found[key] = merged(found[key], value) if both else value
     return found
-
-
-def flattened(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the full name and the value of nested settings."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping) and value:
-            yield from flattened(value, f"{before}{name}.")
-        else:
-            yield f"{before}{name}", value
 
 
 # --- values of policy=, env=, dataset= …: a registered type, a checkpoint, a repository, a folder ---
@@ -633,7 +622,7 @@ def registries(config: type) -> dict[str, dict[str, type]]:
 # --- the policy ---
 
 
-def policy_config(asked: Asked) -> PreTrainedConfig | None:
+def policy_config(asked: CommandSettings) -> PreTrainedConfig | None:
     """Return the configuration of the policy, None without one.
 
     Raises:

@@ -41,7 +41,7 @@ from lerobot_memobench.run.command_line import (
     HELP,
     PATH,
     TRAINING_OPTIONS,
-    Asked,
+    CommandSettings,
     read_words,
     resolve_recipe,
     spelled,
@@ -175,7 +175,9 @@ def take_training_options(words: Mapping[str, str]) -> tuple[bool | None, str | 
     return prompts, obs_type, rest
 
 
-def complete_training(asked: Asked, notify: Callable[[str], None] = print) -> tuple[Asked, TrainPipelineConfig]:
+def complete_training(
+    asked: CommandSettings, notify: Callable[[str], None] = print
+) -> tuple[CommandSettings, TrainPipelineConfig]:
     """Check a training's settings and add the benchmark's defaults; return them and the configuration.
 
     Args:
@@ -221,7 +223,7 @@ def complete_training(asked: Asked, notify: Callable[[str], None] = print) -> tu
     return asked, config
 
 
-def build_training(asked: Asked) -> tuple[Asked, TrainPipelineConfig]:
+def build_training(asked: CommandSettings) -> tuple[CommandSettings, TrainPipelineConfig]:
     """Return the settings and the configuration.
 
     Settings of a checkpoint that have no effect under the settings of the command line are reset to their defaults.
@@ -236,7 +238,7 @@ def build_training(asked: Asked) -> tuple[Asked, TrainPipelineConfig]:
         return asked, asked.build()
 
 
-def with_memory_defaults(asked: Asked) -> Asked:
+def with_memory_defaults(asked: CommandSettings) -> CommandSettings:
     """Return settings in which a memory that differs from the checkpoint's or the recipe's has its own defaults."""
     memory, path = asked.words.get("policy.memory"), asked.get(f"policy.{PATH}")
     if memory is None:
@@ -260,7 +262,7 @@ def check_numbers(config: TrainPipelineConfig) -> None:
             raise MemobenchError(f"found {key}={found}; expected at least {smallest}")
 
 
-def check_dataset(asked: Asked) -> None:
+def check_dataset(asked: CommandSettings) -> None:
     """Refuse a folder that is not a dataset; a folder that does not exist may be one to download into."""
     root, repository = asked.get("dataset.root"), asked.get("dataset.repo_id")
     if root is None:
@@ -279,7 +281,7 @@ def check_dataset(asked: Asked) -> None:
     check_fetched(folder)
 
 
-def check_memory_settings(asked: Asked, policy: Any) -> None:
+def check_memory_settings(asked: CommandSettings, policy: Any) -> None:
     """Refuse settings on the command line that belong to another memory; errors as of `read_settings`."""
     from lerobot_memobench.policies.memobench_mem.memory import NONE, read_settings
 
