@@ -18,9 +18,9 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     MEMORY_FUSIONS,
-    READERS,
     MemobenchMemConfig,
     UnreadError,
+    readers,
 )
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
@@ -127,13 +127,17 @@ def test_bad_values_are_refused(fields: dict[str, Any], named: str) -> None:
         config(**fields)
 
 
+def read_by(reader: str) -> list[str]:
+    return [name for name, one in readers().items() if one.name == reader]
+
+
 @pytest.mark.parametrize(
     ("name", "fields"),
     [(name, OBJECTS) for name in ("visual_encoder", "image_resolution", "empty_cameras")]
-    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *READERS["perception=objects"][1].split())]
+    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *read_by("perception=objects"))]
     + [("image_resolution", {"size": "small"})]
-    + [(name, {"memory": "none"}) for name in (*READERS["a memory"][1].split(), "memory_phase", "memory_repeats")]
-    + [(name, OBJECTS) for name in READERS["objective=flow_matching"][1].split()]
+    + [(name, {"memory": "none"}) for name in (*read_by("a memory"), "memory_phase", "memory_repeats")]
+    + [(name, OBJECTS) for name in read_by("objective=flow_matching")]
     + [(name, {}) for name in ("text_encoder", "subgoal_level", "subgoals", "scheduler_decay_lr", "n_obs_steps")],
 )
 def test_settings_without_effect_are_refused(name: str, fields: dict[str, Any]) -> None:

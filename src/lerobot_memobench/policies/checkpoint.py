@@ -316,8 +316,7 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
 def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
     """Refuse other settings of a checkpoint than those it was trained with.
 
-    The class of its configuration lists them in ``fixed_by_training`` and ``of_training_alone``, both
-    ``ClassVar[tuple[str, ...]]``.
+    The class of its configuration lists them in ``fixed_by_training: ClassVar[tuple[str, ...]]``.
 
     Args:
         source: folder or repository. policy: the configuration to act with.
@@ -325,27 +324,21 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
     Raises:
         MemobenchError: a setting differs.
     """
-    fixed, of_training = getattr(policy, "fixed_by_training", ()), getattr(policy, "of_training_alone", ())
-    if not fixed and not of_training:
-        return
-    trained = as_trained(source, policy, revision)
-    for name, asked, held in differing(policy, trained, (*fixed, *of_training)):
-        why = "its weights depend on it" if name in fixed else "the setting has no effect at evaluation"
+    fixed = getattr(policy, "fixed_by_training", ())
+    for name, asked, held in differing(policy, as_trained(source, policy, revision), fixed) if fixed else ():
         raise MemobenchError(
-            f"--policy.{name}={asked} cannot be used: '{source}' was trained with {held}, and {why}; "
-            f"leave {name} out, or train with it"
+            f"--policy.{name}={asked} cannot be used: '{source}' was trained with {held}, and its weights depend on "
+            f"it; leave {name} out, or train with it"
         )
 
 
 def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTrainedConfig) -> None:
     """Refuse to resume a training with other settings.
 
-    The class of its configuration lists them in ``kept_since_begun: ClassVar[tuple[str, ...]]``.
-
     Raises:
         MemobenchError: a setting differs.
     """
-    for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
+    for name, value, held in differing(asked, begun, getattr(begun, "fixed_by_training", ())):
         raise MemobenchError(
             f"this training was begun with {name}={held} and cannot change it; found {value}; "
             f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "

@@ -8,16 +8,12 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
-from torch import nn
-from torch.optim import AdamW, Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
@@ -35,7 +31,7 @@ from lerobot_memobench.policies.memobench_mem.memory import (
     settings_of_another,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
-from lerobot_memobench.policies.memobench_mem.subgoals import texts_of
+from lerobot_memobench.policies.memobench_mem.optimization import FusedAdamWConfig, WarmupFractionSchedulerConfig
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 
 logger = logging.getLogger(__name__)
@@ -157,75 +153,94 @@ SIZES = {
 }
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(text.split())
-
-
 MAY_DIFFER = frozenset(
-    _names(
-        """
-        n_action_steps device dtype detector num_inference_steps rtc_config use_amp compile_model compile_mode
-        gradient_checkpointing pretrained_path pretrained_revision use_peft output_features
-        push_to_hub repo_id private tags license
-        """
+    (
+        *("n_action_steps", "device", "dtype", "detector", "num_inference_steps", "rtc_config", "use_amp"),
+        *("compile_model", "compile_mode", "gradient_checkpointing", "pretrained_path", "pretrained_revision"),
+        *("use_peft", "output_features", "push_to_hub", "repo_id", "private", "tags", "license"),
     )
 )
 """Fields that may have another value than in training when a checkpoint acts or its training is resumed. All others
 are refused then. LeRobot sets ``output_features`` from the environment; `policies.compatibility` checks them."""
-PI05_ALONE = _names(
-    "use_visual_memory use_proprioceptive_memory memory_frames memory_temporal_attention_every rtc_training_max_delay"
+PI05_ALONE = (
+    *("use_visual_memory", "use_proprioceptive_memory", "memory_frames", "memory_temporal_attention_every"),
+    "rtc_training_max_delay",
 )
 """Fields that LeRobot's main branch adds to pi0.5: visual memory, and training for real-time chunking. They are not
 saved, so that both versions of LeRobot load a checkpoint."""
 
 
-def _remembers(config: MemobenchMemConfig, has: Callable[[Any], bool] = lambda _: True) -> bool:
-    return config.memory != NONE and has(find_mechanism(config.memory))
+# -- metadata of fields ------------------------------------------------------------------------------------------------
 
 
-READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
-    "perception=objects": (
-        lambda it: it.uses_objects,
-        "detector detection_noise object_classes",
-    ),
-    "perception=pixels": (lambda it: not it.uses_objects, "empty_cameras"),
-    "pi0.5's image tower": (lambda it: not (it.uses_objects or it.uses_visual_encoder), "image_resolution"),
-    "a policy whose state is a token": (lambda it: it.state_token, "max_state_dim"),
-    "a policy that sees pictures": (lambda it: it.uses_pictures, "memory_camera"),
-    "size=small perception=pixels": (lambda it: it.uses_visual_encoder, "visual_encoder"),
-    "a memory": (_remembers, "memory_settings memory_fusion memory_stride"),
-    "a memory of objects other than motion": (
-        lambda it: it.uses_objects and _remembers(it, lambda one: not one.asks_motion),
-        "memory_phase memory_repeats",
-    ),
-    "a memory that learns from texts": (lambda it: it.privileged_memory, "subgoals"),
-    "an alignment": (lambda it: it.align != NONE, "align_targets text_encoder"),
-    "an alignment or a memory that learns from texts": (
-        lambda it: it.align != NONE or it.privileged_memory,
-        "subgoal_level",
-    ),
-    "objective=flow_matching": (
-        lambda it: it.objective == FLOW_MATCHING,
-        "num_inference_steps rtc_config time_sampling_beta_alpha time_sampling_beta_beta time_sampling_scale "
-        "time_sampling_offset",
-    ),
-    "use_relative_actions=true": (lambda it: it.use_relative_actions, "relative_exclude_joints"),
-    "compile_model=true": (lambda it: it.compile_model, "compile_mode"),
-    "policy=pi05": (
-        lambda _: False,
-        "paligemma_variant action_expert_variant n_obs_steps freeze_vision_encoder "
-        "scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr " + " ".join(PI05_ALONE),
-    ),
+class Reader(NamedTuple):
+    """A feature that reads some fields; without it, each of them must have its default.
+
+    Attributes:
+        name: for error messages. present: whether a configuration has it.
+    """
+
+    name: str
+    present: Callable[[MemobenchMemConfig], bool]
+
+
+def _remembers(config: MemobenchMemConfig) -> bool:
+    return config.memory != NONE
+
+
+def _may_skip_frames(config: MemobenchMemConfig) -> bool:
+    return config.uses_objects and _remembers(config) and not find_mechanism(config.memory).asks_motion
+
+
+OBJECTS = Reader("perception=objects", lambda it: it.uses_objects)
+PIXELS = Reader("perception=pixels", lambda it: not it.uses_objects)
+PICTURES = Reader("a policy that sees pictures", lambda it: it.uses_pictures)
+IMAGE_TOWER = Reader("pi0.5's image tower", lambda it: not (it.uses_objects or it.uses_visual_encoder))
+VISUAL_ENCODER = Reader("size=small perception=pixels", lambda it: it.uses_visual_encoder)
+STATE_TOKEN = Reader("a policy whose state is a token", lambda it: it.state_token)
+MEMORY = Reader("a memory", _remembers)
+OBJECT_MEMORY = Reader("a memory of objects other than motion", _may_skip_frames)
+TEXT_MEMORY = Reader("a memory that learns from texts", lambda it: it.privileged_memory)
+ALIGNMENT = Reader("an alignment", lambda it: it.align != NONE)
+TEXTS = Reader("an alignment or a memory that learns from texts", lambda it: it.align != NONE or it.privileged_memory)
+FLOW = Reader("objective=flow_matching", lambda it: it.objective == FLOW_MATCHING)
+RELATIVE_ACTIONS = Reader("use_relative_actions=true", lambda it: it.use_relative_actions)
+COMPILED = Reader("compile_model=true", lambda it: it.compile_model)
+PLAIN_PI05 = Reader("policy=pi05", lambda _: False)
+
+INHERITED_READERS: Mapping[str, Reader] = {
+    "empty_cameras": PIXELS,
+    "max_state_dim": STATE_TOKEN,
+    **dict.fromkeys(("rtc_config", "time_sampling_beta_alpha", "time_sampling_beta_beta"), FLOW),
+    **dict.fromkeys(("time_sampling_scale", "time_sampling_offset"), FLOW),
+    "relative_exclude_joints": RELATIVE_ACTIONS,
+    "compile_mode": COMPILED,
+    **dict.fromkeys(("paligemma_variant", "action_expert_variant", "n_obs_steps", *PI05_ALONE), PLAIN_PI05),
+    **dict.fromkeys(("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"), PLAIN_PI05),
 }
-"""Feature of a policy -> whether a configuration has it, and the fields that only this feature reads. Without the
-feature, each of these fields must have its default."""
-RANGES = {
-    **dict.fromkeys(_names("memory_stride n_action_steps frames_per_episode num_inference_steps"), (1, math.inf)),
-    "warmup_fraction": (0, 1),
-    "detection_noise": (0, math.inf),
-    "ema_decay": (0, math.nextafter(1, 0)),
-}
-"""Field -> its smallest and largest value."""
+"""Readers of the fields that are declared by LeRobot."""
+
+
+def setting(
+    default: Any,
+    *,
+    read_by: Reader | None = None,
+    values: Iterable[str] = (),
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> Any:
+    """Return a field of `MemobenchMemConfig`.
+
+    Args:
+        default: its default, or ``dict`` for an empty one.
+        read_by: the feature without which the field has no effect; None: it always has one.
+        values: accepted values; empty for any value of the type.
+        least, most: accepted range.
+    """
+    metadata = {"read_by": read_by, "values": tuple(values), "least": least, "most": most}
+    return (
+        field(default_factory=dict, metadata=metadata) if default is dict else field(default=default, metadata=metadata)
+    )
 
 
 class UnreadError(MemobenchError):
@@ -252,39 +267,39 @@ class MemobenchMemConfig(PI05Config):
     reads_prompt: ClassVar[bool] = True
     execution_only: ClassVar[bool] = True
 
-    size: str = "tiny"
+    size: str = setting("tiny", values=SIZES)
     """``small`` (learns from objects in minutes on a CPU), ``tiny`` (trains on a CPU) or ``pi05`` (3.2 B weights)."""
 
     # -- observations
-    perception: str = "pixels"
+    perception: str = setting("pixels", values=PERCEPTIONS)
     """Source of observation tokens: ``pixels``, encoded by a frozen network, or ``objects``, the slots of
     ``observation.environment_state`` (`sim.object_slots`): privileged object state, or detections."""
-    detector: str | None = None
+    detector: str | None = setting(None, read_by=OBJECTS)
     """With ``perception=objects``: detect objects in pictures by this detector, instead of reading privileged object
     state. ``package``, or a file of `python -m research.detector train`. A checkpoint holds only its name."""
-    visual_encoder: str | None = None
+    visual_encoder: str | None = setting(None, read_by=VISUAL_ENCODER)
     """With pixels at ``size=small``: the frozen encoder of pictures, of ``package`` (the default) or of a detector's
     file. A checkpoint holds its weights."""
-    detection_noise: float = 0.0
+    detection_noise: float = setting(0.0, read_by=OBJECTS, least=0)
     """Size of the errors added to privileged object state in training, so that the policy later acts by a
     ``detector``. 1: as large as the errors of the package's detector; 0: none."""
-    object_classes: list[str] | None = None
+    object_classes: list[str] | None = setting(None, read_by=OBJECTS)
     """Names of the object classes in order of their indices; None: the classes of this version."""
 
     base_weights: str | None = None
     """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); None: from scratch."""
 
     # -- alignment
-    align: str = "none"
+    align: str = setting("none", values=ALIGN_WEIGHTS)
     """How memory is aligned with checkpoint language: ``none``, ``semantic``, ``contrastive`` or ``framewise``."""
-    subgoal_level: str = "intermediate"
+    subgoal_level: str = setting("intermediate", read_by=TEXTS, values=SUBGOAL_LEVELS)
     """Level of the checkpoint language: ``coarse``, ``intermediate`` or ``fine``."""
-    align_targets: str = SUBGOALS
+    align_targets: str = setting(SUBGOALS, read_by=ALIGNMENT, values=ALIGN_TARGETS)
     """Texts that memory is aligned with: ``subgoals``, or a control. ``shuffled`` (the paper's) permutes them within
     each episode; an episode with fewer than three takes texts of other episodes; the permutation is the same in every
     epoch and on every machine. ``progress`` cuts the words that differ between the episodes of a task, and with them
     the hidden answer. ``answers`` is one text per episode, all its subgoals, which does not name its progress."""
-    text_encoder: str | None = None
+    text_encoder: str | None = setting(None, read_by=ALIGNMENT)
     """Encoder of subgoal texts: ``words`` (hashed words), ``labels`` (a random vector per text), or the folder or
     repository of a SigLIP model; None: the default of the size."""
 
@@ -292,56 +307,57 @@ class MemobenchMemConfig(PI05Config):
     memory: str = "frames"
     """The memory mechanism: ``frames``, another one of `memory` or of an installed package, or ``none``: plain pi0.5,
     the baseline without a memory."""
-    memory_settings: dict[str, Any] = field(default_factory=dict)
+    memory_settings: dict[str, Any] = setting(dict, read_by=MEMORY)
     """Settings of the mechanism (the ``Settings`` of its class); a setting that is not given has its default."""
-    memory_fusion: str | None = FROM_SIZE
+    memory_fusion: str | None = setting(FROM_SIZE, read_by=MEMORY, values=MEMORY_FUSIONS)
     """How actions read memory: ``modulation``, ``context`` (memory joins the prefix) or ``own`` (the mechanism's own
     way). None: ``own`` if the mechanism has one, else ``modulation``."""
-    subgoals: dict[str, list[str]] | None = None
+    subgoals: dict[str, list[str]] | None = setting(None, read_by=TEXT_MEMORY)
     """Instruction -> texts of its checkpoints, for a memory that learns from texts; None: those of the dataset."""
     oracle_memory: bool = False
     """Control of the paper: ground-truth memory text in the prompt, from the dataset's column ``memory`` in training
     and from the environment (``--env.oracle_memory=true``) in evaluation."""
-    memory_camera: str | None = None
+    memory_camera: str | None = setting(None, read_by=PICTURES)
     """Camera whose pictures are remembered; None: the first of the policy's."""
-    memory_stride: int = FROM_SIZE
+    memory_stride: int = setting(FROM_SIZE, read_by=MEMORY, least=1)
     """Control steps between remembered frames; None: the mechanism's, or 8 if training decodes no video (objects, or
     pixels through a visual encoder), else 1."""
-    memory_phase: bool = False
+    memory_phase: bool = setting(False, read_by=OBJECT_MEMORY)
     """Whether a remembered frame of objects records its phase, prompt or execution. A memory with this information can
     count the steps since the execution began, which strict tasks hide."""
-    memory_repeats: bool = True
+    memory_repeats: bool = setting(True, read_by=OBJECT_MEMORY)
     """Whether a frame equal to the last remembered one is remembered too. If false, the holds of strict tasks do not
     fill the memory, and do not use up the frames that a chunk reads."""
 
     # -- training
-    objective: str = FROM_SIZE
+    objective: str = setting(FROM_SIZE, values=OBJECTIVES)
     """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, which computes a chunk in one pass
     instead of ten (`losses`). None: ``regression`` at ``small``, else ``flow_matching``."""
-    ema_decay: float = FROM_SIZE
+    ema_decay: float = setting(FROM_SIZE, least=0, most=math.nextafter(1, 0))
     """Decay of the moving average of the weights, which evaluation uses; 0: no average. None: the paper's 0.999, or
     0.995 at ``small``."""
-    frames_per_episode: int = FROM_SIZE
+    frames_per_episode: int = setting(FROM_SIZE, least=1)
     """Frames per episode in a batch; they share memory. ``batch_size`` counts frames. None: 6 if training decodes no
     video, else 1, as in LeRobot."""
     task_weights: dict[str, float] | None = field(default_factory=dict)
     """Draw tasks in proportion to these weights, independent of the length of their episodes. A key is a task's name, a
     memory type or ``prompted`` (tasks with a demonstration prompt); the first match counts, and other tasks weigh 1.
     None: all frames alike, which is the default if training decodes video; ``{}``, the default, else: all tasks."""
-    warmup_fraction: float = 0.05
+    warmup_fraction: float = setting(0.05, least=0, most=1)
     """Share of the updates in which the learning rate rises. It then stays constant, or falls as a cosine to 0.02 of
     its maximum at ``size=small``."""
 
-    # -- pi0.5's fields with other defaults
-    freeze_vision_encoder: bool = True
+    # -- pi0.5's fields with other defaults or checks
+    freeze_vision_encoder: bool = setting(True, read_by=PLAIN_PI05)
     """Always true: memory tokens are cached features of the image tower."""
     chunk_size: int = FROM_SIZE
     """Actions of a chunk; None: 16 at ``small``, else 50."""
-    n_action_steps: int = FROM_SIZE
+    n_action_steps: int = setting(FROM_SIZE, least=1)
     """Actions executed of a chunk before the next one is planned; None: 6 at ``small``, else 50. A policy of objects
     executes the chunk's following actions if its hand has stalled (`rollout.Row.begin_chunk`)."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
-    image_resolution: tuple[int, int] | None = None
+    num_inference_steps: int = setting(10, read_by=FLOW, least=1)
+    image_resolution: tuple[int, int] | None = setting(None, read_by=IMAGE_TOWER)
     tokenizer_name: str | None = None
     tokenizer_max_length: int | None = None
     optimizer_lr: float | None = None
@@ -365,14 +381,7 @@ class MemobenchMemConfig(PI05Config):
 
     def _complete(self) -> None:
         """Set the fields that the size and the perception decide, and check every field."""
-        for name, known in (
-            ("size", SIZES),
-            ("align", ALIGN_WEIGHTS),
-            ("perception", PERCEPTIONS),
-            ("subgoal_level", SUBGOAL_LEVELS),
-            ("align_targets", ALIGN_TARGETS),
-        ):
-            self._choose(name, tuple(known))
+        self._check_values()
         if self.visual_encoder is None and self.uses_visual_encoder:
             self.visual_encoder = PACKAGE
         self._complete_memory()
@@ -382,7 +391,6 @@ class MemobenchMemConfig(PI05Config):
                 setattr(self, name, value)
         if not self.task_weights and not self.decodes_no_video:
             self.task_weights = None
-        self._choose("objective", OBJECTIVES)
         # A checkpoint without oracle memory holds the shorter prompt length, which would cut the memory text off.
         if self.tokenizer_max_length == self.dimensions.tokenizer_max_length:
             self.tokenizer_max_length = defaults["tokenizer_max_length"]
@@ -429,18 +437,18 @@ class MemobenchMemConfig(PI05Config):
             "memory_camera": (f"{OBS_IMAGES}.{next(iter(CAMERAS))}",),
             "num_inference_steps": (1,),
         }
-        found: dict[str, str] = {}
-        for reader, (present, names) in READERS.items():
-            for name in () if present(self) else [one for one in names.split() if one in unset]:
-                known = [unset[name], defaults.get(name), *usual.get(name, ())]
-                value = getattr(self, name)
-                if value not in known and (not isinstance(value, list) or tuple(value) not in known):
-                    found[name] = reader
-        for name, reader in found.items():
+        unread: dict[str, Reader] = {}
+        for name, reader in readers().items():
+            known = [unset[name], defaults.get(name), *usual.get(name, ())]
+            value = getattr(self, name)
+            value = tuple(value) if isinstance(value, list) and tuple(value) in known else value
+            if value not in known and not reader.present(self):
+                unread[name] = reader
+        for name, reader in unread.items():
             raise UnreadError(
-                f"--policy.{name}={getattr(self, name)} has no effect: only {reader} reads it; leave it out, or set "
-                f"it to its default, {json.dumps(unset[name])}.",
-                {one: unset[one] for one in found},
+                f"--policy.{name}={getattr(self, name)} has no effect: only {reader.name} reads it; leave it out, or "
+                f"set it to its default, {json.dumps(unset[name])}.",
+                {one: unset[one] for one in unread},
             )
         if self.memory == NONE:
             self.memory_fusion = None
@@ -454,7 +462,6 @@ class MemobenchMemConfig(PI05Config):
         mechanism = find_mechanism(self.memory)
         fitting = (OWN,) if mechanism.fusion is not None else (MODULATION, CONTEXT)
         self.memory_fusion = self.memory_fusion or fitting[0]
-        self._choose("memory_fusion", MEMORY_FUSIONS)
         if self.memory_fusion not in fitting:
             raise MemobenchError(
                 f"--policy.memory={self.memory} cannot be read by memory_fusion={self.memory_fusion}; pass "
@@ -472,19 +479,21 @@ class MemobenchMemConfig(PI05Config):
 
     # -- checks ----------------------------------------------------------------------------------------------------
 
-    def _choose(self, field: str, known: tuple[str, ...]) -> None:
-        given = getattr(self, field)
-        if given not in known:
-            raise MemobenchError(
-                f"memobench_mem has no {field} '{given}': {nearest(str(given), known)} "
-                f"Pass --policy.{field}=<one of {', '.join(known)}>."
-            )
+    def _check_values(self) -> None:
+        for one in fields(self):
+            known, given = one.metadata.get("values"), getattr(self, one.name)
+            if known and given not in known and not (given is None and one.default is FROM_SIZE):
+                raise MemobenchError(
+                    f"memobench_mem has no {one.name} '{given}': {nearest(str(given), known)} "
+                    f"Pass --policy.{one.name}=<one of {', '.join(known)}>."
+                )
 
     def _check_numbers(self) -> None:
-        for name, (least, most) in RANGES.items():
-            if not least <= getattr(self, name) <= most:  # nor NaN
+        for one in fields(self):
+            least, most = one.metadata.get("least", -math.inf), one.metadata.get("most", math.inf)
+            if (least, most) != (-math.inf, math.inf) and not least <= getattr(self, one.name) <= most:  # nor NaN
                 raise MemobenchError(
-                    f"--policy.{name}={getattr(self, name)} is out of range; expected at least {least}"
+                    f"--policy.{one.name}={getattr(self, one.name)} is out of range; expected at least {least}"
                     + ("." if most == math.inf else f" and {'at most' if isinstance(most, int) else 'below'} 1.")
                 )
         if any(weight < 0 for weight in (self.task_weights or {}).values()):
@@ -527,8 +536,6 @@ class MemobenchMemConfig(PI05Config):
         names = [one.name for one in fields(self) if one.name not in MAY_DIFFER]
         return tuple(sorted(names, key=lambda name: ours.index(name) if name in ours else len(ours)))
 
-    kept_since_begun = fixed_by_training
-
     @property
     def dimensions(self) -> Dimensions:
         """Dimensions of the size."""
@@ -555,14 +562,9 @@ class MemobenchMemConfig(PI05Config):
         return self.uses_detector or not self.uses_objects
 
     @property
-    def encodes_ahead(self) -> bool:
-        """Whether pictures are encoded, or objects detected in them, once before training."""
-        return self.uses_detector or self.uses_visual_encoder
-
-    @property
     def decodes_no_video(self) -> bool:
         """Whether training samples consist of numbers and features in main memory."""
-        return self.uses_objects or self.encodes_ahead
+        return self.uses_objects or self.uses_visual_encoder
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -583,11 +585,6 @@ class MemobenchMemConfig(PI05Config):
         return tuple(self.image_resolution)  # type: ignore[return-value]  # a checkpoint gives a list
 
     @property
-    def tokens_per_frame(self) -> int:
-        """Number of memory tokens of a remembered frame."""
-        return TOKENS_PER_FRAME[self.perception]
-
-    @property
     def privileged_memory(self) -> bool:
         """Whether the memory learns from texts of checkpoints."""
         return self.memory != NONE and find_mechanism(self.memory).privileged
@@ -596,11 +593,6 @@ class MemobenchMemConfig(PI05Config):
     def remembers_thumbnails(self) -> bool:
         """Whether small grey copies of pictures are remembered instead of their tokens."""
         return self.memory != NONE and find_mechanism(self.memory).asks_motion and not self.uses_objects
-
-    @property
-    def subgoal_texts(self) -> tuple[str, ...]:
-        """All texts of checkpoints; a privileged memory refers to them by their indices here."""
-        return texts_of(self.subgoals or {})
 
     @property
     def needs_every_frame(self) -> bool:
@@ -690,40 +682,8 @@ class MemobenchMemConfig(PI05Config):
             setattr(self, name, needed)
 
 
-@OptimizerConfig.register_subclass("memobench_adamw")
-@dataclass
-class FusedAdamWConfig(AdamWConfig):
-    """Fused AdamW. Torch's default copies all trained parameters on a GPU, and takes three times as long on a CPU.
-
-    At full size the copy takes 10.5 GiB; with it, `config=train_paper` does not fit on four GPUs of 80 GB.
-    """
-
-    def build(self, params: Iterable[nn.Parameter]) -> Optimizer:
-        """Return the optimizer of these parameters."""
-        learning = list(params)
-        fused = all(parameter.device.type in ("cpu", "cuda") for parameter in learning) or None  # None: torch's choice
-        return AdamW(learning, self.lr, self.betas, self.eps, self.weight_decay, fused=fused)
-
-
-@LRSchedulerConfig.register_subclass("memobench_constant_with_warmup")
-@dataclass
-class WarmupFractionSchedulerConfig(LRSchedulerConfig):
-    """Linear warm-up over a fraction of the updates (paper: 5 %), then constant, or a cosine down to ``final``.
-
-    LeRobot's constant schedule takes a number of warm-up steps, which would have to change with ``--steps``.
-    """
-
-    num_warmup_steps: int | None = None
-    warmup_fraction: float = 0.05
-    final: float = 1.0
-
-    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        """Return the schedule of a training of ``num_training_steps`` updates."""
-        steps = self.num_warmup_steps
-        warmup = max(1, round(self.warmup_fraction * num_training_steps) if steps is None else steps)
-
-        def rate(step: int) -> float:
-            fallen = (1 - math.cos(math.pi * min(1.0, step / num_training_steps))) / 2
-            return min(1.0, (step + 1) / warmup) * (1 - (1 - self.final) * fallen)
-
-        return LambdaLR(optimizer, rate)
+def readers() -> dict[str, Reader]:
+    """Return the reader of each field that does not always have an effect, ours first."""
+    own = {one.name: one.metadata["read_by"] for one in fields(MemobenchMemConfig) if one.metadata.get("read_by")}
+    known = {one.name for one in fields(MemobenchMemConfig)}  # LeRobot 0.6.1 lacks those of its main branch
+    return own | {name: reader for name, reader in INHERITED_READERS.items() if name in known}
