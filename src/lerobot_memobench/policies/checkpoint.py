@@ -32,11 +32,6 @@ RANDOM_IF_MISSING = ("pi0", "pi05", "pi0_fast")
 ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
-REMOVED_FIELDS = {
-    *("align_weight", "feature_cache_dir", "full_chunk_when_stalled", "memory_frames", "min_lr_ratio", "open_gate"),
-    *("shuffle_seed", "shuffle_subgoals", "tokens_per_frame"),
-}
-"""Fields of memobench_mem in checkpoints of earlier versions (`update_checkpoint`)."""
 
 
 class Feature(TypedDict, total=False):
@@ -172,14 +167,7 @@ def checkpoint_type(path: str) -> str | None:
         if looks_local(path):
             raise MemobenchError(f"the checkpoint folder {path} does not exist")
         return None
-    config = read_json(folder / CONFIG_FILE)
-    name = config.get("type")
-    removed = sorted(REMOVED_FIELDS & config.keys())
-    if name == "memobench_mem" and removed:
-        raise MemobenchError(
-            f"{folder / CONFIG_FILE} has {', '.join(removed)}, which an earlier version wrote; update the checkpoint: "
-            f"python -m lerobot_memobench.policies.update_checkpoint {folder}"
-        )
+    name = read_json(folder / CONFIG_FILE).get("type")
     if not isinstance(name, str):
         raise MemobenchError(
             f"{folder / CONFIG_FILE} names no policy type; LeRobot cannot read checkpoints of its first year: train "
@@ -301,7 +289,7 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
         names.setdefault(id(wanted[name]), []).append(name)
     missing = [same[0] for same in names.values() if not any(name in tensors for name in same)]
     if type(policy).__module__.startswith(f"{__package__}."):
-        # Our policies load weights strictly, of earlier names too; here only too large an allocation is refused.
+        # Our policies load weights strictly, except for new parts; here only too large an allocation is refused.
         reserved = sum(math.prod(wanted[name].shape) for name in missing)
         missing = missing if reserved > sum(map(math.prod, found.values())) else []
     wrong = [name for name in built.state_dict() if name in tensors and tensors[name] != tuple(wanted[name].shape)]

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 from lerobot.configs import PreTrainedConfig
 from safetensors import safe_open
 from safetensors.torch import load_file
@@ -33,9 +32,6 @@ from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 logger = logging.getLogger(__name__)
-
-WORD_POSITIONS = "instruction.positions"
-"""End of the name of a tensor that checkpoints of earlier versions lack."""
 
 
 def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
@@ -116,9 +112,6 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             "--policy.base_weights=<checkpoint> instead of a pretrained path."
         )
     weights = {name: tensor for name, tensor in weights.items() if name not in new}
-    for name, parameter in policy.named_parameters():
-        if name.endswith(WORD_POSITIONS):  # zeros give the mean word, to which earlier versions mapped an instruction
-            weights.setdefault(name, torch.zeros_like(parameter))
     load_exactly(policy, weights, source, optional=new | _head(policy))
 
 
