@@ -19,12 +19,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import (
     PREPROCESSOR_FILE,
     WEIGHTS_FILE,
-    Processor,
     check_processors,
     checkpoint_file,
     differing,
-    read_json,
-    statistics_shapes,
+    steps_of,
     undamaged,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -139,25 +137,6 @@ def weights_file(source: str | Path, revision: str | None = None, *, named: str,
     return path
 
 
-def require_statistics(source: str | Path, revision: str | None = None) -> None:
-    """Check that a checkpoint has the statistics that normalise states and actions.
-
-    LeRobot does not normalise values without statistics, and an evaluation then scores 0 %.
-
-    Raises:
-        MemobenchError: a file or a statistic is missing.
-    """
-    fix = "copy the preprocessor files of its training run into it, or train again"
-    if checkpoint_file(source, PREPROCESSOR_FILE, revision) is None:
-        raise MemobenchError(f"The checkpoint '{source}' has no {PREPROCESSOR_FILE}, which evaluation needs; {fix}.")
-    missing = sorted({"observation.state", "action"} - set(statistics_shapes(source, revision)))
-    if missing:
-        raise MemobenchError(
-            f"The checkpoint '{source}' has no dataset statistics for {' and '.join(missing)}, so states and actions "
-            f"could not be normalised; {fix}."
-        )
-
-
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """Return all tensors of a file.
 
@@ -221,8 +200,7 @@ def require_agreement(source: str | Path, revision: str | None, config: Memobenc
     path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
     if path is None:
         return
-    entries = read_json(path, Processor).get("steps", [])
-    steps = {entry.get("registry_name", ""): entry.get("config", {}) for entry in entries}
+    steps: dict[str, Any] = {step.get("registry_name", ""): step.get("config", {}) for step in steps_of(path)}
     for field, held in _held(steps, config, training):
         asked = getattr(config, field)
         if asked != held:

@@ -26,7 +26,7 @@ from transformers.initialization import no_init_weights
 from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_weights
+from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_statistics, check_weights
 from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
 from lerobot_memobench.policies.memobench_mem.backbone import Precision
@@ -37,7 +37,6 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     read_config,
     read_tensors,
     require_agreement,
-    require_statistics,
     weights_file,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
@@ -557,7 +556,7 @@ class MemobenchMemPolicy(PI05Policy):
         config = read_config(source, config, revision)
         path = weights_file(source, revision, named=f"The checkpoint '{source}'", fix="give a pretrained_model folder")
         if dataset_meta is None:
-            require_statistics(source, revision)
+            check_statistics(source, revision)
         # With an adapter, ``source`` is the base; the processor steps are saved with the adapter.
         saved, of = (config.pretrained_path, config.pretrained_revision) if config.use_peft else (source, revision)
         if saved is not None:
