@@ -12,19 +12,15 @@ import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
-from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, MEMORY_COLUMN, FrameLookup, holds_texts
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.losses import joint, mean_over_ranks, world_size
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
 
@@ -214,68 +210,13 @@ def alignment_loss(
     return weighted, logged | alignment.numbers()
 
 
-# -- subgoal texts of samples -----------------------------------------------------------------------------------------
-
-
-def require_texts(root: Path, config: MemobenchMemConfig) -> None:
-    """Check that a dataset has the texts that a policy learns from.
-
-    Raises:
-        MemobenchError: it has no subgoals at the level of the alignment, or no oracle memory.
-    """
-    column = LEVEL_COLUMNS[config.subgoal_level]
-    if config.align != "none" and not holds_texts(root, column):
-        others = [level for level, name in LEVEL_COLUMNS.items() if holds_texts(root, name)]
-        cure = (
-            f"it has {' and '.join(others)} subgoals: choose one with --policy.subgoal_level"
-            if others
-            else ("use --policy.align=none, or a dataset that has the subgoal of each frame there")
-        )
-        raise MemobenchError(
-            f"The dataset {root} has no {config.subgoal_level} subgoals (no text in a column '{column}'), so "
-            f"--policy.align={config.align} has no text to align memory with; {cure}."
-        )
-    if config.oracle_memory and not holds_texts(root, MEMORY_COLUMN):
-        raise MemobenchError(
-            f"The dataset {root} has no text in a column '{MEMORY_COLUMN}', which --policy.oracle_memory=true reads; "
-            "leave it out, or generate the dataset again with this version."
-        )
-
-
-def text_rows(lookup: FrameLookup, level: str, align: str) -> np.ndarray:
-    """Return the row of the cached embeddings for each frame of the dataset (N,), -1 for frames without subgoal.
+def embedded_texts(embeddings: Tensor, rows: Tensor) -> dict[str, Tensor]:
+    """Return the texts (..., d_t) of frames and their mask (...), as inputs of `alignment_loss`.
 
     Args:
-        level: subgoal level. align: the objective, for the message.
-
-    Raises:
-        MemobenchError: the dataset has no texts.
+        embeddings: of all texts, (T, d_t). rows: (...) int64, row of each frame's text, -1 for none.
     """
-    rows = lookup.text_rows(level)
-    if len(lookup.texts) == 0:
-        raise MemobenchError(
-            f"The dataset of {lookup.root} has no subgoal text, which --policy.align={align} needs; use "
-            "--policy.align=none, or a dataset with subgoals."
-        )
-    return rows
-
-
-def texts_of_frames(lookup: FrameLookup, rows: np.ndarray, frames: Sequence[int]) -> dict[str, Tensor]:
-    """Return the texts (B, d_t) of frames of the dataset, and their mask (B,); ``rows`` as of `text_rows`."""
-    return _embed(lookup, rows[np.asarray(frames)].astype(np.int64))
-
-
-def texts_of_histories(lookup: FrameLookup, rows: np.ndarray, histories: Sequence[np.ndarray]) -> dict[str, Tensor]:
-    """Return the texts (B, F, d_t) of remembered frames, padded to the longest history, and their mask (B, F)."""
-    padded = np.full((len(histories), max(map(len, histories))), -1, dtype=np.int64)
-    for sample, history in enumerate(histories):
-        padded[sample, : len(history)] = rows[history]
-    return _embed(lookup, padded)
-
-
-def _embed(lookup: FrameLookup, rows: np.ndarray) -> dict[str, Tensor]:
-    numbers = torch.from_numpy(rows)
-    return {TEXT_MASK: numbers >= 0, TEXT: lookup.text_embeddings[numbers.clamp(min=0)]}
+    return {TEXT_MASK: rows >= 0, TEXT: embeddings[rows.clamp(min=0)]}
 
 
 # -- frozen text encoders of subgoals ---------------------------------------------------------------------------------
