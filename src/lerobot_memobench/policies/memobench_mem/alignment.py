@@ -214,9 +214,9 @@ def embedded_texts(embeddings: Tensor, rows: Tensor) -> dict[str, Tensor]:
     """Return the texts (..., d_t) of frames and their mask (...), as inputs of `alignment_loss`.
 
     Args:
-        embeddings: of all texts, (T, d_t). rows: (...) int64, row of each frame's text, -1 for none.
+        embeddings: of all texts, (T, d_t). rows: (...) integers, row of each frame's text, -1 for none.
     """
-    return {TEXT_MASK: rows >= 0, TEXT: embeddings[rows.clamp(min=0)]}
+    return {TEXT_MASK: rows >= 0, TEXT: embeddings[rows.long().clamp(min=0)]}
 
 
 # -- frozen text encoders of subgoals ---------------------------------------------------------------------------------

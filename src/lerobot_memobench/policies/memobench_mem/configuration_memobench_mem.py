@@ -184,22 +184,17 @@ class Reader(NamedTuple):
     present: Callable[[MemobenchMemConfig], bool]
 
 
-def _remembers(config: MemobenchMemConfig) -> bool:
-    return config.memory != NONE
-
-
-def _may_skip_frames(config: MemobenchMemConfig) -> bool:
-    return config.uses_objects and _remembers(config) and not find_mechanism(config.memory).asks_motion
-
-
 OBJECTS = Reader("perception=objects", lambda it: it.uses_objects)
 PIXELS = Reader("perception=pixels", lambda it: not it.uses_objects)
 PICTURES = Reader("a policy that sees pictures", lambda it: it.uses_pictures)
 IMAGE_TOWER = Reader("pi0.5's image tower", lambda it: not (it.uses_objects or it.uses_visual_encoder))
 VISUAL_ENCODER = Reader("size=small perception=pixels", lambda it: it.uses_visual_encoder)
 STATE_TOKEN = Reader("a policy whose state is a token", lambda it: it.state_token)
-MEMORY = Reader("a memory", _remembers)
-OBJECT_MEMORY = Reader("a memory of objects other than motion", _may_skip_frames)
+MEMORY = Reader("a memory", lambda it: it.memory != NONE)
+OBJECT_MEMORY = Reader(
+    "a memory of objects other than motion",
+    lambda it: it.uses_objects and it.memory != NONE and not find_mechanism(it.memory).asks_motion,
+)
 TEXT_MEMORY = Reader("a memory that learns from texts", lambda it: it.privileged_memory)
 ALIGNMENT = Reader("an alignment", lambda it: it.align != NONE)
 TEXTS = Reader("an alignment or a memory that learns from texts", lambda it: it.align != NONE or it.privileged_memory)
@@ -218,7 +213,7 @@ INHERITED_READERS: Mapping[str, Reader] = {
     **dict.fromkeys(("paligemma_variant", "action_expert_variant", "n_obs_steps", *PI05_ALONE), PLAIN_PI05),
     **dict.fromkeys(("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"), PLAIN_PI05),
 }
-"""Readers of the fields that are declared by LeRobot."""
+"""LeRobot's fields that do not always have an effect -> their readers."""
 
 
 def setting(
@@ -238,9 +233,8 @@ def setting(
         least, most: accepted range.
     """
     metadata = {"read_by": read_by, "values": tuple(values), "least": least, "most": most}
-    return (
-        field(default_factory=dict, metadata=metadata) if default is dict else field(default=default, metadata=metadata)
-    )
+    kind: dict[str, Any] = {"default_factory": dict} if default is dict else {"default": default}
+    return field(**kind, metadata=metadata)
 
 
 class UnreadError(MemobenchError):

@@ -41,10 +41,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from lerobot_memobench.datasets.frames import FrameLookup
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment import (
-    embedded_texts,
-    words,
-)
+from lerobot_memobench.policies.memobench_mem.alignment import embedded_texts, words
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
@@ -252,7 +249,7 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
         if config.align == "none":
             return memory | found
-        rows = torch.from_numpy(lookup.text_rows(config.subgoal_level)).long()
+        rows = torch.from_numpy(lookup.text_rows(config.subgoal_level))
         if config.align != "framewise":
             return memory | found | embedded_texts(lookup.text_embeddings, rows[torch.tensor([*indices])])
         histories = [rows[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
