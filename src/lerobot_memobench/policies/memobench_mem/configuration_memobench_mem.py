@@ -579,6 +579,11 @@ class MemobenchMemConfig(PI05Config):
         return tuple(self.image_resolution)  # type: ignore[return-value]  # a checkpoint gives a list
 
     @property
+    def tokens_per_frame(self) -> int:
+        """Number of memory tokens of a remembered frame."""
+        return TOKENS_PER_FRAME[self.perception]
+
+    @property
     def privileged_memory(self) -> bool:
         """Whether the memory learns from texts of checkpoints."""
         return self.memory != NONE and find_mechanism(self.memory).privileged
@@ -681,3 +686,13 @@ def readers() -> dict[str, Reader]:
     own = {one.name: one.metadata["read_by"] for one in fields(MemobenchMemConfig) if one.metadata.get("read_by")}
     known = {one.name for one in fields(MemobenchMemConfig)}  # LeRobot 0.6.1 lacks those of its main branch
     return own | {name: reader for name, reader in INHERITED_READERS.items() if name in known}
+
+
+def memory_defaults() -> dict[str, Any]:
+    """Return the fields that a memory does not take over from another memory's checkpoint -> their defaults.
+
+    Construction converts ``memory_settings``.
+    """
+    own = {one.name: one.default for one in fields(MemobenchMemConfig)}
+    of_memory = [name for name, reader in readers().items() if reader in (MEMORY, OBJECT_MEMORY, TEXT_MEMORY)]
+    return {name: own[name] for name in of_memory if name != "memory_settings"}

@@ -42,7 +42,6 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     ALIGN_WEIGHTS,
     REGRESSION,
-    TOKENS_PER_FRAME,
     MemobenchMemConfig,
 )
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -129,8 +128,7 @@ class MemobenchMemPolicy(PI05Policy):
         with contextlib.nullcontext() if draw else no_init_weights():
             self.model = MemoryPI05(config, rtc_processor=self.rtc_processor)
         dims = config.dimensions
-        tokens = TOKENS_PER_FRAME[config.perception]
-        self.alignment = make_alignment(config.align, dims.vlm.width, dims.text_dim, tokens)
+        self.alignment = make_alignment(config.align, dims.vlm.width, dims.text_dim, config.tokens_per_frame)
         self.precision = Precision(list(self.parameters()))
         if dataset_meta is not None:
             self.precision.settle()  # before loading weights, which may be float32

@@ -249,10 +249,10 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
         if config.align == "none":
             return memory | found
-        rows = torch.from_numpy(lookup.text_rows(config.subgoal_level))
+        texts = torch.from_numpy(lookup.text_rows(config.subgoal_level))
         if config.align != "framewise":
-            return memory | found | embedded_texts(lookup.text_embeddings, rows[torch.tensor([*indices])])
-        histories = [rows[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
+            return memory | found | embedded_texts(lookup.text_embeddings, texts[torch.tensor([*indices])])
+        histories = [texts[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
         padded = pad_sequence(histories, batch_first=True, padding_value=-1)
         return memory | found | embedded_texts(lookup.text_embeddings, padded)
 
