@@ -10,7 +10,6 @@ from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
@@ -21,6 +20,7 @@ from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE
+from lerobot_memobench.policies.checkpoint import CONFIG_FILE
 from lerobot_memobench.policies.memobench_mem.memory import (
     NONE,
     OURS,
@@ -367,7 +367,7 @@ class MemobenchMemConfig(PI05Config):
 
     def _save_pretrained(self, save_directory: Path) -> None:
         super()._save_pretrained(save_directory)
-        file = save_directory / CONFIG_NAME
+        file = save_directory / CONFIG_FILE
         saved = json.loads(file.read_text(encoding="utf-8"))
         if set(PI05_ALONE) & set(saved):  # an earlier LeRobot would refuse the checkpoint for them
             kept = {name: value for name, value in saved.items() if name not in PI05_ALONE}
