@@ -1,4 +1,4 @@
-"""Configuration of ``memobench_mem``: the dimensions of each size, the settings, their defaults and checks."""
+"""Configuration of ``memobench_mem``: the settings, their defaults and checks. Dimensions are in `sizes`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -32,15 +32,13 @@ from lerobot_memobench.policies.memobench_mem.memory import (
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
 from lerobot_memobench.policies.memobench_mem.optimization import FusedAdamWConfig, WarmupFractionSchedulerConfig
+from lerobot_memobench.policies.memobench_mem.sizes import FLOW_MATCHING, REGRESSION, SIZES, Dimensions
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 
 logger = logging.getLogger(__name__)
 
-FLOW_MATCHING, REGRESSION = "flow_matching", "regression"
 OBJECTIVES = (FLOW_MATCHING, REGRESSION)
 ALIGN_WEIGHTS: Mapping[str, float] = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
-SHUFFLE_SEED = 7
-"""Seed of ``align_targets=shuffled``."""
 SUBGOALS, SHUFFLED, PROGRESS, ANSWERS = ALIGN_TARGETS = ("subgoals", "shuffled", "progress", "answers")
 MODULATION, CONTEXT, OWN = "modulation", "context", "own"
 MEMORY_FUSIONS = (MODULATION, CONTEXT, OWN)
@@ -54,105 +52,6 @@ MEMORY_STRIDE, FRAMES_PER_EPISODE = 8, 6
 """Defaults if training decodes no video; 1 otherwise."""
 ORACLE_TOKENS = 128
 """Tokens added to the prompt's length for oracle memory text: six checkpoints of about ten words."""
-
-
-@dataclass(frozen=True)
-class Gemma:
-    """Dimensions of one of the two transformers, named as in LeRobot's ``GemmaConfig``."""
-
-    width: int
-    depth: int
-    mlp_dim: int
-    num_heads: int
-    num_kv_heads: int
-    head_dim: int
-
-
-@dataclass(frozen=True)
-class Vision:
-    """Dimensions of the SigLIP image tower."""
-
-    width: int
-    depth: int
-    mlp_dim: int
-    num_heads: int
-    patch: int
-    image: int  # pixels per side of the policy's input
-
-
-PAPERS: Mapping[str, Any] = {
-    "chunk_size": 50,
-    "n_action_steps": 50,
-    "optimizer_weight_decay": 0.0,
-    "ema_decay": 0.999,
-    "objective": FLOW_MATCHING,
-}
-"""The paper's values of the fields whose defaults depend on the size."""
-
-
-@dataclass(frozen=True)
-class Dimensions:
-    """All dimensions and size-dependent defaults of one size."""
-
-    vlm: Gemma
-    expert: Gemma
-    vision: Vision
-    vocabulary: int
-    tokenizer: str  # "words" (built here) or a Hugging Face tokenizer
-    tokenizer_max_length: int
-    text_encoder: str  # "words" or "labels" (built here) or a folder or repository of a SigLIP model
-    text_dim: int
-    learning_rate: float
-    normalization: str = "QUANTILES"  # LeRobot's mode for states and actions
-    final_learning_rate: float = 1.0  # at the end, as a fraction of the highest; 1: it stays constant
-    defaults: Mapping[str, Any] = field(default_factory=lambda: PAPERS)
-
-
-# The VLM's width is also the width d_m of the memory tokens (2048 at full size).
-# LeRobot's attention code fixes 8 heads; widths and head dimensions are free.
-_TINY = Dimensions(
-    vlm=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
-    expert=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
-    vision=Vision(width=96, depth=2, mlp_dim=192, num_heads=4, patch=12, image=96),
-    vocabulary=1024,
-    tokenizer="words",
-    tokenizer_max_length=64,
-    text_encoder="words",
-    text_dim=64,
-    learning_rate=1e-3,
-)
-SIZES = {
-    "tiny": _TINY,
-    "small": replace(
-        _TINY,
-        vlm=replace(_TINY.vlm, depth=3),
-        expert=replace(_TINY.expert, depth=3),
-        vocabulary=512,
-        tokenizer_max_length=48,
-        normalization="MEAN_STD",
-        final_learning_rate=0.02,
-        defaults={
-            "chunk_size": 16,
-            "n_action_steps": 6,
-            "optimizer_weight_decay": 1e-4,
-            "ema_decay": 0.995,
-            "objective": REGRESSION,
-        },
-    ),
-    "pi05": Dimensions(
-        vlm=Gemma(width=2048, depth=18, mlp_dim=16_384, num_heads=8, num_kv_heads=1, head_dim=256),
-        expert=Gemma(width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256),
-        vision=Vision(width=1152, depth=27, mlp_dim=4304, num_heads=16, patch=14, image=224),
-        vocabulary=257_152,
-        tokenizer="google/paligemma-3b-pt-224",
-        tokenizer_max_length=200,
-        text_encoder="google/siglip-so400m-patch14-224",
-        text_dim=1152,
-        learning_rate=5e-5,
-    ),
-}
-
-
 MAY_DIFFER = frozenset(
     (
         *("n_action_steps", "device", "dtype", "detector", "num_inference_steps", "rtc_config", "use_amp"),
@@ -351,6 +250,7 @@ class MemobenchMemConfig(PI05Config):
     executes the chunk's following actions if its hand has stalled (`rollout.Row.begin_chunk`)."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
     num_inference_steps: int = setting(10, read_by=FLOW, least=1)
+    """Steps from noise to actions, with flow matching."""
     image_resolution: tuple[int, int] | None = setting(None, read_by=IMAGE_TOWER)
     tokenizer_name: str | None = None
     tokenizer_max_length: int | None = None
@@ -592,11 +492,6 @@ class MemobenchMemConfig(PI05Config):
     def remembers_thumbnails(self) -> bool:
         """Whether small grey copies of pictures are remembered instead of their tokens."""
         return self.memory != NONE and find_mechanism(self.memory).asks_motion and not self.uses_objects
-
-    @property
-    def needs_every_frame(self) -> bool:
-        """Whether the policy reads pictures between two action chunks."""
-        return self.memory != NONE and self.uses_pictures
 
     def check_memory_reads(self) -> None:
         """Check that the memory's fusion can report how much a chunk reads of each remembered entry.

@@ -39,11 +39,7 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     require_agreement,
     weights_file,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
-    ALIGN_WEIGHTS,
-    REGRESSION,
-    MemobenchMemConfig,
-)
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import ALIGN_WEIGHTS, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     ENCODED,
     ObservationEncoder,
@@ -74,6 +70,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
+from lerobot_memobench.policies.memobench_mem.sizes import REGRESSION
 from lerobot_memobench.policies.memory_reads import Chunk, chunk_reads
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 

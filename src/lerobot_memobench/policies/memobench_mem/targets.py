@@ -12,10 +12,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SHUFFLE_SEED
-
 logger = logging.getLogger(__name__)
 
+SHUFFLE_SEED = 7
 SHUFFLED_ALONE = 3
 """Smallest number of subgoals of an episode that are permuted among themselves."""
 NO_WORD = "-"
