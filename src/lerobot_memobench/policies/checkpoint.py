@@ -7,7 +7,6 @@ them.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -379,11 +378,10 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
                 f"{policy.type} would act with random ones; copy or train it again"
             )
         return
-    found = _shapes(file)
     built = _built_empty(policy)
     if built is None:
         return
-    tensors = _as_loaded(built, found)
+    tensors = _as_loaded(built, _shapes(file))
     names: dict[int, list[str]] = {}  # a tensor with several names is saved by one of them
     wanted = {
         **dict(built.named_parameters(remove_duplicate=False)),
@@ -392,10 +390,6 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
     for name in built.state_dict():
         names.setdefault(id(wanted[name]), []).append(name)
     missing = [same[0] for same in names.values() if not any(name in tensors for name in same)]
-    if type(policy).__module__.startswith(f"{__package__}."):
-        # Our policies load weights strictly, except for new parts; here only too large an allocation is refused.
-        reserved = sum(math.prod(wanted[name].shape) for name in missing)
-        missing = missing if reserved > sum(map(math.prod, found.values())) else []
     wrong = [name for name in built.state_dict() if name in tensors and tensors[name] != tuple(wanted[name].shape)]
     if missing or wrong:
         raise MemobenchError(

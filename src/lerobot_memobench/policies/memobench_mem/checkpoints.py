@@ -26,7 +26,6 @@ from lerobot_memobench.policies.checkpoint import (
     undamaged,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 logger = logging.getLogger(__name__)
@@ -78,13 +77,13 @@ def _head(policy: nn.Module) -> set[str]:
 
 
 def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: MemobenchMemConfig) -> None:
-    """Load the weights of checkpoint ``source`` into a policy of this kind; its alignment heads may be missing.
+    """Load the weights of checkpoint ``source`` into a policy of this kind.
 
     Args:
         trained: the checkpoint's configuration. `restarted` parts keep their initial weights, with a warning.
 
     Raises:
-        MemobenchError: the weights cannot be read, do not fit, or have no memory.
+        MemobenchError: the weights cannot be read, or do not fit.
     """
     config, new = cast(MemobenchMemConfig, policy.config), restarted(policy, trained)
     for name, asked, held in differing(config, trained, ("base_weights", "visual_encoder")):
@@ -92,7 +91,6 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             f"--policy.{name}={asked} has no effect: it sets initial weights, and the weights of '{source}' "
             f"({name}={held}) replace them; leave {name} out, or train from scratch."
         )
-    weights = read_tensors(path)
     if has_another_memory(config, trained):
         logger.warning(
             "'%s' was trained with memory=%s, and this is memory=%s%s: %d tensors of the memory and its fusion keep "
@@ -104,13 +102,8 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             len(new - _head(policy)),
             config.memory_stride,
         )
-    elif config.memory != NONE and not any(name.startswith("model.memory.") for name in weights):
-        raise MemobenchError(
-            f"'{source}' holds weights without a memory; to start from pi0.5's weights pass "
-            "--policy.base_weights=<checkpoint> instead of a pretrained path."
-        )
-    weights = {name: tensor for name, tensor in weights.items() if name not in new}
-    load_exactly(policy, weights, source, optional=new | _head(policy))
+    weights = {name: tensor for name, tensor in read_tensors(path).items() if name not in new}
+    load_exactly(policy, weights, source, optional=new)
 
 
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
