@@ -33,7 +33,6 @@ from lerobot_memobench.datasets.lerobot_format.reading import check_revision, li
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
-from lerobot_memobench.policies.memobench_mem.alignment import make_text_encoder
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     ImageTowerEncoder,
@@ -46,6 +45,7 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     follow_training,
     make_memobench_mem_pre_post_processors,
 )
+from lerobot_memobench.policies.memobench_mem.text_encoders import make_text_encoder
 from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.sim.scene_hash import check_world
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features

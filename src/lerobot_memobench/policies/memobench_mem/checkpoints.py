@@ -1,4 +1,4 @@
-"""Checkpoints of the policy: checks of configuration, weights, statistics and saved processor steps.
+"""Load the weights of a checkpoint, and check that its processor steps agree with the configuration.
 
 The model file holds the averaged weights; `training.average` saves the trained weights next to it.
 """

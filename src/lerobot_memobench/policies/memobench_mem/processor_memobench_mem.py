@@ -41,7 +41,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from lerobot_memobench.datasets.frames import FrameLookup
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment import embedded_texts, words
+from lerobot_memobench.policies.memobench_mem.alignment import embedded_texts
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
@@ -56,6 +56,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 )
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.subgoals import choices, texts_of
+from lerobot_memobench.policies.memobench_mem.text_encoders import words
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 logger = logging.getLogger(__name__)
