@@ -17,10 +17,12 @@ import lerobot_policy_memobench  # noqa: F401  (registers the environment)
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
+    MEMORY,
     MEMORY_FUSIONS,
     MemobenchMemConfig,
     UnreadError,
     readers,
+    setting,
 )
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
@@ -146,6 +148,23 @@ def test_settings_without_effect_are_refused(name: str, fields: dict[str, Any]) 
     with pytest.raises(UnreadError, match=f"policy.{name}=") as refused:
         config(**fields | {name: other(name, getattr(plain, name))})
     assert config(**fields | {name: refused.value.defaults[name]}) == plain
+
+
+@dataclasses.dataclass
+class OneMore(MemobenchMemConfig):
+    repetitions: int = setting(1, read_by=MEMORY, least=1)
+    colour: str = setting("grey", values=("grey", "red"))
+
+
+def test_a_setting_is_one_field() -> None:
+    assert OneMore(device="cpu", repetitions=2, colour="red").fixed_by_training[-2:] == ("repetitions", "colour")
+    for fields, named in (
+        ({"repetitions": 2, "memory": "none"}, "repetitions=2 has no effect: only a memory reads it"),
+        ({"repetitions": 0}, "repetitions=0 is out of range"),
+        ({"colour": "rd"}, "colour 'rd'.*red"),
+    ):
+        with pytest.raises(MemobenchError, match=named):
+            OneMore(device="cpu", **fields)
 
 
 def test_default_settings_of_another_memory_are_replaced() -> None:

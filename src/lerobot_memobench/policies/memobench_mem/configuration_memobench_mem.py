@@ -332,7 +332,7 @@ class MemobenchMemConfig(PI05Config):
             "num_inference_steps": (1,),
         }
         unread: dict[str, Reader] = {}
-        for name, reader in readers().items():
+        for name, reader in readers(self).items():
             known = [unset[name], defaults.get(name), *usual.get(name, ())]
             value = getattr(self, name)
             value = tuple(value) if isinstance(value, list) and tuple(value) in known else value
@@ -576,10 +576,10 @@ class MemobenchMemConfig(PI05Config):
             setattr(self, name, needed)
 
 
-def readers() -> dict[str, Reader]:
-    """Return the reader of each field that does not always have an effect, ours first."""
-    own = {one.name: one.metadata["read_by"] for one in fields(MemobenchMemConfig) if one.metadata.get("read_by")}
-    known = {one.name for one in fields(MemobenchMemConfig)}  # LeRobot 0.6.1 lacks those of its main branch
+def readers(config: Any = MemobenchMemConfig) -> dict[str, Reader]:
+    """Return the reader of each field of a configuration that does not always have an effect, ours first."""
+    own = {one.name: one.metadata["read_by"] for one in fields(config) if one.metadata.get("read_by")}
+    known = {one.name for one in fields(config)}  # LeRobot 0.6.1 lacks those of its main branch
     return own | {name: reader for name, reader in INHERITED_READERS.items() if name in known}
 
 
