@@ -21,7 +21,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
     MEMORY_FUSIONS,
     MemobenchMemConfig,
     UnreadError,
-    readers,
+    conditions,
     setting,
 )
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
@@ -129,17 +129,17 @@ def test_bad_values_are_refused(fields: dict[str, Any], named: str) -> None:
         config(**fields)
 
 
-def read_by(reader: str) -> list[str]:
-    return [name for name, one in readers().items() if one.name == reader]
+def used_if(feature: str) -> list[str]:
+    return [name for name, one in conditions().items() if one.name == feature]
 
 
 @pytest.mark.parametrize(
     ("name", "fields"),
     [(name, OBJECTS) for name in ("visual_encoder", "image_resolution", "empty_cameras")]
-    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *read_by("perception=objects"))]
+    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *used_if("perception=objects"))]
     + [("image_resolution", {"size": "small"})]
-    + [(name, {"memory": "none"}) for name in (*read_by("a memory"), "memory_phase", "memory_repeats")]
-    + [(name, OBJECTS) for name in read_by("objective=flow_matching")]
+    + [(name, {"memory": "none"}) for name in (*used_if("a memory"), "memory_phase", "memory_repeats")]
+    + [(name, OBJECTS) for name in used_if("objective=flow_matching")]
     + [(name, {}) for name in ("text_encoder", "subgoal_level", "subgoals", "scheduler_decay_lr", "n_obs_steps")],
 )
 def test_settings_without_effect_are_refused(name: str, fields: dict[str, Any]) -> None:
@@ -152,7 +152,7 @@ def test_settings_without_effect_are_refused(name: str, fields: dict[str, Any]) 
 
 @dataclasses.dataclass
 class OneMore(MemobenchMemConfig):
-    repetitions: int = setting(1, read_by=MEMORY, least=1)
+    repetitions: int = setting(1, used_if=MEMORY, least=1)
     colour: str = setting("grey", values=("grey", "red"))
 
 

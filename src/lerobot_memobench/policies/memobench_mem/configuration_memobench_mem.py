@@ -72,37 +72,39 @@ saved, so that both versions of LeRobot load a checkpoint."""
 # -- metadata of fields ------------------------------------------------------------------------------------------------
 
 
-class Reader(NamedTuple):
-    """A feature that reads some fields; without it, each of them must have its default.
+class Condition(NamedTuple):
+    """A condition under which some fields are used; otherwise each of them must have its default.
 
     Attributes:
-        name: for error messages. present: whether a configuration has it.
+        name: of the feature that reads the fields, for error messages. holds: whether a configuration has it.
     """
 
     name: str
-    present: Callable[[MemobenchMemConfig], bool]
+    holds: Callable[[MemobenchMemConfig], bool]
 
 
-OBJECTS = Reader("perception=objects", lambda it: it.uses_objects)
-PIXELS = Reader("perception=pixels", lambda it: not it.uses_objects)
-PICTURES = Reader("a policy that sees pictures", lambda it: it.uses_pictures)
-IMAGE_TOWER = Reader("pi0.5's image tower", lambda it: not (it.uses_objects or it.uses_visual_encoder))
-VISUAL_ENCODER = Reader("size=small perception=pixels", lambda it: it.uses_visual_encoder)
-STATE_TOKEN = Reader("a policy whose state is a token", lambda it: it.state_token)
-MEMORY = Reader("a memory", lambda it: it.memory != NONE)
-OBJECT_MEMORY = Reader(
+OBJECTS = Condition("perception=objects", lambda it: it.uses_objects)
+PIXELS = Condition("perception=pixels", lambda it: not it.uses_objects)
+PICTURES = Condition("a policy that sees pictures", lambda it: it.uses_pictures)
+IMAGE_TOWER = Condition("pi0.5's image tower", lambda it: not (it.uses_objects or it.uses_visual_encoder))
+VISUAL_ENCODER = Condition("size=small perception=pixels", lambda it: it.uses_visual_encoder)
+STATE_TOKEN = Condition("a policy whose state is a token", lambda it: it.state_token)
+MEMORY = Condition("a memory", lambda it: it.memory != NONE)
+OBJECT_MEMORY = Condition(
     "a memory of objects other than motion",
     lambda it: it.uses_objects and it.memory != NONE and not find_mechanism(it.memory).asks_motion,
 )
-TEXT_MEMORY = Reader("a memory that learns from texts", lambda it: it.privileged_memory)
-ALIGNMENT = Reader("an alignment", lambda it: it.align != NONE)
-TEXTS = Reader("an alignment or a memory that learns from texts", lambda it: it.align != NONE or it.privileged_memory)
-FLOW = Reader("objective=flow_matching", lambda it: it.objective == FLOW_MATCHING)
-RELATIVE_ACTIONS = Reader("use_relative_actions=true", lambda it: it.use_relative_actions)
-COMPILED = Reader("compile_model=true", lambda it: it.compile_model)
-PLAIN_PI05 = Reader("policy=pi05", lambda _: False)
+TEXT_MEMORY = Condition("a memory that learns from texts", lambda it: it.privileged_memory)
+ALIGNMENT = Condition("an alignment", lambda it: it.align != NONE)
+TEXTS = Condition(
+    "an alignment or a memory that learns from texts", lambda it: it.align != NONE or it.privileged_memory
+)
+FLOW = Condition("objective=flow_matching", lambda it: it.objective == FLOW_MATCHING)
+RELATIVE_ACTIONS = Condition("use_relative_actions=true", lambda it: it.use_relative_actions)
+COMPILED = Condition("compile_model=true", lambda it: it.compile_model)
+PLAIN_PI05 = Condition("policy=pi05", lambda _: False)
 
-INHERITED_READERS: Mapping[str, Reader] = {
+INHERITED_CONDITIONS: Mapping[str, Condition] = {
     "empty_cameras": PIXELS,
     "max_state_dim": STATE_TOKEN,
     **dict.fromkeys(("rtc_config", "time_sampling_beta_alpha", "time_sampling_beta_beta"), FLOW),
@@ -112,13 +114,13 @@ INHERITED_READERS: Mapping[str, Reader] = {
     **dict.fromkeys(("paligemma_variant", "action_expert_variant", "n_obs_steps", *PI05_ALONE), PLAIN_PI05),
     **dict.fromkeys(("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"), PLAIN_PI05),
 }
-"""LeRobot's fields that do not always have an effect -> their readers."""
+"""LeRobot's fields that are not always used -> their conditions."""
 
 
 def setting(
     default: Any,
     *,
-    read_by: Reader | None = None,
+    used_if: Condition | None = None,
     values: Iterable[str] = (),
     least: float = -math.inf,
     most: float = math.inf,
@@ -127,11 +129,11 @@ def setting(
 
     Args:
         default: its default, or ``dict`` for an empty one.
-        read_by: the feature without which the field has no effect; None: it always has one.
+        used_if: the condition without which the field has no effect; None: it is always used.
         values: accepted values; empty for any value of the type.
         least, most: accepted range.
     """
-    metadata = {"read_by": read_by, "values": tuple(values), "least": least, "most": most}
+    metadata = {"used_if": used_if, "values": tuple(values), "least": least, "most": most}
     kind: dict[str, Any] = {"default_factory": dict} if default is dict else {"default": default}
     return field(**kind, metadata=metadata)
 
@@ -167,16 +169,16 @@ class MemobenchMemConfig(PI05Config):
     perception: str = setting("pixels", values=PERCEPTIONS)
     """Source of observation tokens: ``pixels``, encoded by a frozen network, or ``objects``, the slots of
     ``observation.environment_state`` (`sim.object_slots`): privileged object state, or detections."""
-    detector: str | None = setting(None, read_by=OBJECTS)
+    detector: str | None = setting(None, used_if=OBJECTS)
     """With ``perception=objects``: detect objects in pictures by this detector, instead of reading privileged object
     state. ``package``, or a file of `python -m research.detector train`. A checkpoint holds only its name."""
-    visual_encoder: str | None = setting(None, read_by=VISUAL_ENCODER)
+    visual_encoder: str | None = setting(None, used_if=VISUAL_ENCODER)
     """With pixels at ``size=small``: the frozen encoder of pictures, of ``package`` (the default) or of a detector's
     file. A checkpoint holds its weights."""
-    detection_noise: float = setting(0.0, read_by=OBJECTS, least=0)
+    detection_noise: float = setting(0.0, used_if=OBJECTS, least=0)
     """Size of the errors added to privileged object state in training, so that the policy later acts by a
     ``detector``. 1: as large as the errors of the package's detector; 0: none."""
-    object_classes: list[str] | None = setting(None, read_by=OBJECTS)
+    object_classes: list[str] | None = setting(None, used_if=OBJECTS)
     """Names of the object classes in order of their indices; None: the classes of this version."""
 
     base_weights: str | None = None
@@ -185,14 +187,14 @@ class MemobenchMemConfig(PI05Config):
     # -- alignment
     align: str = setting("none", values=ALIGN_WEIGHTS)
     """How memory is aligned with checkpoint language: ``none``, ``semantic``, ``contrastive`` or ``framewise``."""
-    subgoal_level: str = setting("intermediate", read_by=TEXTS, values=SUBGOAL_LEVELS)
+    subgoal_level: str = setting("intermediate", used_if=TEXTS, values=SUBGOAL_LEVELS)
     """Level of the checkpoint language: ``coarse``, ``intermediate`` or ``fine``."""
-    align_targets: str = setting(SUBGOALS, read_by=ALIGNMENT, values=ALIGN_TARGETS)
+    align_targets: str = setting(SUBGOALS, used_if=ALIGNMENT, values=ALIGN_TARGETS)
     """Texts that memory is aligned with: ``subgoals``, or a control. ``shuffled`` (the paper's) permutes them within
     each episode; an episode with fewer than three takes texts of other episodes; the permutation is the same in every
     epoch and on every machine. ``progress`` cuts the words that differ between the episodes of a task, and with them
     the hidden answer. ``answers`` is one text per episode, all its subgoals, which does not name its progress."""
-    text_encoder: str | None = setting(None, read_by=ALIGNMENT)
+    text_encoder: str | None = setting(None, used_if=ALIGNMENT)
     """Encoder of subgoal texts: ``words`` (hashed words), ``labels`` (a random vector per text), or the folder or
     repository of a SigLIP model; None: the default of the size."""
 
@@ -200,25 +202,25 @@ class MemobenchMemConfig(PI05Config):
     memory: str = "frames"
     """The memory mechanism: ``frames``, another one of `memory` or of an installed package, or ``none``: plain pi0.5,
     the baseline without a memory."""
-    memory_settings: dict[str, Any] = setting(dict, read_by=MEMORY)
+    memory_settings: dict[str, Any] = setting(dict, used_if=MEMORY)
     """Settings of the mechanism (the ``Settings`` of its class); a setting that is not given has its default."""
-    memory_fusion: str | None = setting(FROM_SIZE, read_by=MEMORY, values=MEMORY_FUSIONS)
+    memory_fusion: str | None = setting(FROM_SIZE, used_if=MEMORY, values=MEMORY_FUSIONS)
     """How actions read memory: ``modulation``, ``context`` (memory joins the prefix) or ``own`` (the mechanism's own
     way). None: ``own`` if the mechanism has one, else ``modulation``."""
-    subgoals: dict[str, list[str]] | None = setting(None, read_by=TEXT_MEMORY)
+    subgoals: dict[str, list[str]] | None = setting(None, used_if=TEXT_MEMORY)
     """Instruction -> texts of its checkpoints, for a memory that learns from texts; None: those of the dataset."""
     oracle_memory: bool = False
     """Control of the paper: ground-truth memory text in the prompt, from the dataset's column ``memory`` in training
     and from the environment (``--env.oracle_memory=true``) in evaluation."""
-    memory_camera: str | None = setting(None, read_by=PICTURES)
+    memory_camera: str | None = setting(None, used_if=PICTURES)
     """Camera whose pictures are remembered; None: the first of the policy's."""
-    memory_stride: int = setting(FROM_SIZE, read_by=MEMORY, least=1)
+    memory_stride: int = setting(FROM_SIZE, used_if=MEMORY, least=1)
     """Control steps between remembered frames; None: the mechanism's, or 8 if training decodes no video (objects, or
     pixels through a visual encoder), else 1."""
-    memory_phase: bool = setting(False, read_by=OBJECT_MEMORY)
+    memory_phase: bool = setting(False, used_if=OBJECT_MEMORY)
     """Whether a remembered frame of objects records its phase, prompt or execution. A memory with this information can
     count the steps since the execution began, which strict tasks hide."""
-    memory_repeats: bool = setting(True, read_by=OBJECT_MEMORY)
+    memory_repeats: bool = setting(True, used_if=OBJECT_MEMORY)
     """Whether a frame equal to the last remembered one is remembered too. If false, the holds of strict tasks do not
     fill the memory, and do not use up the frames that a chunk reads."""
 
@@ -241,7 +243,7 @@ class MemobenchMemConfig(PI05Config):
     its maximum at ``size=small``."""
 
     # -- pi0.5's fields with other defaults or checks
-    freeze_vision_encoder: bool = setting(True, read_by=PLAIN_PI05)
+    freeze_vision_encoder: bool = setting(True, used_if=PLAIN_PI05)
     """Always true: memory tokens are cached features of the image tower."""
     chunk_size: int = FROM_SIZE
     """Actions of a chunk; None: 16 at ``small``, else 50."""
@@ -249,9 +251,9 @@ class MemobenchMemConfig(PI05Config):
     """Actions executed of a chunk before the next one is planned; None: 6 at ``small``, else 50. A policy of objects
     executes the chunk's following actions if its hand has stalled (`rollout.Row.begin_chunk`)."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
-    num_inference_steps: int = setting(10, read_by=FLOW, least=1)
+    num_inference_steps: int = setting(10, used_if=FLOW, least=1)
     """Steps from noise to actions, with flow matching."""
-    image_resolution: tuple[int, int] | None = setting(None, read_by=IMAGE_TOWER)
+    image_resolution: tuple[int, int] | None = setting(None, used_if=IMAGE_TOWER)
     tokenizer_name: str | None = None
     tokenizer_max_length: int | None = None
     optimizer_lr: float | None = None
@@ -331,17 +333,17 @@ class MemobenchMemConfig(PI05Config):
             "memory_camera": (f"{OBS_IMAGES}.{next(iter(CAMERAS))}",),
             "num_inference_steps": (1,),
         }
-        unread: dict[str, Reader] = {}
-        for name, reader in readers(self).items():
+        unread: dict[str, Condition] = {}
+        for name, condition in conditions(self).items():
             known = [unset[name], defaults.get(name), *usual.get(name, ())]
             value = getattr(self, name)
             value = tuple(value) if isinstance(value, list) and tuple(value) in known else value
-            if value not in known and not reader.present(self):
-                unread[name] = reader
-        for name, reader in unread.items():
+            if value not in known and not condition.holds(self):
+                unread[name] = condition
+        for name, condition in unread.items():
             raise UnreadError(
-                f"--policy.{name}={getattr(self, name)} has no effect: only {reader.name} reads it; leave it out, or "
-                f"set it to its default, {json.dumps(unset[name])}.",
+                f"--policy.{name}={getattr(self, name)} has no effect: only {condition.name} reads it; leave it "
+                f"out, or set it to its default, {json.dumps(unset[name])}.",
                 {one: unset[one] for one in unread},
             )
         if self.memory == NONE:
@@ -576,18 +578,18 @@ class MemobenchMemConfig(PI05Config):
             setattr(self, name, needed)
 
 
-def readers(config: Any = MemobenchMemConfig) -> dict[str, Reader]:
-    """Return the reader of each field of a configuration that does not always have an effect, ours first."""
-    own = {one.name: one.metadata["read_by"] for one in fields(config) if one.metadata.get("read_by")}
+def conditions(config: Any = MemobenchMemConfig) -> dict[str, Condition]:
+    """Return the conditions of the fields of a configuration that are not always used, ours first."""
+    own = {one.name: one.metadata["used_if"] for one in fields(config) if one.metadata.get("used_if")}
     known = {one.name for one in fields(config)}  # LeRobot 0.6.1 lacks those of its main branch
-    return own | {name: reader for name, reader in INHERITED_READERS.items() if name in known}
+    return own | {name: condition for name, condition in INHERITED_CONDITIONS.items() if name in known}
 
 
 def memory_defaults() -> dict[str, Any]:
     """Return the fields that a memory does not take over from another memory's checkpoint -> their defaults.
 
-    Construction converts ``memory_settings``.
+    ``memory_settings`` are not among them: construction converts them.
     """
     own = {one.name: one.default for one in fields(MemobenchMemConfig)}
-    of_memory = [name for name, reader in readers().items() if reader in (MEMORY, OBJECT_MEMORY, TEXT_MEMORY)]
+    of_memory = [name for name, condition in conditions().items() if condition in (MEMORY, OBJECT_MEMORY, TEXT_MEMORY)]
     return {name: own[name] for name in of_memory if name != "memory_settings"}
