@@ -396,7 +396,10 @@ def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
         ):
             continue
         text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
-        default = "" if node.value is None else ast.unparse(node.value)
+        value = node.value
+        if isinstance(value, ast.Call) and ast.unparse(value.func) == "setting":
+            value = value.args[0]
+        default = "" if value is None else ast.unparse(value)
         factory = re.fullmatch(r"field\(default_factory=(.*)\)", default)
         default = {"FROM_SIZE": "by size", "BY_DIALECT": "by dialect", "dict": "{}", "tuple": "()", "list": "[]"}.get(
             factory[1] if factory else default, default

@@ -24,7 +24,7 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import check_checkpoint, folder_with_checkpoint
+from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_folder
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.command_line import OPTIONS, SHORT_FORMS, parse_words
@@ -429,7 +429,7 @@ def test_a_copied_run_has_no_link(training: Called, last: str | None, lost: str 
     found = Path("run/checkpoints/000080" if last is lost is None else "run/checkpoints/000040") / "pretrained_model"
     if lost is None:
         for text in ("run", "run/checkpoints/last", "run/checkpoints/last/pretrained_model"):
-            assert folder_with_checkpoint(text) == found
+            assert checkpoint_folder(text) == found
     assert main(RESUME) == 0
     assert training.config_path == str(found / "train_config.json")
     assert not link.exists(), "LeRobot makes it"

@@ -67,14 +67,6 @@ SHORT_TRAINING = 2000
 """Updates below which losses are logged ten times; LeRobot's default of every 200 updates would log too few."""
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """Settings that name the model to train."""
-MEMORY_DEFAULTS: Mapping[str, object] = {
-    "memory_stride": None,
-    "memory_fusion": None,
-    "memory_phase": False,
-    "memory_repeats": True,
-    "subgoals": None,
-}
-"""Settings that a memory does not take over from another memory's checkpoint or recipe -> their defaults."""
 SMALLEST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0, "eval.n_episodes": 1}
 """Setting -> its smallest value."""
 
@@ -245,10 +237,13 @@ def with_memory_defaults(asked: CommandSettings) -> CommandSettings:
         return asked
     folder = None if path is None else local_folder(path)
     begun = read_json(folder / POLICY_CONFIG) if folder is not None else asked.file.get("policy") or {}
-    held = begun.get("memory") or ("none" if begun.get("memory_fusion") == "none" else "frames")
-    if begun.get("type") != MEMORY_POLICY or held == ("frames" if memory == "null" else memory):
+    if begun.get("type") != MEMORY_POLICY:
         return asked
-    defaults = {f"policy.{name}": value for name, value in MEMORY_DEFAULTS.items()}
+    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig, memory_defaults
+
+    if begun.get("memory", MemobenchMemConfig.memory) == memory:
+        return asked
+    defaults = {f"policy.{name}": value for name, value in memory_defaults().items()}
     return replace(asked, words={**defaults, **asked.words})
 
 

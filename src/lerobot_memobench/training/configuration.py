@@ -72,7 +72,8 @@ def check_settings(config: TrainPipelineConfig) -> None:
     for name, value in vars(config).items():
         for setting, found in () if name in READ else changes(name, value, getattr(unused, name, None)):
             raise MemobenchError(f"{setting}={found} has no effect on policy={policy.type}; leave it out")
-    encoded = config.dataset.image_transforms.enable and policy.encodes_ahead
+    encodes_ahead = policy.uses_detector or policy.uses_visual_encoder
+    encoded = config.dataset.image_transforms.enable and encodes_ahead
     no_optimizer = config.optimizer is None and not config.use_policy_training_preset
     new_policy = not policy.pretrained_path and not config.resume
     repository = policy.repo_id
