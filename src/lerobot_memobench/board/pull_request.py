@@ -19,7 +19,8 @@ def pull_request(name: str, about: About, evaluation: Evaluation) -> str:
     Args:
         name: of the row's folder.
     """
-    stated = {**about.model_dump(exclude={"links"}, exclude_none=True), **about.links}
+    stated = about.model_dump(exclude_none=True)
+    stated |= stated.pop("links")
     lines = [
         f"This pull request adds `results/board/{name}` and changes nothing else: `{CARD}`, `{LOG}` and, for a "
         f"control, the same two files in {' and '.join(f'`{control}`' for control in CONTROLS)}.",
