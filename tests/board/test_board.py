@@ -128,6 +128,15 @@ DOCTORED: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "unknown observations": (in_card(lambda card: card["protocol"].update(obs_type="eyes")), "obs_type is 'eyes'"),
     "line of a control": (in_log(lambda log: log[0].update(corrupt="delete")), "corrupt: none and delete"),
+    "line of a control, as of an earlier version": (
+        lambda folder: (
+            in_card(lambda card: card["protocol"].pop("scene_hash_version"))(folder),
+            in_log(lambda log: log[0].update(corrupt="delete"))(folder),
+        ),
+        "corrupt: none and delete",
+    ),
+    "no replan interval": (in_log(lambda log: log[0].pop("replan_steps")), "has no replan_steps"),
+    "list of suites": (in_card(lambda card: card["protocol"].update(suite=["strict"])), "found suite="),
     "pauses in the log only": (in_log(lambda log: log[0].update(paused_steps=300)), "pause_steps: 0 and 300 in all"),
     "other seeds": (in_card(lambda card: card["protocol"].update(seed_base=20_000)), "seeds that count"),
     "shifted seed": (in_log(lambda log: log[3].update(seed=99), card=True), "seed_base: 7 and "),

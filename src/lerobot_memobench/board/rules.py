@@ -23,7 +23,7 @@ from lerobot_memobench.protocol import EVALUATION_EPISODES, EVIDENCE_EPISODES, P
 from lerobot_memobench.run.card import PACKAGES
 from lerobot_memobench.run.sealed import policy_hash, scenes_hash
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import LIBERO_SUITES
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 
 FEWEST, MOST = 10, EVALUATION_EPISODES
 """Episodes of each task, without evidence."""
@@ -78,13 +78,13 @@ def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool
 def _check_settings(run: Evaluation, **control: Any) -> None:
     """Check that the settings are those of the board, and of a control."""
     protocol = run.protocol
-    if protocol.get("suite") in LIBERO_SUITES:
+    if protocol["suite"] not in (PUBLISHED, STRICT):
         raise MemobenchError(
             f"{run.place}: found suite={protocol['suite']}; the board is of memory tasks, published or strict"
         )
     try:
         board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
-    except (MemobenchError, TypeError) as error:
+    except MemobenchError as error:
         raise MemobenchError(f"{run.place}: {error}") from None
     fixed = {key: value for key, value in board.protocol_block.items() if key not in MAY_DIFFER}
     if missing := sorted({*fixed, *MAY_DIFFER} - {*protocol}):
