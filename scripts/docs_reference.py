@@ -65,6 +65,7 @@ PUBLIC = {
     "Comparison": ("evaluation.comparison", "Comparison Difference compare"),
     "Datasets": ("datasets.lerobot_format.reading", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
+    "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
     "Errors": ("errors", "MemobenchError"),
     "Constants": ("protocol", ""),
 }
@@ -101,8 +102,9 @@ def plain(docstring: str | None) -> str:
 
 def short_forms(command: str) -> list[list[str]]:
     """Return the rows of ``lerobot <command> --help``: short form, meaning, default."""
-    text = (SOURCE / "cli" / f"lerobot_{command}.txt").read_text()
-    rows = []
+    from lerobot_memobench.cli.lerobot import help_of
+
+    text, rows = help_of(command), []
     for typed, lines in re.findall(r"^  (\S.*)\n((?: {8}.*\n)+)", text, re.MULTILINE):
         meaning, default = re.fullmatch(r"(.*?)(?: \(default: (.*)\))?", " ".join(lines.split())).groups("")
         rows.append([typed, meaning, default])
@@ -126,7 +128,10 @@ def lerobot_page() -> str:
             for typed, meaning, default in short_forms(command)
         ]
         parts += [f"## lerobot {command}", f"```text\n{example}\n```", table(["short form", "sets", "default"], rows)]
-    rows = [[code(f"env.{name}"), code(default), meaning] for name, default, meaning in environment_fields()]
+    rows = [
+        [code(f"env.{name}"), html.escape(default, quote=False), meaning]
+        for name, default, meaning in environment_fields()
+    ]
     parts += ["## Environment settings", table(["setting", "default", "meaning"], rows)]
     return "\n\n".join(parts) + "\n"
 
@@ -137,7 +142,8 @@ def environment_fields() -> Iterator[tuple[str, str, str]]:
 
     for field in dataclasses.fields(EnvSettings):
         values = ", ".join(code(value) for value in field.metadata["values"] or ())
-        yield field.name, repr(field.default), f"{field.metadata['meaning']}{f' ({values})' if values else ''}"
+        default = field.metadata["usual"] or repr(field.default)
+        yield field.name, default, f"{field.metadata['meaning']}{f' ({values})' if values else ''}"
     tree = class_of(SOURCE / "envs" / "configuration_memobench.py", "MemobenchEnvConfig")
     meaning = arguments(ast.get_docstring(tree) or "")
     for node in tree.body:
@@ -388,7 +394,10 @@ def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
         ):
             continue
         text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
-        default = "" if node.value is None else ast.unparse(node.value)
+        value = node.value
+        if isinstance(value, ast.Call) and ast.unparse(value.func) == "setting":
+            value = value.args[0]
+        default = "" if value is None else ast.unparse(value)
         factory = re.fullmatch(r"field\(default_factory=(.*)\)", default)
         default = {"FROM_SIZE": "by size", "BY_DIALECT": "by dialect", "dict": "{}", "tuple": "()", "list": "[]"}.get(
             factory[1] if factory else default, default
@@ -429,10 +438,9 @@ def python_page() -> str:
     """Return the page of the Python API, which mkdocstrings completes."""
     parts = ["# Python API", "Public modules. All others may change between versions."]
     for heading, (module, names) in PUBLIC.items():
+        module = module if module == "mujoco_raster" else f"lerobot_memobench.{module}"
         parts.append(f"## {heading}")
-        parts += [f"::: lerobot_memobench.{module}.{name}" for name in names.split()] or [
-            f"::: lerobot_memobench.{module}"
-        ]
+        parts += [f"::: {module}.{name}" for name in names.split()] or [f"::: {module}"]
     return "\n\n".join(parts) + "\n"
 
 

@@ -14,6 +14,7 @@ SMALLEST = {
     "dataset_writing": "--episodes 1 --repeats 1 --ways write",
     "gpu": "--size tiny --device cpu --steps 1 --out {folder}/gpu.jsonl",
     "memory_cost": "--memory none bank --steps 30 --repeats 1",
+    "mujoco_renderers": "--frames 1 --backends egl",
     "object_update": "src --rounds 1 --memory frames",
     "step_with_objects": "--steps 5 --repeats 1 --tasks 1",
 }

@@ -38,7 +38,7 @@ PER_1000_LINES = {
 }
 """Words -> pattern and maximum number per 1,000 lines."""
 TEXTS = {
-    "package": ("src/lerobot_memobench",),
+    "package": ("src/lerobot_memobench", "src/mujoco_raster"),
     "pages": ("README.md", "docs/start", "docs/guides", "docs/benchmark", "docs/develop", "docs/develop.md"),
     "scripts": ("scripts", "benchmarks"),
 }
@@ -74,7 +74,7 @@ def old_words(root: Path) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("root", ["src/lerobot_memobench", "research", "examples"])
+@pytest.mark.parametrize("root", ["src/lerobot_memobench", "src/mujoco_raster", "research", "examples"])
 def test_public_names_are_terms_of_the_field(root: str) -> None:
     assert old_words(ROOT / root) == []
 

@@ -21,12 +21,12 @@ from lerobot_memobench.experts.hand import downward
 from lerobot_memobench.sim.asset import TABLE, TABLE_TOP, Asset, Grasp
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
+from mujoco_raster.highlights import Highlight
 
 Array = NDArray[np.float64]
 

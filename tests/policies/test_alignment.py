@@ -11,13 +11,11 @@ import torch
 
 from lerobot_memobench.datasets.frames import FrameTable
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment import (
-    WordTextEncoder,
-    make_alignment,
-    retrieval_accuracy,
-)
+from lerobot_memobench.policies.memobench_mem.alignment import make_alignment, retrieval_accuracy
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.targets import answers, progress, shuffled_subgoals, with_targets
+from lerobot_memobench.policies.memobench_mem.targets import answers, progress, shuffled_subgoals
+from lerobot_memobench.policies.memobench_mem.text_encoders import WordTextEncoder
+from lerobot_memobench.training.texts import with_targets
 from tests.support.small_policy import batch_of, made_for_training
 
 B, F, P, D, T = 5, 3, 4, 6, 7

@@ -31,12 +31,13 @@ from lerobot_memobench.policies.checkpoint import (
     check_as_trained,
     check_checkpoint,
     check_registered,
+    check_statistics,
     check_weights,
     checkpoint_type,
     shipped_policies,
 )
 from lerobot_memobench.policies.compatibility import cameras_read, check_features
-from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreement, require_statistics
+from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreement
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.run.card import training_facts
@@ -357,7 +358,7 @@ def test_damaged_files_end_in_a_result_or_an_error(tmp_path: Path, kind: str, co
         training_facts(damaged)
         check_checkpoint(str(damaged))
         checkpoint_type(str(damaged))
-        require_statistics(damaged)
+        check_statistics(damaged)
         require_agreement(damaged, None, MemobenchMemConfig(device="cpu"), training=True)
 
     found = mutations.ends_well(range(count), prepare, use, whole, ("it",))

@@ -17,10 +17,12 @@ import lerobot_policy_memobench  # noqa: F401  (registers the environment)
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
+    MEMORY,
     MEMORY_FUSIONS,
-    READERS,
     MemobenchMemConfig,
     UnreadError,
+    conditions,
+    setting,
 )
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
@@ -127,13 +129,17 @@ def test_bad_values_are_refused(fields: dict[str, Any], named: str) -> None:
         config(**fields)
 
 
+def used_if(feature: str) -> list[str]:
+    return [name for name, one in conditions().items() if one.name == feature]
+
+
 @pytest.mark.parametrize(
     ("name", "fields"),
     [(name, OBJECTS) for name in ("visual_encoder", "image_resolution", "empty_cameras")]
-    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *READERS["perception=objects"][1].split())]
+    + [(name, {"size": "tiny"}) for name in ("max_state_dim", *used_if("perception=objects"))]
     + [("image_resolution", {"size": "small"})]
-    + [(name, {"memory": "none"}) for name in (*READERS["a memory"][1].split(), "memory_phase", "memory_repeats")]
-    + [(name, OBJECTS) for name in READERS["objective=flow_matching"][1].split()]
+    + [(name, {"memory": "none"}) for name in (*used_if("a memory"), "memory_phase", "memory_repeats")]
+    + [(name, OBJECTS) for name in used_if("objective=flow_matching")]
     + [(name, {}) for name in ("text_encoder", "subgoal_level", "subgoals", "scheduler_decay_lr", "n_obs_steps")],
 )
 def test_settings_without_effect_are_refused(name: str, fields: dict[str, Any]) -> None:
@@ -142,6 +148,23 @@ def test_settings_without_effect_are_refused(name: str, fields: dict[str, Any]) 
     with pytest.raises(UnreadError, match=f"policy.{name}=") as refused:
         config(**fields | {name: other(name, getattr(plain, name))})
     assert config(**fields | {name: refused.value.defaults[name]}) == plain
+
+
+@dataclasses.dataclass
+class OneMore(MemobenchMemConfig):
+    repetitions: int = setting(1, used_if=MEMORY, least=1)
+    colour: str = setting("grey", values=("grey", "red"))
+
+
+def test_a_setting_is_one_field() -> None:
+    assert OneMore(device="cpu", repetitions=2, colour="red").fixed_by_training[-2:] == ("repetitions", "colour")
+    for fields, named in (
+        ({"repetitions": 2, "memory": "none"}, "repetitions=2 has no effect: only a memory reads it"),
+        ({"repetitions": 0}, "repetitions=0 is out of range"),
+        ({"colour": "rd"}, "colour 'rd'.*red"),
+    ):
+        with pytest.raises(MemobenchError, match=named):
+            OneMore(device="cpu", **fields)
 
 
 def test_default_settings_of_another_memory_are_replaced() -> None:

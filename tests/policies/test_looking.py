@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import pkgutil
+from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchExpertConfig, MemobenchRandomConfig
 from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy, MemobenchRandomPolicy
-from lerobot_memobench.run.rollout import needs_observation
+from lerobot_memobench.run.rollout import CHUNKED, ActionQueue, plans_chunks
 from tests.support.policy_server import PolicyServer
 from tests.support.remote_case import counting, make
 from tests.support.small_policy import made_for_training
@@ -59,8 +64,8 @@ def acted(
             always shown.
     """
     torch.manual_seed(0)
-    policy.reset()
-    looks, seen, actions = needs_observation(policy), [], []
+    queue, seen, actions = ActionQueue(policy), [], []
+    queue.reset()
     shown, phases = True, None
     for time in range(STEPS):
         rows = clock(time)
@@ -71,9 +76,8 @@ def acted(
             seen.append(time)
         elif blind:
             batch |= {key: torch.full((len(rows), 3, 96, 96), torch.nan) for key in CAMERAS}
-        with torch.inference_mode():
-            actions.append(policy.select_action(before(batch)))
-        shown = looks()
+        actions.append(queue.select(before(batch)))
+        shown = queue.needs_observation()
     return torch.stack(actions), seen
 
 
@@ -111,22 +115,49 @@ def test_act() -> None:
     check(act(temporal_ensemble_coeff=0.01, n_action_steps=1), execution, range(STEPS))
 
 
+@pytest.mark.parametrize("name", CHUNKED)
+def test_a_queued_plan_has_the_actions_of_lerobot(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot may change ``select_action``: here it plans by the number of plans before."""
+    kind = pkgutil.resolve_name(name)
+    monkeypatch.setattr(kind, "eval", lambda self: self)
+
+    def made() -> Any:
+        policy, plans = kind.__new__(kind), itertools.count()
+        torch.nn.Module.__init__(policy)
+        policy.config = SimpleNamespace(temporal_ensemble_coeff=None, n_action_steps=PLAN, rtc_config=None)
+        policy._action_queue, policy._queues = deque(), {ACTION: deque(maxlen=PLAN)}
+        policy._prepare_batch = lambda batch: batch
+        plan = lambda batch, *_: torch.arange(2 * 7 * 7.0).view(2, 7, 7) + 1000 * next(plans)  # noqa: E731
+        policy.predict_action_chunk = policy._get_action_chunk = plan
+        policy.reset = lambda: None
+        return policy
+
+    alone, queue = made(), ActionQueue(made())
+    for _ in range(2 * PLAN + 1):
+        assert torch.equal(queue.select({}), alone.select_action({}))
+
+
 def test_unknown_policies_need_every_observation() -> None:
     class Watchful(type(act())):  # type: ignore[misc]
         def select_action(self, batch: dict[str, Tensor]) -> Tensor:
             return super().select_action(batch)  # type: ignore[no-any-return]
 
     policy = act()
+    assert plans_chunks(policy)
     assert not needs_after_a_plan(policy)
+    policy.config.temporal_ensemble_coeff = 0.01
+    assert not plans_chunks(policy)
+    policy.config.temporal_ensemble_coeff = None
     policy.__class__ = Watchful
     assert needs_after_a_plan(policy)
-    assert needs_observation(object())()
+    assert ActionQueue(object()).needs_observation()
 
 
 def needs_after_a_plan(policy: Any) -> bool:
-    policy.reset()
-    policy.select_action(observation(execution(0), 0))
-    return needs_observation(policy)()
+    queue = ActionQueue(policy)
+    queue.reset()
+    queue.select(observation(execution(0), 0))
+    return queue.needs_observation()
 
 
 def test_baselines_need_no_observations() -> None:

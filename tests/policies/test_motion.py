@@ -30,6 +30,7 @@ from lerobot_memobench.policies.memobench_mem.motion_fields import (
     REACH,
     UNCHANGED,
     ObjectMotion,
+    PictureMotion,
     match_blocks,
 )
 from lerobot_memobench.policies.memobench_mem.objects import frame_row
@@ -94,6 +95,14 @@ def field_of_objects() -> ObjectMotion:
 def moved(field: Tensor) -> Tensor:
     """Return displacement along x, change of the joint, and whether it is known, for each cell."""
     return torch.stack([field[..., 0] / PER_STEP, field[..., 3] / PER_STEP, field[..., MOVED]], dim=-1)
+
+
+def test_frames_of_a_batch_may_be_strided() -> None:
+    """Those of a training are slices of longer histories."""
+    field, frames = PictureMotion(16, 8), torch.randint(0, 255, (3, 4, THUMBNAIL**2), dtype=torch.uint8)
+    strided = frames[:, :2].transpose(0, 1)
+    assert torch.equal(field.between(strided, strided), field.between(strided.contiguous(), strided.contiguous()))
+    assert field.following(frames)[0].shape == (3, 3, BLOCKS**2, 2)
 
 
 def test_things_are_matched_by_class_and_place() -> None:

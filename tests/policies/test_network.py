@@ -226,7 +226,7 @@ def test_instruction_conditions_norms_without_its_padding() -> None:
     exchanged = condition(tokens[:, [0, 2, 1, *range(3, 12)]])
     assert ((exchanged - found).abs().amax(dim=1) > 1e-3).all(), "the order of words counts"
     with torch.no_grad():
-        model.instruction.positions.zero_()  # as in checkpoints of earlier versions
+        model.instruction.positions.zero_()  # zeros give the mean word
     torch.testing.assert_close(condition(tokens[:, [0, 2, 1, *range(3, 12)]]), condition(tokens))
 
 

@@ -27,7 +27,6 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     WordTokenizerProcessorStep,
 )
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout, Row
-from lerobot_memobench.policies.update_checkpoint import update_checkpoint
 from lerobot_memobench.protocol import CONTROL_HZ, ENDED, EXECUTION, NO_CLOCK, PROMPT
 from lerobot_memobench.training.average import begin_average
 from lerobot_memobench.training.data import Training
@@ -417,65 +416,6 @@ def test_base_weights_are_loaded_except_for_the_memory(trained: Any, tmp_path: P
     own = {name: one for name, one in policy.model.named_parameters() if name not in memory}
     assert own.keys() == dict(plain.named_parameters()).keys()
     assert all(torch.equal(own[name], tensor) for name, tensor in plain.named_parameters())
-
-
-def nested(name: str) -> str:
-    """Return the earlier name of a tensor."""
-    norm = "model.paligemma_with_expert.gemma_expert.model.layers.{}.post_attention_layernorm."
-    if name.startswith("model.modulators."):
-        _, _, layer, rest = name.split(".", 3)
-        return norm.format(layer) + f"modulator.{rest}"
-    if ".gemma_expert." in name:
-        return name.replace("post_attention_layernorm.", "post_attention_layernorm.norm.")
-    return name
-
-
-OLD = {"memory_frames": 32, "tokens_per_frame": 2, "open_gate": False, "full_chunk_when_stalled": True}
-
-
-@pytest.mark.parametrize(
-    ("old", "noted", "refused"),
-    [
-        ({"memory_frames": 8, "open_gate": True, "full_chunk_when_stalled": False}, ["open_gate", "full_chunk"], None),
-        (
-            {"memory_fusion": "none", "memory": None, "memory_stride": 8, "align": "none", "text_encoder": "words"},
-            [],
-            None,
-        ),
-        ({"memory_settings": {"time_codes": False, "content": True}}, [], "time_codes"),
-    ],
-    ids=["notes", "no memory", "time_codes"],
-)
-def test_checkpoints_of_earlier_versions_are_updated(
-    trained: Any, tmp_path: Path, old: dict[str, Any], noted: list[str], refused: str | None
-) -> None:
-    folder = copied(trained[3], tmp_path / "it")
-    file, processor = folder / "config.json", folder / "policy_preprocessor.json"
-    content = json.loads(processor.read_text())
-    step = next(one for one in content["steps"] if one["registry_name"] == "memobench_gather_memory")
-    step["config"] = {"frames": 32, "align": "none", "shuffle_seed": 7}
-    processor.write_text(json.dumps(content))
-    weights = load_file(folder / "model.safetensors")
-    save_file({nested(name): tensor for name, tensor in weights.items()}, folder / "model.safetensors")
-    (folder.parent / "training_state").mkdir()
-    file.write_text(json.dumps(json.loads(file.read_text()) | OLD | {"memory_settings": {"content": True}} | old))
-    if refused is not None:
-        with pytest.raises(MemobenchError, match=refused):
-            update_checkpoint(folder)
-        return
-    notes = update_checkpoint(folder)
-    assert not (folder.parent / "training_state").exists()
-    assert notes.pop().startswith("the training cannot be resumed")
-    assert load_file(folder / "model.safetensors").keys() == weights.keys()
-    assert [any(one.startswith(name) for one in notes) for name in noted] == [True] * len(noted)
-    assert bool(notes) == bool(noted)
-    found: Any = PreTrainedConfig.from_pretrained(folder)
-    if old.get("memory_fusion") == "none":
-        assert (found.memory, found.memory_fusion) == ("none", None)
-        return
-    assert found.memory_settings == {"frames": old.get("memory_frames", 32), "content": True}
-    make_pre_post_processors(found, pretrained_path=str(folder))
-    MemobenchMemPolicy.from_pretrained(folder)
 
 
 @pytest.fixture(scope="module")

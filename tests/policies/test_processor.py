@@ -11,13 +11,13 @@ from lerobot.policies import make_pre_post_processors
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem
-from lerobot_memobench.policies.memobench_mem.alignment import WordTextEncoder, make_text_encoder, words
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     WordTokenizerProcessorStep,
     make_vocabulary,
     make_word_tokenizer,
 )
+from lerobot_memobench.policies.memobench_mem.text_encoders import WordTextEncoder, make_text_encoder, words
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from tests.support.small_policy import batch_of, made_for_training, small_config

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pkgutil
 import random
 from contextlib import nullcontext
 from pathlib import Path
@@ -28,17 +27,7 @@ from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memory_reads import ReadLog, find_reads
 from lerobot_memobench.run import evaluate as evaluation
-from lerobot_memobench.run import rollout as rollouts
-from lerobot_memobench.run.rollout import (
-    KNOWN,
-    Actor,
-    BatchSeeds,
-    batch_seed,
-    digest,
-    has_planned_action,
-    needs_observation,
-    roll,
-)
+from lerobot_memobench.run.rollout import Actor, BatchSeeds, batch_seed, roll
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import task_folder
 
@@ -314,37 +303,6 @@ def test_the_batch_size_of_an_object_policy_changes_no_episode(tmp_path: Path) -
         found.append([{key: value for key, value in line.items() if key not in ("wall_s", "run")} for line in lines])
     assert len(found[0]) == 2
     assert found[0] == found[1]
-
-
-# --- LeRobot's functions that the loop was written for ---
-
-READ = {
-    "lerobot.envs.utils.preprocess_observation": ("10196a71b8af",),
-    **{f"{module}.{name}.select_action": policy.read for (module, name), policy in KNOWN.items()},
-    "lerobot.policies.smolvla.modeling_smolvla.SmolVLAPolicy._prepare_batch": ("57d81cd4cddd",),
-}
-"""Function -> first digits of the hash of its source in LeRobot 0.6.1, and in its main where they differ."""
-
-
-@pytest.mark.parametrize("function", READ)
-def test_lerobots_functions_have_not_changed(function: str) -> None:
-    found = digest(pkgutil.resolve_name(function))
-    assert found in READ[function], f"{function} has changed ({found}): compare run/rollout.py, then note its hash"
-
-
-@pytest.mark.parametrize("read", [True, False])
-def test_a_changed_policy_needs_every_observation(read: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    policy = ACTPolicy.__new__(ACTPolicy)
-    vars(policy).update(config=SimpleNamespace(temporal_ensemble_coeff=None), _action_queue=[1])
-    if not read:
-        monkeypatch.setattr(rollouts, "digest", lambda function: "another")
-    assert (needs_observation(policy)(), has_planned_action(policy)()) == (not read, read)
-    pi05 = KNOWN["lerobot.policies.pi05.modeling_pi05", "PI05Policy"]
-    for memory in (False, True):  # a visual memory takes in a picture at every step
-        acting = SimpleNamespace(config=SimpleNamespace(use_visual_memory=memory), _action_queue=[1])
-        assert pi05.planned(acting) is not memory
 
 
 # --- seeds ---

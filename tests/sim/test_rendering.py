@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.raster.highlights import HIGHLIGHTS, Highlight
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
+from mujoco_raster.highlights import HIGHLIGHTS, Highlight
 
 Simulate = Callable[..., Simulation]
 STOVE = "turn_on_the_stove_and_turn_it_off"

@@ -9,7 +9,8 @@ import torch
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import FLOW_MATCHING, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.sizes import FLOW_MATCHING
 from lerobot_memobench.training.data import Training, open_datasets, open_training
 from lerobot_memobench.training.loop import train
 

@@ -12,6 +12,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
+from lerobot_memobench.policies.memobench_mem.subgoals import texts_of
 from tests.support import rank_case
 from tests.support.fork_server import ForkServer
 from tests.support.small_policy import (
@@ -75,7 +76,7 @@ def test_evaluation_loss_uses_the_memorys_own_choice(objects: Path, memory: str)
     if memory == "keyframes":
         draw_modulation(policy.model)  # so that actions depend on what it reads
     batch = before(batch_of(dataset, [10, 30, 50]))
-    others = {name: (batch[name] + 1) % len(policy.config.subgoal_texts) for name in (SUBGOAL, SUBGOALS)}
+    others = {name: (batch[name] + 1) % len(texts_of(policy.config.subgoals)) for name in (SUBGOAL, SUBGOALS)}
     with torch.no_grad():
         for learns in (True, False):
             mine, other = (policy.train(learns).forward(one)[1] for one in (batch, {**batch, **others}))

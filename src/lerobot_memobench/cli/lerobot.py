@@ -9,17 +9,20 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+import textwrap
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import Field, fields
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from lerobot_memobench.cli.console import WITH_PARENT, console, counting, note, run_command, say
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import as_path, explaining_disk_errors
 from lerobot_memobench.jobs.processes import adding_resume_hint
@@ -73,7 +76,7 @@ def run(line: Sequence[str]) -> int:
         )
     words = parse_words(line[1:])
     if HELP in words:
-        print(Path(__file__).with_name(f"lerobot_{name}.txt").read_text(encoding="utf-8"), flush=True)
+        print(help_of(name), flush=True)
         if len(words) == 1:
             print(f"all settings: `lerobot {name} --help` with env= or policy=, which imports LeRobot")
             return 0
@@ -88,6 +91,22 @@ def run(line: Sequence[str]) -> int:
     if is_of_benchmark(words) and HELP not in words:
         return evaluate(words)
     return call_lerobot(name, flags_of_other(words))
+
+
+def help_of(command: str) -> str:
+    """Return the help of ``lerobot eval`` or ``lerobot train``, with the settings of the environment."""
+    text = Path(__file__).with_name(f"lerobot_{command}.txt").read_text(encoding="utf-8")
+    return text.replace("{environment}", "".join(map(explained, fields(EnvSettings))))
+
+
+def explained(setting: Field[Any]) -> str:
+    """Return the entry of a setting in the help: name, meaning, values and default."""
+    meaning, values, usual = (setting.metadata[key] for key in ("meaning", "values", "usual"))
+    default = "none" if setting.default is None else str(setting.default)
+    plain = default.lower() if isinstance(setting.default, bool) else default
+    accepted = f"; {', '.join(values)}" if values else ""
+    text = textwrap.fill(f"{meaning}{accepted} (default: {usual or plain})", 92)
+    return f"  {setting.name}=\n{textwrap.indent(text, ' ' * 8)}\n"
 
 
 def overview(commands: Iterable[str]) -> str:

@@ -26,8 +26,8 @@ from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.policies.convention import chosen_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import CLOCK
-from lerobot_memobench.run.command_line import PATH, SHORT_FORMS, has_setting, parse_words, policy_config, read_words
-from lerobot_memobench.run.rollout import has_planned_action, needs_observation
+from lerobot_memobench.run.command_line import PATH, SHORT_FORMS, parse_words, policy_config, read_words, setting_kind
+from lerobot_memobench.run.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 
@@ -84,21 +84,26 @@ class Subject:
             sparing: repeat earlier pictures and objects if the policy does not need new ones, and everything except
                 the clock if its next action is planned already, as evaluations do.
         """
-        needed, planned = needs_observation(self.policy), has_planned_action(self.policy)
+        actions = ActionQueue(self.policy)
         last: dict[str, Any] = {}
         answers = []
-        self.policy.reset()
+        actions.reset()
         with EqualNoise() if equal_noise else nullcontext():
             for call in range(max(len(stream) for stream in streams)):
                 batch = self._batch(streams, call)
                 begins = any(call in (0, stream.start) for stream in streams)
                 costly = [key for key in batch if key.startswith(("observation.images", OBJECTS_COLUMN))]
                 if sparing and not begins:
-                    kept = [key for key in batch if key not in CLOCK] if planned() else [] if needed() else costly
+                    kept = (
+                        [key for key in batch if key not in CLOCK]
+                        if actions.has_planned_action()
+                        else []
+                        if actions.needs_observation()
+                        else costly
+                    )
                     batch |= {key: last[key] for key in kept}
                 last = batch
-                with torch.inference_mode():
-                    action = self.postprocessor(self.policy.select_action(self.preprocessor(batch)))
+                action = self.postprocessor(actions.select(self.preprocessor(batch)))
                 answers.append(action.to("cpu", torch.float32).numpy().copy())
         return np.stack(answers)
 
@@ -172,7 +177,7 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
     check_device(asked.get("policy.device"))
     if not torch.cuda.is_available():
         asked = asked.default("policy.device", "cpu")
-    if has_setting(asked, "policy.n_action_steps"):
+    if setting_kind(asked, "policy.n_action_steps") is not None:
         asked = asked.default("policy.n_action_steps", REPLAN)
     config: Any = policy_config(asked)
     if config is None:

@@ -91,15 +91,6 @@ def read_frame_table(root: Path) -> FrameTable:
     )
 
 
-def holds_texts(root: Path, column: str) -> bool:
-    """Return whether a column of texts exists and has a text that is not empty."""
-    for path in files_below(root / "data", ".parquet"):
-        for name in pq.read_schema(path).names:
-            if EARLIER_COLUMNS.get(name, name) == column and any(_texts(pq.read_table(path, columns=[name]), name)):
-                return True
-    return False
-
-
 def _read_columns(root: Path, optional: list[str]) -> pa.Table:
     """Return each frame's indices, and the existing ones among the optional columns."""
     files = files_below(root / "data", ".parquet")

@@ -290,10 +290,8 @@ def _report_size(
     seconds = left * FRAME_SECONDS + (left * IMAGES_SECONDS + held_left * HELD_SECONDS) * area
     minutes = seconds / 60 / max(min(workers, cores()), 1)
     time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
-    size, extent = (
-        run_size(frames, side, held),
-        f"{left:,} frames{f' and {held_left:,} held ones' if held_left else ''}",
-    )
+    size = run_size(frames, side, held)
+    extent = f"{left:,} frames{f' and {held_left:,} held ones' if held_left else ''}"
     work = f"{len(missing)} demonstrations of about {extent}, in about {time} with {workers} at a time"
     check_room(out, size, size - run_size(left, side, held_left), notify, work)
 

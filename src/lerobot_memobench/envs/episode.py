@@ -37,7 +37,6 @@ from lerobot_memobench.protocol import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.raster.drawlist import Image
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
 from lerobot_memobench.tasks.catalogue import get_task
@@ -49,6 +48,7 @@ from lerobot_memobench.tasks.libero_suites import initial_states
 from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import AS_BEGUN, Progress
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task, referent_text
+from mujoco_raster.drawlist import Image
 
 
 class Fault(NamedTuple):

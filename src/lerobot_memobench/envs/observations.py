@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
 
     from lerobot_memobench.envs.episode import Episode
-    from lerobot_memobench.sim.raster.drawlist import Image
+    from mujoco_raster.drawlist import Image
 
 ROBOT_STATE: dict[str, dict[str, tuple[int, ...]]] = {
     "eef": {"pos": (3,), "quat": (4,), "mat": (3, 3)},

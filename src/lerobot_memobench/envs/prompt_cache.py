@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.io import cache_folder, draft_of, files_below
 from lerobot_memobench.protocol import ACTION_DIM
-from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import Simulation, Snapshot
 from lerobot_memobench.tasks.task import Task
+from mujoco_raster.highlights import Highlight
 
 logger = logging.getLogger(__name__)
 

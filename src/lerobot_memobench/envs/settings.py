@@ -92,20 +92,22 @@ LIBERO_ONLY = {
 object slots lack their classes."""
 
 
-def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None) -> Any:
+def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None, usual: str = "") -> Any:
     """Return a field of `EnvSettings`.
 
     Args:
-        meaning: one line for the reference.
+        meaning: one line for help and reference.
         values: accepted values; empty for any value of the type.
         least: smallest accepted integer.
+        usual: the default in words, where it depends on other settings or on the policy.
     """
-    return field(default=default, metadata={"meaning": meaning, "values": tuple(values), "least": least})
+    details = {"meaning": meaning, "values": tuple(values), "least": least, "usual": usual}
+    return field(default=default, metadata=details)
 
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """Settings of one environment; ``metadata["meaning"]`` of each field is its entry in the reference.
+    """Settings of one environment; the metadata of each field are its entry in help and reference (`setting`).
 
     Raises:
         MemobenchError: a value is not accepted, or two settings are incompatible.
@@ -113,49 +115,103 @@ class EnvSettings:
 
     suite: str = setting(
         PUBLISHED,
-        "published tasks, strict: 30 variants that need a memory, or a suite of LIBERO",
+        "thirty tasks as published; strict: variants that need a memory; libero_…: LIBERO's own tasks, of which "
+        "episode i has the i-th initial state",
         (*SUITES, *LIBERO_SUITES),
     )
-    difficulty: str = setting(STANDARD, "number of repetitions in strict tasks", DIFFICULTIES)
-    protocol: str = setting(BY_PAPER, "the paper's evaluation, or the authors' script", PROTOCOLS)
-    seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0)
-    obs_type: str = setting(PIXELS, "observations: the arm's state with pictures, object slots, or both", OBS_TYPES)
+    difficulty: str = setting(
+        STANDARD, "counts of strict tasks up to 2, 3, 5 or 8, and the number of steps", DIFFICULTIES
+    )
+    protocol: str = setting(
+        BY_PAPER,
+        "the paper's evaluation; upstream, the authors' script: no demonstration prompt, fixed referents, at most 990 "
+        "steps, an end when all checkpoints have held",
+        PROTOCOLS,
+    )
+    seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0, usual="that of seed= or split=")
+    obs_type: str = setting(
+        PIXELS,
+        "observations: the arm's state with pictures, with object slots, or with both",
+        OBS_TYPES,
+        usual="what the policy was trained on, else pictures",
+    )
     convention: str = setting(
         None,
-        "pictures upright, or mirrored and named as in LIBERO's data; the default follows suite and names",
+        "pictures upright (image, wrist_image), or libero: mirrored left to right (image, image2), as checkpoints of "
+        "LIBERO need them",
         [*CONVENTIONS],
+        usual="the checkpoint's; else upright, in suites of LIBERO libero",
     )
     camera_name_mapping: dict[str, str] | None = setting(  # noqa: RUF009 - its default is None
-        None, "LIBERO's name of each camera -> name of its picture; means convention=libero"
+        None,
+        f"LeRobot's mapping of LIBERO's names of the cameras, such as {EXAMPLE}; means convention=libero",
+        usual="image, image2",
     )
-    observation_height: int = setting(IMAGE_SIZE, "height of pictures, pixels", least=SMALLEST)
-    observation_width: int = setting(IMAGE_SIZE, "width of pictures, pixels", least=SMALLEST)
-    control_mode: str = setting(RELATIVE, "actions are displacements; LIBERO's absolute ones do not exist")
+    observation_height: int = setting(IMAGE_SIZE, "height of pictures, pixels, an even number", least=SMALLEST)
+    observation_width: int = setting(IMAGE_SIZE, "width of pictures, pixels, an even number", least=SMALLEST)
+    control_mode: str = setting(RELATIVE, "actions are displacements; LIBERO's absolute ones are refused")
     referent: str = setting(
-        "fixed", "published goals, or goals drawn by the seed; strict tasks always draw", REFERENT_VALUES
+        "fixed",
+        "the published goals; random: the seed decides the goal that the prompt shows; strict tasks are always drawn",
+        REFERENT_VALUES,
     )
-    demonstration_prompt: bool = setting(True, "object and procedural tasks start with their demonstration prompt")
-    prompt_in: str = setting(AUTO, "the prompt plays in steps that the policy observes, or in reset", PROMPT_IN)
-    horizon: int = setting(None, "execution steps per episode; the default follows suite and difficulty", least=1)
+    demonstration_prompt: bool = setting(True, "object and procedural tasks begin with their demonstration prompt")
+    prompt_in: str = setting(
+        AUTO,
+        "steps: the policy observes the prompt; reset: it plays before the first observation",
+        PROMPT_IN,
+        usual="by the policy",
+    )
+    horizon: int = setting(
+        None,
+        "execution steps per episode",
+        least=1,
+        usual="1200; with difficulty=hard 2000, with extreme 3200; in suites of LIBERO 280, 280, 300, 520 and 400",
+    )
     replan_steps: int | None = setting(
-        None, "actions executed per prediction; pauses start, and holds end, between chunks", least=1
+        None,
+        "actions executed per prediction; pauses start, and holds end, between chunks",
+        least=1,
+        usual="the policy's",
     )
-    window_steps: int = setting(1, "control steps of observations in an input of a policy without a memory", least=1)
+    window_steps: int = setting(
+        1,
+        "control steps of observations in an input of a policy without a memory",
+        least=1,
+        usual="the policy's",
+    )
     delay_steps: int = setting(0, "control steps from an observation to the first action planned from it", least=0)
     render: str = setting("default", "high is for figures and four times slower", QUALITIES)
     oracle_memory: bool = setting(False, "the instruction ends with the completed checkpoints (oracle memory control)")
-    pause_steps: int = setting(0, "control steps of each pause, at moments drawn by the seed (pause control)", least=0)
-    speed: float = setting(1.0, "1, 0.5, 0.33, ...: an action takes 1, 2, 3, ... control steps (speed control)")
-    evidence: bool = setting(False, "run each scene with each variant of its task (evidence control)")
-    salt: str | None = setting(None, "32 hexadecimal digits, mixed into the draws of variants and holds (sealed test)")
-    corrupt: str = setting(INTACT, "delete, swap (between rows) or noise the policy's memory once", CORRUPTIONS)
+    pause_steps: int = setting(
+        0, "control steps of each pause, at moments drawn by the seed (pause control, see memobench compare)", least=0
+    )
+    speed: float = setting(
+        1.0, "1, 0.5, 0.33 and so on: an action takes 1, 2, 3 control steps (speed control, see memobench compare)"
+    )
+    evidence: bool = setting(
+        False, "each scene with each variant of its task, 36 episodes unless others are asked for (evidence control)"
+    )
+    salt: str | None = setting(
+        None,
+        "sealed test only: 32 hexadecimal digits that repeat the draws of variants and holds of an earlier run",
+        usual="drawn at the start",
+    )
+    corrupt: str = setting(
+        INTACT, "delete, swap (between rows) or noise the policy's memory once, for policies that offer it", CORRUPTIONS
+    )
     corrupt_step: int = setting(0, "execution step at which corrupt acts; 0: at the end of the prompt", least=0)
     reshow: bool = setting(False, "the prompt plays a second time, after corrupt has acted")
     interference: int = setting(0, "episodes of other tasks shown between prompt and execution", least=0)
     robot_state: bool = setting(False, "add the nested robot_state of LeRobot's libero: hand, fingers and joints")
     expert_action: bool = setting(False, "add the scripted expert's action as observation.expert_action")
     blind_action: bool = setting(False, "add the blind published routine's action as observation.blind_action")
-    videos: int = setting(0, "number of first episodes of each task recorded as videos; -1 for all", least=EVERY)
+    videos: int = setting(
+        0,
+        "number of first episodes of each task recorded as videos; -1 for all",
+        least=EVERY,
+        usual="10, without pictures in the observations 0",
+    )
 
     def __post_init__(self) -> None:
         self._set(**{name: value for name, value in self.usual.items() if getattr(self, name) is None})

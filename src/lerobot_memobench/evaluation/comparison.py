@@ -18,7 +18,7 @@ from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences
 from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.agreement import SCENES
-from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed, published_table
+from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
@@ -467,26 +467,10 @@ TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
 """Key, title, and kinds of scopes of each table."""
 
 
-def comparison_report(found: Comparison, paper: bool = False) -> Report:
-    """Return a comparison as tables and JSON values.
-
-    Args:
-        paper: add the published figures of the control.
-
-    Raises:
-        MemobenchError: they are asked for, and the paper has none of this comparison.
-    """
-    section = comparison_section(found)
-    if paper:
-        published = published_table(found.control) if found.control else None
-        if published is None:
-            raise MemobenchError(
-                "the paper has no figures of this comparison, only of oracle and of shuffled memory; leave out "
-                "--with paper"
-            )
-        section = replace(section, tables=(*section.tables, published))
-    title = f"{found.title}: {found.headline}"
-    return Report(title, (replace(section, title=""),), comparison_data(found))
+def comparison_report(found: Comparison) -> Report:
+    """Return a comparison as tables and JSON values."""
+    section = replace(comparison_section(found), title="")
+    return Report(f"{found.title}: {found.headline}", (section,), comparison_data(found))
 
 
 def comparison_section(found: Comparison, overall: bool = False) -> Section:

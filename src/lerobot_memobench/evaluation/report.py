@@ -30,14 +30,11 @@ from lerobot_memobench.evaluation.metrics import (
 from lerobot_memobench.evaluation.records import Run, asked_for, read_run, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     best_interval,
-    check_paper_rows,
-    departures,
     failures_table,
     inputs_sentence,
     joined_table,
     memory_types_table,
     overview,
-    paper_section,
     pooled_sentence,
     prefix_table,
     rates_table,
@@ -46,7 +43,6 @@ from lerobot_memobench.evaluation.report_tables import (
 )
 from lerobot_memobench.evaluation.tables import Report, Section, markdown, terminal_table
 from lerobot_memobench.io import write_file
-from lerobot_memobench.paper import PublishedRow, published_rows
 
 REPORT_JSON = "report.json"
 REPORT_MARKDOWN = "report.md"
@@ -93,22 +89,14 @@ def evaluation_markdown(run: Run) -> str:
 # --- documents ---
 
 
-def build(runs: Sequence[Run], paper: bool = False) -> Report:
-    """Return the report of one or several evaluations.
-
-    Args:
-        paper: add the published figures.
-
-    Raises:
-        MemobenchError: the published figures are of other tasks.
-    """
-    check_paper_rows(runs, paper)
+def build(runs: Sequence[Run]) -> Report:
+    """Return the report of one or several evaluations."""
     found, controls = [], list(controls_among(runs))
     if len(runs) > 1:
         found.append(Section("Evaluations", (overview(runs), joined_table(runs)), notes=tuple(unlike(runs))))
     found += [sweep(method, group) for method, group in sweeps(runs).items()]
     found += [comparison_section(each, overall=True) for each in controls]
-    found += granularity_section(runs, paper)
+    found += granularity_section(runs)
     for run in runs:
         section = _section(run)
         if len(runs) > 1:  # their rates by task are joined
@@ -116,9 +104,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
             tables = tuple(table for table in section.tables if table.key != "tasks")
             section = replace(section, title=run.name, tables=tables, sentences=(where, *section.sentences))
         found += [section, *_evidence(run)]
-    if paper:
-        found.append(paper_section(runs))
-    return Report(headline(runs), tuple(found), report_data(runs, controls, paper))
+    return Report(headline(runs), tuple(found), report_data(runs, controls))
 
 
 def _section(run: Run) -> Section:
@@ -148,8 +134,8 @@ def evidence_values(run: Run) -> dict[str, Any]:
 # --- JSON ---
 
 
-def report_data(runs: Sequence[Run], controls: Sequence[Comparison], paper: bool) -> dict[str, Any]:
-    """Return the figures of one or several evaluations, and the published ones where asked for."""
+def report_data(runs: Sequence[Run], controls: Sequence[Comparison]) -> dict[str, Any]:
+    """Return the figures of one or several evaluations."""
     found: dict[str, Any]
     if len(runs) == 1:
         found = run_data(runs[0])
@@ -161,9 +147,6 @@ def report_data(runs: Sequence[Run], controls: Sequence[Comparison], paper: bool
             found["granularity"] = levels
     if swept := sweeps(runs):
         found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
-    if paper:
-        found["departs_from_paper"] = {run.name: departures(run) for run in runs}
-        found["paper"] = [_published_data(row) for row in published_rows()]
     return found
 
 
@@ -216,14 +199,4 @@ def _sweep_data(runs: Sequence[Run]) -> dict[str, Any]:
             str(run.replan_steps): {metric: percent(rate.value) for metric, rate in run.summary.average.items()}
             for run in runs
         },
-    }
-
-
-def _published_data(row: PublishedRow) -> dict[str, Any]:
-    return {
-        "table": row.table,
-        "model": row.model,
-        "replan_steps": row.replan_steps,
-        "memory_types": {name: dict(figures) for name, figures in row.memory_types.items()},
-        "average": dict(row.average),
     }

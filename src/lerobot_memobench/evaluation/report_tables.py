@@ -1,12 +1,9 @@
-"""Tables, sections and sentences of a report: of one evaluation, of several, and with the paper's figures."""
+"""Tables, sections and sentences of a report: of one evaluation and of several."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from lerobot_memobench.envs.episode_log import with_omitted
-from lerobot_memobench.envs.settings import PICTURES
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, METRICS, SUITE, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.tables import (
@@ -22,11 +19,8 @@ from lerobot_memobench.evaluation.tables import (
     with_ids,
 )
 from lerobot_memobench.io import count_of
-from lerobot_memobench.paper import PublishedRow, failure_taxonomy, published_rows
-from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import GROUPS
-from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
+from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 
 def inputs_phrase(words: str) -> str:
@@ -349,106 +343,3 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
         return [], None
     best = [run for value, run in found if value == max(known)]
     return [run.replan_steps for run in best if run.replan_steps is not None], best[0].summary.average[metric]
-
-
-# --- with the paper's figures ---
-
-PAPER_PROTOCOL = {
-    **{WORLD: LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True, "horizon": HORIZON},
-    **{"seed_base": EVALUATION_SEED, **PICTURES},
-}
-PAPER_INPUTS = "pixels"
-PAPER_TASKS, PAPER_EPISODES = 30, 50
-
-TABLES = (
-    ("paper-main", "With the paper's main results", ("main",)),
-    ("paper-alignment", "With the paper's memory alignment results", ("alignment",)),
-    ("paper-reference", "With the paper's oracle memory and MemER", ("oracle", "memer")),
-)
-"""Key, title, and which of the paper's tables it holds."""
-
-
-def check_paper_rows(runs: Sequence[Run], paper: bool) -> None:
-    """Refuse to report the paper's figures (``paper``) with those of tasks that it did not publish.
-
-    Raises:
-        MemobenchError: naming the first such evaluation.
-    """
-    other = next((run for run in runs if run.protocol.get("suite", PUBLISHED) != PUBLISHED), None)
-    if paper and other is not None:
-        raise MemobenchError(
-            f"{other.folder} is an evaluation of the {other.protocol['suite']} suite, the paper's figures are of the "
-            "published one; leave out --with paper"
-        )
-
-
-def paper_section(runs: Sequence[Run]) -> Section:
-    """Return the paper's tables of rates with these evaluations in the first rows, and departures from its protocol."""
-    tables = [_paper_table(runs, *each) for each in TABLES]
-    notes = [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
-    return Section("With the paper's figures", (*tables, paper_failures()), notes=tuple(notes))
-
-
-def extent(run: Run) -> str:
-    """Return how many tasks and rollouts an evaluation is of, "" where it is as many as the paper's."""
-    summary = run.summary
-    if len(summary.tasks) == PAPER_TASKS and {row["SR"].n for row in summary.tasks.values()} == {PAPER_EPISODES}:
-        return ""
-    return f"{len(summary.tasks)} of {PAPER_TASKS} tasks, {count_of(summary.rollouts, 'rollout')}"
-
-
-def _paper_table(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -> Table:
-    """Return a table of the paper's, ours on top, named with their extent: the paper ran 1,500 rollouts."""
-    published = published_rows(*sources)
-    names = [f"{run.name} ({size})" if (size := extent(run)) else run.name for run in runs]
-    rows = (
-        *((name, *run_row(run)[1:]) for name, run in zip(names, runs, strict=True)),
-        *(_published_row(row) for row in published),
-    )
-    steps = [row.replan_steps for row in published]
-    changes = {len(runs) + k for k in range(1, len(steps)) if steps[k] != steps[k - 1]}
-    return wide_table(key, title, rows, strong=range(len(runs)), rules={len(runs), *changes})
-
-
-def _published_row(row: PublishedRow) -> tuple[Cell, ...]:
-    columns = [*(row.memory_types[name] for name in MEMORY_TYPES), row.average]
-    return (
-        f"paper: {row.label}",
-        PAPER_INPUTS,
-        row.replan_steps,
-        *(published_rate(c[m]) for c in columns for m in METRICS),
-    )
-
-
-def published_rate(value: float | None) -> Rate:
-    """Return a published percentage as a rate without interval: the paper gives none."""
-    return Rate(None if value is None else value / 100, 0)
-
-
-def paper_failures() -> Table:
-    """Return how the paper's rollouts of its temporal task ended."""
-    counts = failure_taxonomy()
-    total = counts.pop("rollouts")
-    rows = tuple((name.replace("_", " "), Count(count), Rate(count / total, total)) for name, count in counts.items())
-    return Table(
-        "paper-failures",
-        f"The paper's outcomes of {total} rollouts of a temporal task with the checkpoints S, U, U",
-        ("outcome", "rollouts", "of all"),
-        rows,
-    )
-
-
-def departures(run: Run) -> list[str]:
-    """Return a phrase for each departure of an evaluation from the paper's protocol."""
-    found = []
-    if len(run.summary.tasks) != PAPER_TASKS:
-        found.append(f"{len(run.summary.tasks)} of {PAPER_TASKS} tasks")
-    counts = {row["SR"].n for row in run.summary.tasks.values()}
-    if counts != {PAPER_EPISODES}:
-        low, high = min(counts), max(counts)
-        found.append(f"{low if low == high else f'{low} to {high}'} episodes of each instead of {PAPER_EPISODES}")
-    known = with_omitted(run.protocol)
-    for key, value in PAPER_PROTOCOL.items():
-        if key in known and known[key] != value:
-            found.append(f"{key.replace('_', ' ')} {known[key]} instead of {value}")
-    return found

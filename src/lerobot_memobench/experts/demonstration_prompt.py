@@ -14,10 +14,10 @@ from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.grasping import pick, put_at
 from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand, Steps
 from lerobot_memobench.experts.travel import HAND_HOME, go_home, pointing
-from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
+from mujoco_raster.highlights import Highlight
 
 PAUSE_STEPS = 8
 """Steps at rest before and after a prompt, so that it has a first and a last frame."""

@@ -1,9 +1,12 @@
-"""Find checkpoints of trained policies, and check that they are complete and of the expected type."""
+"""Find checkpoints of trained policies, and check that they are complete, of the expected type, and name no code.
+
+LeRobot imports and calls any ``class`` that a checkpoint's processor names, so its steps are checked before it builds
+them.
+"""
 
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -29,14 +32,20 @@ RENAMING = "rename_observations_processor"
 """LeRobot's processor step that gives observations the names of a policy."""
 RANDOM_IF_MISSING = ("pi0", "pi05", "pi0_fast")
 """LeRobot's policies that act with random weights if there are none."""
+PACKAGES = ("lerobot", "lerobot_memobench")
+PLUGIN = "lerobot_policy_"
+"""Prefix of the packages that LeRobot imports as plugins."""
+NAMES_CODE = ("class", "registry_name", "_target_")
+"""Keys of nested mappings that would build an object."""
+REMOTE_CODE = {
+    "action_tokenizer_name": "lerobot/fast-action-tokenizer",
+    "paligemma_tokenizer_name": "google/paligemma-3b-pt-224",
+    "model_name": "nvidia/Cosmos-Reason2-2B",
+}
+"""Settings of LeRobot's steps that run the Python code of a repository -> LeRobot's values."""
 ADVICE = "copy or train the checkpoint again"
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
-REMOVED_FIELDS = {
-    *("align_weight", "feature_cache_dir", "full_chunk_when_stalled", "memory_frames", "min_lr_ratio", "open_gate"),
-    *("shuffle_seed", "shuffle_subgoals", "tokens_per_frame"),
-}
-"""Fields of memobench_mem in checkpoints of earlier versions (`update_checkpoint`)."""
 
 
 class Feature(TypedDict, total=False):
@@ -104,11 +113,8 @@ def checkpoint_folder(text: str) -> Path | None:
     A name is that of a policy that comes with the package, a path that of a checkpoint or a training run, whose last
     checkpoint is returned. If both exist, ``./name`` is the path.
     """
-    return shipped_policies().get(text) or folder_with_checkpoint(text)
-
-
-def folder_with_checkpoint(text: str) -> Path | None:
-    """Return the checkpoint in a folder: the folder itself, or the last one of a training run; None without any."""
+    if text in (shipped := shipped_policies()):
+        return shipped[text]
     base = _through_last(Path(text).expanduser())
     for folder in (base, *(checkpoint / "pretrained_model" for checkpoint in (base, *checkpoints_of(base)))):
         if (folder / CONFIG_FILE).is_file():
@@ -153,11 +159,14 @@ def portable_path(path: str) -> str:
 def local_folder(path: str) -> Path | None:
     """Return the folder of a checkpoint, also of a repository in the hub's cache; None if it is not on this machine."""
     here = checkpoint_folder(path)
-    if here is not None or looks_local(path):
-        return here
+    return here if here is not None or looks_local(path) else cached_folder(path)
+
+
+def cached_folder(repository: str) -> Path | None:
+    """Return the folder of a repository in the hub's cache, None without one."""
     from huggingface_hub import try_to_load_from_cache
 
-    cached = try_to_load_from_cache(path, CONFIG_FILE)
+    cached = try_to_load_from_cache(repository, CONFIG_FILE)
     return Path(cached).parent if isinstance(cached, str) else None
 
 
@@ -172,14 +181,7 @@ def checkpoint_type(path: str) -> str | None:
         if looks_local(path):
             raise MemobenchError(f"the checkpoint folder {path} does not exist")
         return None
-    config = read_json(folder / CONFIG_FILE)
-    name = config.get("type")
-    removed = sorted(REMOVED_FIELDS & config.keys())
-    if name == "memobench_mem" and removed:
-        raise MemobenchError(
-            f"{folder / CONFIG_FILE} has {', '.join(removed)}, which an earlier version wrote; update the checkpoint: "
-            f"python -m lerobot_memobench.policies.update_checkpoint {folder}"
-        )
+    name = read_json(folder / CONFIG_FILE).get("type")
     if not isinstance(name, str):
         raise MemobenchError(
             f"{folder / CONFIG_FILE} names no policy type; LeRobot cannot read checkpoints of its first year: train "
@@ -206,28 +208,16 @@ def read_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
 def check_checkpoint(path: str) -> None:
     """Refuse a checkpoint folder that cannot act as it was trained.
 
-    A policy without the statistics of its training data would run on raw numbers and score 0 % without any message.
-
     Raises:
         MemobenchError: weights, processors or normalisation statistics are missing.
     """
     folder = Path(path).expanduser()
-    if checkpoint_type(path) is None:
-        check_processors(path)
-        return  # a repository: LeRobot fetches the rest
-    if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
-        raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
-    for weights in folder.glob("*.safetensors"):
-        check_fetched(weights)
-    if not (folder / PREPROCESSOR_FILE).is_file():
-        raise MemobenchError(
-            f"{folder / PREPROCESSOR_FILE} is missing; copy the checkpoint, or migrate one of an earlier LeRobot: "
-            f"python -m lerobot.processor.migrate_policy_normalization --pretrained-path {folder}"
-        )
-    for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
-        for step in read_json(folder / name, Processor).get("steps", []):
-            if str(step.get("registry_name", "")).endswith("normalizer_processor"):
-                _check_statistics(folder, name, step)
+    if checkpoint_type(path) is not None:  # else a repository: LeRobot fetches these files
+        if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
+            raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
+        for weights in folder.glob("*.safetensors"):
+            check_fetched(weights)
+        check_statistics(folder)
     check_processors(path)
 
 
@@ -235,8 +225,7 @@ def check_registered(path: str) -> None:
     """Refuse a checkpoint, a folder or a repository, of a policy type that no imported package registers."""
     from lerobot.configs.policies import PreTrainedConfig
 
-    held = _file_of(path, CONFIG_FILE)
-    kind = None if held is None else read_json(held).get("type")
+    kind = _type_of(path)
     if kind is not None and kind not in PreTrainedConfig.get_known_choices():
         raise MemobenchError(
             f"the checkpoint {path} is of policy type '{kind}', which no installed package registers; install the "
@@ -244,8 +233,64 @@ def check_registered(path: str) -> None:
         )
 
 
+def check_statistics(source: str | Path, revision: str | None = None) -> None:
+    """Refuse processors without the statistics of the training data.
+
+    Their policy would run on raw numbers and score 0 % without any message.
+
+    Args:
+        source: a checkpoint folder, or a repository, whose processor files are fetched now.
+
+    Raises:
+        MemobenchError: a processor or a statistic is missing.
+    """
+    for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
+        file = checkpoint_file(source, name, revision)
+        if file is None:
+            raise MemobenchError(
+                f"{Path(source) / name} is missing; copy the checkpoint, or migrate one of an earlier LeRobot: "
+                f"python -m lerobot.processor.migrate_policy_normalization --pretrained-path {source}"
+            )
+        for step in filter(_normalises, steps_of(file)):
+            _check_statistics(source, file, step, revision)
+
+
+def _check_statistics(source: str | Path, file: Path, step: Step, revision: str | None) -> None:
+    config = step.get("config", {})
+    modes = config.get("norm_map", {})
+    needed = [
+        key
+        for key, feature in config.get("features", {}).items()
+        if str(modes.get(str(feature.get("type")), "IDENTITY")).upper() != "IDENTITY"
+        # The preprocessor normalises observations (and actions in training), the postprocessor actions alone.
+        and (file.name == PREPROCESSOR_FILE or feature.get("type") == "ACTION")
+        # Datasets have no statistics of the clock, which stays raw, but `lerobot-train` lists it as an input.
+        and key not in CLOCK
+    ]
+    present: set[str] = set()
+    if (name := step.get("state_file")) is not None:
+        state = checkpoint_file(source, file_name(name, f"state_file in {file}"), revision)
+        if state is None:
+            raise MemobenchError(
+                f"the checkpoint {source} lacks its normalisation statistics ({name} is missing); copy the whole "
+                "checkpoint or train it again"
+            )
+        present = set(_shapes(state))
+    missing = [key for key in needed if not any(one.startswith(f"{key}.") for one in present)]
+    if missing:
+        raise MemobenchError(
+            f"the checkpoint {source} has no normalisation statistics for {', '.join(missing)} ({name or file.name}), "
+            "and would act on raw numbers; copy the whole checkpoint or train it again"
+        )
+
+
+# -- code in checkpoints -----------------------------------------------------------------------------------------------
+
+
 def check_processors(path: str | Path, revision: str | None = None) -> None:
-    """Refuse processors that name other code than registered steps (`processor_steps`), without building them.
+    """Refuse processor steps that neither LeRobot nor this package nor an installed plugin registers.
+
+    They are not built.
 
     Args:
         path: a checkpoint folder, or a repository, whose processor files are fetched now.
@@ -253,15 +298,61 @@ def check_processors(path: str | Path, revision: str | None = None) -> None:
     Raises:
         MemobenchError: a step is refused.
     """
-    from lerobot_memobench.policies.processor_steps import check_step
-
-    held = _file_of(path, CONFIG_FILE, revision)
-    kind = None if held is None else read_json(held).get("type")
+    kind = _type_of(path, revision)
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         file = _file_of(path, name, revision)
-        if file is not None:
-            for step in read_json(file, Processor).get("steps", []):
-                check_step(file, step, kind)
+        for reason in (reason for step in steps_of(file) for reason in _reasons(step, kind)):
+            raise MemobenchError(
+                f"{file} {reason}; expected steps with plain settings that LeRobot, this package or an installed "
+                f"{PLUGIN}* package registers: install the policy's package, or use a checkpoint that you trust"
+            )
+
+
+def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
+    """Yield the reasons to refuse a step."""
+    name, config = step.get("registry_name"), step.get("config") or {}
+    if not isinstance(name, str) or "class" in step:
+        yield f"names the class {step.get('class')!r}, which LeRobot would import and call"
+        return
+    found = _registered(name, kind)
+    if found is None or not _trusted(found.__module__.partition(".")[0]):
+        yield f"names the step {name!r}, which {'no package' if found is None else found.__module__} registers"
+    yield from (f"holds {key!r} in the settings of the step {name!r}, which would name code" for key in _naming(config))
+    if config.get("trust_remote_code") is not False:
+        for setting, known in REMOTE_CODE.items():
+            if config.get(setting, known) != known:
+                yield f"sets {setting}={config[setting]!r} in the step {name!r}, which runs code of that repository"
+
+
+def _registered(name: str, kind: str | None) -> type | None:
+    """Return the class of a registered step; None if no imported module registers it."""
+    from lerobot.policies.factory import get_policy_class
+    from lerobot.processor import ProcessorStepRegistry
+
+    with suppress(Exception):  # packages of the policy may be missing
+        get_policy_class(str(kind))
+    with suppress(KeyError):
+        return ProcessorStepRegistry.get(name)
+    return None
+
+
+def _trusted(package: str) -> bool:
+    from lerobot.configs import PreTrainedConfig
+
+    policies = {one.__module__.partition(".")[0] for one in PreTrainedConfig.get_known_choices().values()}
+    return package in {*PACKAGES, *policies} or package.startswith(PLUGIN)
+
+
+def _naming(value: Any) -> Iterator[str]:
+    """Yield the keys, at any depth, that would name code."""
+    if isinstance(value, Mapping):
+        yield from (key for key in NAMES_CODE if key in value)
+        value = list(value.values())
+    for one in value if isinstance(value, list) else []:
+        yield from _naming(one)
+
+
+# -- weights and settings ----------------------------------------------------------------------------------------------
 
 
 def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
@@ -287,11 +378,10 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
                 f"{policy.type} would act with random ones; copy or train it again"
             )
         return
-    found = _shapes(file)
     built = _built_empty(policy)
     if built is None:
         return
-    tensors = _as_loaded(built, found)
+    tensors = _as_loaded(built, _shapes(file))
     names: dict[int, list[str]] = {}  # a tensor with several names is saved by one of them
     wanted = {
         **dict(built.named_parameters(remove_duplicate=False)),
@@ -300,10 +390,6 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
     for name in built.state_dict():
         names.setdefault(id(wanted[name]), []).append(name)
     missing = [same[0] for same in names.values() if not any(name in tensors for name in same)]
-    if type(policy).__module__.startswith(f"{__package__}."):
-        # Our policies load weights strictly, of earlier names too; here only too large an allocation is refused.
-        reserved = sum(math.prod(wanted[name].shape) for name in missing)
-        missing = missing if reserved > sum(map(math.prod, found.values())) else []
     wrong = [name for name in built.state_dict() if name in tensors and tensors[name] != tuple(wanted[name].shape)]
     if missing or wrong:
         raise MemobenchError(
@@ -316,8 +402,7 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
 def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
     """Refuse other settings of a checkpoint than those it was trained with.
 
-    The class of its configuration lists them in ``fixed_by_training`` and ``of_training_alone``, both
-    ``ClassVar[tuple[str, ...]]``.
+    The class of its configuration lists them in ``fixed_by_training: ClassVar[tuple[str, ...]]``.
 
     Args:
         source: folder or repository. policy: the configuration to act with.
@@ -325,27 +410,21 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
     Raises:
         MemobenchError: a setting differs.
     """
-    fixed, of_training = getattr(policy, "fixed_by_training", ()), getattr(policy, "of_training_alone", ())
-    if not fixed and not of_training:
-        return
-    trained = as_trained(source, policy, revision)
-    for name, asked, held in differing(policy, trained, (*fixed, *of_training)):
-        why = "its weights depend on it" if name in fixed else "the setting has no effect at evaluation"
+    fixed = getattr(policy, "fixed_by_training", ())
+    for name, asked, held in differing(policy, as_trained(source, policy, revision), fixed) if fixed else ():
         raise MemobenchError(
-            f"--policy.{name}={asked} cannot be used: '{source}' was trained with {held}, and {why}; "
-            f"leave {name} out, or train with it"
+            f"--policy.{name}={asked} cannot be used: '{source}' was trained with {held}, and its weights depend on "
+            f"it; leave {name} out, or train with it"
         )
 
 
 def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTrainedConfig) -> None:
     """Refuse to resume a training with other settings.
 
-    The class of its configuration lists them in ``kept_since_begun: ClassVar[tuple[str, ...]]``.
-
     Raises:
         MemobenchError: a setting differs.
     """
-    for name, value, held in differing(asked, begun, getattr(begun, "kept_since_begun", ())):
+    for name, value, held in differing(asked, begun, getattr(begun, "fixed_by_training", ())):
         raise MemobenchError(
             f"this training was begun with {name}={held} and cannot change it; found {value}; "
             f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
@@ -420,7 +499,8 @@ def statistics_shapes(path: str | Path, revision: str | None = None) -> dict[str
     file = _file_of(path, PREPROCESSOR_FILE, revision)
     if file is None:
         return {}
-    states = [_file_of(path, file_name(name, f"state_file in {file}"), revision) for name in _state_files(file)]
+    names = [step.get("state_file") for step in filter(_normalises, steps_of(file))]
+    states = [_file_of(path, file_name(name, f"state_file in {file}"), revision) for name in names if name]
     renamed = trained_names(path, revision)
     return {
         renamed.get(name.rpartition(".")[0], name.rpartition(".")[0]): shape
@@ -455,16 +535,18 @@ def trained_names(path: str | Path, revision: str | None = None) -> dict[str, st
     if found := training_of(path, revision).get("rename_map"):
         return dict(found)
     file = _file_of(path, PREPROCESSOR_FILE, revision)
-    steps = [] if file is None else read_json(file, Processor).get("steps", [])
-    configs = [step.get("config", {}) for step in steps if step.get("registry_name") == RENAMING]
+    configs = [step.get("config", {}) for step in steps_of(file) if step.get("registry_name") == RENAMING]
     return {old: new for config in configs for old, new in config.get("rename_map", {}).items()}
 
 
-def _state_files(preprocessor: Path) -> Iterator[str]:
-    for step in read_json(preprocessor, Processor).get("steps", []):
-        state = step.get("state_file")
-        if str(step.get("registry_name", "")).endswith("normalizer_processor") and isinstance(state, str):
-            yield state
+def steps_of(file: Path | None) -> list[Step]:
+    """Return the steps in the file of a processor; none without a file."""
+    steps: list[Step] = [] if file is None else read_json(file, Processor).get("steps", [])
+    return steps
+
+
+def _normalises(step: Step) -> bool:
+    return str(step.get("registry_name", "")).endswith("normalizer_processor")
 
 
 def checkpoint_file(source: str | Path, name: str, revision: str | None = None) -> Path | None:
@@ -497,31 +579,7 @@ def _file_of(path: str | Path, name: str, revision: str | None = None) -> Path |
         return None
 
 
-def _check_statistics(folder: Path, file: str, step: Mapping[str, Any]) -> None:
-    config = step.get("config", {})
-    modes = config.get("norm_map", {})
-    needed = [
-        key
-        for key, feature in config.get("features", {}).items()
-        if str(modes.get(feature.get("type"), "IDENTITY")).upper() != "IDENTITY"
-        # The preprocessor normalises observations (and actions in training), the postprocessor actions alone.
-        and (file == PREPROCESSOR_FILE or feature.get("type") == "ACTION")
-        # Datasets have no statistics of the clock, which stays raw, but `lerobot-train` lists it as an input.
-        and key not in CLOCK
-    ]
-    state_file = step.get("state_file")
-    present: set[str] = set()
-    if isinstance(state_file, str):
-        path = folder / file_name(state_file, f"state_file in {folder / file}")
-        if not path.is_file():
-            raise MemobenchError(
-                f"the checkpoint {folder} lacks its normalisation statistics ({path.name} is missing); "
-                "copy the whole checkpoint or train it again"
-            )
-        present = set(_shapes(path))
-    missing = [key for key in needed if not any(name.startswith(f"{key}.") for name in present)]
-    if missing:
-        raise MemobenchError(
-            f"the checkpoint {folder} has no normalisation statistics for {', '.join(missing)} "
-            f"({state_file or file}), and would act on raw numbers; copy the whole checkpoint or train it again"
-        )
+def _type_of(path: str | Path, revision: str | None = None) -> str | None:
+    """Return the type of policy that a checkpoint names."""
+    file = _file_of(path, CONFIG_FILE, revision)
+    return None if file is None else read_json(file).get("type")

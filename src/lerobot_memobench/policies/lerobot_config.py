@@ -17,6 +17,7 @@ from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
+from lerobot_memobench.policies.checkpoint import cached_folder
 
 NOT_THE_CHECKPOINT = (
     *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),
@@ -151,16 +152,8 @@ def checkpoint_hash(path: str) -> str:
     """Return one hash for a checkpoint folder; for a repository, its name and the commit in the local cache."""
     if Path(path).is_dir():
         return tree_hash(checkpoint_files(Path(path)))
-    folder = _cached_folder(path)
+    folder = cached_folder(path)
     return path if folder is None else f"{path}@{folder.name}"
-
-
-def _cached_folder(repository: str) -> Path | None:
-    """Return the local copy of a repository, None without one."""
-    from huggingface_hub import try_to_load_from_cache
-
-    found = try_to_load_from_cache(repository, "config.json")
-    return Path(found).parent if isinstance(found, str) else None
 
 
 def checkpoint_files(folder: Path) -> dict[str, str]:

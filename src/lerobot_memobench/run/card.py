@@ -195,14 +195,14 @@ def versions() -> dict[str, str]:
 
 
 def git_commit() -> str | None:
-    """Return the commit that this package runs from, with ``+changes`` where files differ; None outside a checkout."""
+    """Return the commit of the checkout, with ``+changes`` where files of ``src`` differ; None outside a checkout."""
     package = Path(__file__).resolve().parents[1]
     if not (package.parents[1] / ".git").exists():
         return None
     commit = git(package, "rev-parse", "HEAD")
     if not commit:
         return None
-    return commit + ("+changes" if git(package, "status", "--porcelain", "--", str(package)) else "")
+    return commit + ("+changes" if git(package, "status", "--porcelain", "--", str(package.parent)) else "")
 
 
 def git(folder: Path, *words: str) -> str | None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 import re
 import typing
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -21,6 +21,7 @@ import draccus
 import yaml
 from draccus.utils import DecodingError, ParsingError, is_choice_type, is_enum, is_literal, is_union
 
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, chain, nearest
 from lerobot_memobench.policies.checkpoint import (
     TRAIN_CONFIG,
@@ -47,31 +48,22 @@ PATH, TYPE, PACKAGES = "path", "type", "discover_packages_path"
 """Keys of a choice that LeRobot's parser reads besides its fields: ``--policy.type``."""
 HELP = "help"
 
+OF_POLICY = ("align", "size", "perception", "detector", "visual_encoder", "device")
+OF_ENVIRONMENT = ("tasks", "task", "task_ids", *(each.name for each in fields(EnvSettings)))
 COMMON: dict[str, tuple[str, ...]] = {
-    **{key: (f"policy.{key}",) for key in ("align", "size", "perception", "detector", "visual_encoder", "device")},
-    **{key: (f"env.{key}",) for key in ("tasks", "obs_type", "suite", "referent")},
+    **{key: (f"policy.{key}",) for key in OF_POLICY},
+    **{key: (f"env.{key}",) for key in OF_ENVIRONMENT},
     "replan": ("policy.n_action_steps", "env.replan_steps"),
 }
 SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
     "eval": {
         **COMMON,
         **{key: (f"policy.{key}",) for key in ("host", "port", "dialect")},
-        **{
-            key: (f"env.{key}",)
-            for key in (
-                *("task", "task_ids", "convention", "camera_name_mapping", "observation_height", "observation_width"),
-                *("robot_state", "control_mode"),
-                *("difficulty", "protocol", "demonstration_prompt", "prompt_in", "horizon"),
-                *("pause_steps", "speed", "evidence", "salt", "videos"),
-                *("corrupt", "corrupt_step", "reshow", "interference"),
-            )
-        },
-        "episodes": ("eval.n_episodes",),
-        "batch_size": ("eval.batch_size",),
+        **{"episodes": ("eval.n_episodes",), "batch_size": ("eval.batch_size",)},
     },
     "train": {**COMMON, "episodes": ("dataset.episodes",)},
 }
-"""Command -> short form -> the fields it sets, as far as they exist. `cli/lerobot_<command>.txt` explains them."""
+"""Command -> short form -> the fields it sets, as far as they exist. `cli/lerobot.py` explains them."""
 RUN_OPTIONS = ("split", "memory_reads", "resume", "shard", "shards", "workers")
 """Keys of `lerobot eval env=memobench` that LeRobot does not have (`plan.RunOptions`)."""
 TRAINING_OPTIONS = ("prompt_frames", "obs_type")
@@ -143,7 +135,7 @@ def is_of_benchmark(words: Mapping[str, str]) -> bool:
 
 
 @dataclass(frozen=True)
-class Asked:
+class CommandSettings:
     """The settings of one of LeRobot's commands, as a command line and its configuration file ask for them.
 
     Changes return another object.
@@ -171,7 +163,7 @@ class Asked:
             found = found.get(part) if isinstance(found, Mapping) else None
         return found
 
-    def default(self, key: str, value: object) -> Asked:
+    def default(self, key: str, value: object) -> CommandSettings:
         """Return settings with a value, unless one is given."""
         return replace(self, file=merged(nested({key: value}), self.file))
 
@@ -189,7 +181,7 @@ class Asked:
         return None if given is None else build(field_types(self.config)[name], given, name)
 
 
-def read_words(command: str, words: Mapping[str, str]) -> Asked:
+def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
     """Return the settings that the words of ``lerobot eval`` or ``lerobot train`` ask for.
 
     Raises:
@@ -203,7 +195,7 @@ def read_words(command: str, words: Mapping[str, str]) -> Asked:
     choices = registries(config)
     config_path = words.get(CONFIG_FILE)
     file = _settings_of_file(config, config_path)
-    found: dict[str, str] = {}
+    found: dict[str, Any] = {}
     for key in choices:  # `policy: act` in a file is `policy=act`
         if isinstance(file.get(key), str):
             file[key] = nested(choice_settings(config, key, file[key]))[key]
@@ -219,29 +211,29 @@ def read_words(command: str, words: Mapping[str, str]) -> Asked:
             del file[key]  # settings of another choice
     if "dataset.repo_id" in found and isinstance(file.get(DATASET), Mapping):
         file[DATASET] = without(file[DATASET], "root", "repo_id")
-    asked, short = Asked(config, found, file, config_path), SHORT_FORMS[command]
+    asked, short = CommandSettings(config, found, file, config_path), SHORT_FORMS[command]
     for key in found:
         if "." not in key and key not in (names := (*field_types(config), *short)):
             raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, names)}")
     for key in [key for key in found if key in short and key not in field_types(config)]:
         # replan= sets the policy's interval and the environment's, for the log; either may not exist.
-        fields = [each for each in short[key] if has_setting(asked, each)]
-        if not fields:
+        kinds = {full: kind for full in short[key] if (kind := setting_kind(asked, full)) is not None}
+        if not kinds:
             raise _without_field(asked, key, short[key][0])
-        found |= dict.fromkeys(fields, found[key])
+        found |= {full: value_of(key, kind, found[key]) for full, kind in kinds.items()}
         del found[key]
     return asked
 
 
-def has_setting(asked: Asked, key: str) -> bool:
-    """Return whether the command has a setting of this full name, with the choices that are made."""
+def setting_kind(asked: CommandSettings, key: str) -> Any:
+    """Return the type of a setting of this full name, None where the choices that are made have none."""
     section, _, name = key.partition(".")
     kind = without_none(field_types(asked.config)[section])
     chosen = chosen_class(kind, section, asked.get(section) or {}) if is_choice_type(kind) else kind
-    return chosen is not None and name in field_types(chosen)
+    return None if chosen is None else field_types(chosen).get(name)
 
 
-def _without_field(asked: Asked, key: str, full: str) -> MemobenchError:
+def _without_field(asked: CommandSettings, key: str, full: str) -> MemobenchError:
     section, _, name = full.partition(".")
     kind = without_none(field_types(asked.config)[section])
     chosen = chosen_class(kind, section, asked.get(section) or {})
@@ -264,10 +256,8 @@ def nested(words: Mapping[str, Any]) -> Settings:
             node = node.setdefault(part, {})
             if not isinstance(node, dict):
                 raise MemobenchError(f"found {key}= and {part}={words.get(part, '')}; give one of them")
-        if isinstance(node.get(last), dict) != isinstance(value, dict) and last in node:
-            raise MemobenchError(
-                f"found {key}={str(value)[:80]}; {key} holds settings, such as {key}.{next(iter(node[last]))}="
-            )
+        if isinstance(node.get(last), dict):
+            raise MemobenchError(f"found {key}={str(value)[:80]} and {key}.{next(iter(node[last]))}=; give one of them")
         node[last] = value
     return found
 
@@ -282,15 +272,6 @@ def merged(*layers: Mapping[str, Any]) -> Settings:
             both = isinstance(value, Mapping) and isinstance(found.get(key), Mapping)
             found[key] = merged(found[key], value) if both else value
     return found
-
-
-def flattened(settings: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the full name and the value of nested settings."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping) and value:
-            yield from flattened(value, f"{before}{name}.")
-        else:
-            yield f"{before}{name}", value
 
 
 # --- values of policy=, env=, dataset= …: a registered type, a checkpoint, a repository, a folder ---
@@ -641,7 +622,7 @@ def registries(config: type) -> dict[str, dict[str, type]]:
 # --- the policy ---
 
 
-def policy_config(asked: Asked) -> PreTrainedConfig | None:
+def policy_config(asked: CommandSettings) -> PreTrainedConfig | None:
     """Return the configuration of the policy, None without one.
 
     Raises:

@@ -1,18 +1,16 @@
 """Roll out a policy in a batch of environments, one episode per row.
 
-The loop is LeRobot's: observation, processors, ``select_action``, processors, step. It skips unneeded work: pictures
-are drawn only where the policy reads them, and the processors of observations do not run at a step whose action is
-already planned. LeRobot seeds once per run; here the caller seeds each batch, so that an evaluation that is resumed or
-shared among machines draws the same numbers as an undisturbed one.
+The loop is LeRobot's: observation, processors, ``select_action``, processors, step. It skips unneeded work: it queues
+the plans of LeRobot's policies, draws pictures only where the policy reads them, and runs the processors of
+observations only where the next action is not planned. LeRobot seeds once per run; here the caller seeds each batch, so
+that an evaluation that is resumed or shared among machines draws the same numbers as an undisturbed one.
 """
 
 from __future__ import annotations
 
 import hashlib
-import inspect
-import sys
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,23 +28,87 @@ PIXELS, PHASE, STEP = "pixels", "phase", "step"
 KEEPS_ITS_NOISE = ("memobench_mem",)
 """Policies that seed the noise of each episode from torch's initial seed: it must remain the seed of the run."""
 
+CHUNKED = (
+    "lerobot.policies.act.modeling_act.ACTPolicy",
+    "lerobot.policies.pi0.modeling_pi0.PI0Policy",
+    "lerobot.policies.pi05.modeling_pi05.PI05Policy",
+    "lerobot.policies.smolvla.modeling_smolvla.SmolVLAPolicy",
+)
+"""LeRobot's policies whose plans the loop queues."""
+
 Ended = Callable[[NDArray[np.bool_]], None]
 """Called after each step with the finished rows (B,)."""
 
 
-@dataclass(frozen=True)
+class ActionQueue:
+    """The actions of a policy, step by step.
+
+    A plan of LeRobot's policies in `CHUNKED` is queued here, so that no observation is needed until the queue is empty;
+    any other policy selects each action by itself. It may define ``needs_observation``: whether, after an action, it
+    reads the next pictures or objects; and ``has_planned_action``: whether its next ``select_action`` reads only
+    ``observation.phase`` and ``observation.step``.
+    """
+
+    def __init__(self, policy: Any) -> None:
+        self._policy = policy
+        self._queue: deque[torch.Tensor] | None = deque() if plans_chunks(policy) else None
+
+    def reset(self) -> None:
+        """Begin episodes."""
+        self._policy.reset()
+        if self._queue is not None:
+            self._queue.clear()
+
+    def select(self, inputs: dict[str, Any]) -> torch.Tensor:
+        """Return the actions (B, A) for the policy's inputs."""
+        with torch.inference_mode():
+            if self._queue is None:
+                action: torch.Tensor = self._policy.select_action(inputs)
+                return action
+            if not self._queue:
+                chunk = self._policy.predict_action_chunk(inputs)[:, : self._policy.config.n_action_steps]
+                self._queue.extend(chunk.transpose(0, 1))
+            return self._queue.popleft()
+
+    def needs_observation(self) -> bool:
+        """Return after an action whether the policy reads the next pictures or objects."""
+        own = getattr(self._policy, "needs_observation", None)
+        return not self.has_planned_action() if own is None else bool(own())
+
+    def has_planned_action(self) -> bool:
+        """Return after an action whether the next one is planned."""
+        own = getattr(self._policy, "has_planned_action", None)
+        return bool(self._queue) if own is None else bool(own())
+
+
+def plans_chunks(policy: Any) -> bool:
+    """Return whether the ``select_action`` of a policy is a queue of its ``predict_action_chunk``, and no more.
+
+    Subclasses may act differently. ACT's temporal ensemble and π0.5's visual memory read every observation.
+    """
+    kind, config = type(policy), getattr(policy, "config", None)
+    return (
+        f"{kind.__module__}.{kind.__name__}" in CHUNKED
+        and getattr(config, "temporal_ensemble_coeff", None) is None
+        and not getattr(config, "use_visual_memory", False)
+        and not getattr(getattr(config, "rtc_config", None), "enabled", False)
+    )
+
+
 class Actor:
     """A policy between its processors.
 
-    Attributes:
+    Args:
         policy: of LeRobot's interface.
         before: processors of observations: the environment's, then the policy's.
         after: processors of actions: the policy's, then the environment's.
     """
 
-    policy: Any
-    before: Sequence[Callable[[Any], Any]]
-    after: Sequence[Callable[[Any], Any]]
+    def __init__(
+        self, policy: Any, before: Sequence[Callable[[Any], Any]], after: Sequence[Callable[[Any], Any]]
+    ) -> None:
+        self.policy, self.before, self.after = policy, before, after
+        self.actions = ActionQueue(policy)
 
     def inputs(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Return the policy's inputs for an observation under LeRobot's names."""
@@ -56,10 +118,9 @@ class Actor:
 
     def act(self, inputs: dict[str, Any]) -> NDArray[np.float32]:
         """Return the environment's actions (B, A)."""
-        with torch.inference_mode():
-            action = self.policy.select_action(inputs)
         policys, environments = self.after
-        found: NDArray[np.float32] = environments({ACTION: policys(action)})[ACTION].to("cpu").numpy()
+        action = environments({ACTION: policys(self.actions.select(inputs))})[ACTION]
+        found: NDArray[np.float32] = action.to("cpu").numpy()
         return found
 
 
@@ -71,7 +132,7 @@ def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = Non
         seeds: one per row.
         corrupt: what happens to the memory of rows when their environments report so, see `EnvSettings`.
     """
-    actor.policy.reset()
+    actor.actions.reset()
     # Without the option a frozen row would stay frozen for this rollout.
     observation, _ = env.reset(seed=list(seeds), options={NEW_ROLLOUT_OPTION: True})
     limit = env.call("_max_episode_steps")[0]
@@ -98,7 +159,6 @@ class Inputs:
 
     def __init__(self, env: Any, actor: Actor) -> None:
         self._env, self._actor = env, actor
-        self._needed, self._ready = needs_observation(actor.policy), has_planned_action(actor.policy)
         self._drawn, self._planned = True, False  # after the environment's reset
         self._pictures: dict[str, torch.Tensor] = {}
         self._last: dict[str, Any] = {}
@@ -106,7 +166,8 @@ class Inputs:
 
     def announce(self) -> None:
         """Announce to the environment, before its step, whether the policy needs the observation after it."""
-        needed, self._planned = self._needed(), self._ready()
+        actions = self._actor.actions
+        needed, self._planned = actions.needs_observation(), actions.has_planned_action()
         if needed != self._drawn:
             self._env.call("need_observation", needed)
             self._drawn = needed
@@ -135,82 +196,6 @@ class Inputs:
         converted["task"] = list(self._env.call("task_description"))
         self._last = self._actor.inputs(converted)
         return self._last
-
-
-# --- the observations that a policy needs ---
-
-
-@dataclass(frozen=True)
-class ChunkPolicy:
-    """One of LeRobot's policies that plan action chunks.
-
-    Attributes:
-        planned: returns whether a policy's next action is planned.
-        read: `digest` of each version of ``select_action`` for which ``planned`` was written.
-    """
-
-    planned: Callable[[Any], bool]
-    read: tuple[str, ...]
-
-
-KNOWN: dict[tuple[str, str], ChunkPolicy] = {
-    ("lerobot.policies.act.modeling_act", "ACTPolicy"): ChunkPolicy(
-        lambda policy: policy.config.temporal_ensemble_coeff is None and bool(policy._action_queue), ("031085d1a22c",)
-    ),
-    ("lerobot.policies.pi0.modeling_pi0", "PI0Policy"): ChunkPolicy(
-        lambda policy: bool(policy._action_queue), ("a330b536084c",)
-    ),
-    # Its visual memory reads the pictures of every step.
-    ("lerobot.policies.pi05.modeling_pi05", "PI05Policy"): ChunkPolicy(
-        lambda policy: not getattr(policy.config, "use_visual_memory", False) and bool(policy._action_queue),
-        ("a330b536084c", "41d18fe29b12"),
-    ),
-    ("lerobot.policies.smolvla.modeling_smolvla", "SmolVLAPolicy"): ChunkPolicy(
-        lambda policy: bool(policy._queues[ACTION]), ("3b7b12d0066f",)
-    ),
-}
-"""By module and class."""
-
-
-def needs_observation(policy: Any) -> Callable[[], bool]:
-    """Return the check, made after an action, whether a policy reads the next pictures or objects.
-
-    A policy defines it as a method of that name. Of LeRobot's policies, those whose source is known need an
-    observation when no action is planned; any other policy needs every observation.
-    """
-    own: Callable[[], bool] | None = getattr(policy, "needs_observation", None)
-    if own is not None:
-        return own
-    planned = has_planned_action(policy)
-    return lambda: not planned()
-
-
-def has_planned_action(policy: Any) -> Callable[[], bool]:
-    """Return the check, made after an action, whether a policy has planned the next one.
-
-    Its ``select_action`` then reads ``observation.phase`` and ``observation.step`` only. A policy defines it as a
-    method of that name. LeRobot's policies are recognised by the source of ``select_action``, since a subclass may act
-    differently (`diffusion` queues pictures at every step); for any other policy the answer is no.
-    """
-    own: Callable[[], bool] | None = getattr(policy, "has_planned_action", None)
-    if own is not None:
-        return own
-    acts: Any = getattr(type(policy), "select_action", None)
-    for (module, name), known in KNOWN.items():
-        # A module that was not imported has no policy here.
-        theirs: Any = getattr(getattr(sys.modules.get(module), name, None), "select_action", None)
-        if theirs is not None and acts is theirs and digest(theirs) in known.read:
-            return lambda: known.planned(policy)
-    return lambda: False
-
-
-def digest(function: Callable[..., Any]) -> str | None:
-    """Return the first digits of the hash of a function's source; None without a source."""
-    try:
-        source = inspect.getsource(inspect.unwrap(function))
-    except (OSError, TypeError):
-        return None
-    return hashlib.sha256(source.encode()).hexdigest()[:12]
 
 
 # --- random numbers ---

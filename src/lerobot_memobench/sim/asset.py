@@ -21,8 +21,8 @@ TABLE_SIZE = (1.0, 1.2, 0.05)
 """Size of the table's board, m."""
 TABLE_TOP = 0.90
 """Height of the table's top, m; its centre is at x = y = 0."""
-COLLISION_GROUP, SITE_GROUP = 0, 4
-"""Groups of geoms with contacts and of sites; `raster.drawlist.VISUAL_GROUP` is that of visible geoms."""
+COLLISION_GROUP, VISUAL_GROUP, SITE_GROUP = 0, 1, 4
+"""Groups of geoms with contacts, of drawn geoms, and of sites."""
 
 ALONG_X, ALONG_Y = 0.0, float(np.pi / 2)
 """Yaws of a grasp whose fingers close along x or y of the body [rad]."""

@@ -25,8 +25,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.asset import COLLISION_GROUP, Articulation, split_class
 from lerobot_memobench.sim.libero.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
-from lerobot_memobench.sim.raster.highlights import Highlight
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+from mujoco_raster.highlights import Highlight
 
 POINTS_PER_THING = 24
 """Ray targets per thing."""

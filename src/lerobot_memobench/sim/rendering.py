@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import mujoco
-import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.sim.raster.drawlist import DrawList, Image
-from lerobot_memobench.sim.raster.highlights import Highlight
+from mujoco_raster.drawlist import DrawList, Image
+from mujoco_raster.errors import RasterError
+from mujoco_raster.highlights import Highlight
 
 if TYPE_CHECKING:
-    from lerobot_memobench.sim.raster.rasterizer import Rasterizer
+    from mujoco_raster.rasterizer import Rasterizer
 
 
 DEFAULT, HIGH = "default", "high"
@@ -59,10 +60,9 @@ class Supersampled:
         self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, highlights: Sequence[Highlight] = ()
     ) -> Image:
         """Return a camera's image; see `Renderer`."""
-        fine = self.renderer.draw(model, data, camera, highlights)
-        height, width, channels = fine.shape
-        total = fine.reshape(height // 2, 2, width // 2, 2, channels).sum(axis=(1, 3), dtype=np.uint16)
-        return ((total + 2) // 4).astype(np.uint8)
+        from mujoco_raster.rasterizer import mean_of_four
+
+        return mean_of_four(self.renderer.draw(model, data, camera, highlights))
 
 
 CACHED_RENDERERS = 4
@@ -106,9 +106,18 @@ def get_rasterizer(key: Any, model: mujoco.MjModel, settings: RenderSettings, dr
     return cast("Rasterizer", get_renderer(key, model, replace(settings, quality=DEFAULT), draw_list))
 
 
+@contextlib.contextmanager
+def translate_errors() -> Iterator[None]:
+    """Raise errors of the rasterizer as `MemobenchError`."""
+    try:
+        yield
+    except RasterError as error:
+        raise MemobenchError(str(error)) from error
+
+
 def make_renderer(model: mujoco.MjModel, settings: RenderSettings, draw_list: DrawList) -> Renderer:
     """Return a new renderer of a scene; arguments as in `get_renderer`."""
-    from lerobot_memobench.sim.raster.rasterizer import Rasterizer  # loads numba
+    from mujoco_raster.rasterizer import Rasterizer  # loads numba
 
     if settings.quality == HIGH:
         return Supersampled(Rasterizer(model, draw_list, 2 * settings.width, 2 * settings.height))

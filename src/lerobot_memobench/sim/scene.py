@@ -10,8 +10,8 @@ import mujoco
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.sim.asset import Asset
 from lerobot_memobench.sim.libero.files import user_folders
-from lerobot_memobench.sim.raster.drawlist import DrawList
 from lerobot_memobench.tasks.task import Task
+from mujoco_raster.drawlist import DrawList
 
 AGENTVIEW = "agentview"
 

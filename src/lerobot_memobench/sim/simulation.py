@@ -20,14 +20,14 @@ from lerobot_memobench.sim.hiding import HiddenObject, HiddenObjects
 from lerobot_memobench.sim.libero.placement import Placer
 from lerobot_memobench.sim.libero.scene import GLOW_OFF, GLOW_ON, get_scene
 from lerobot_memobench.sim.libero.settling import settling_step
-from lerobot_memobench.sim.raster.drawlist import DrawList, Image
-from lerobot_memobench.sim.raster.highlights import Highlight
-from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer
+from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer, translate_errors
 from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
 from lerobot_memobench.sim.scene_hash import scene_hash
 from lerobot_memobench.sim.world import StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
+from mujoco_raster.drawlist import DrawList, Image
+from mujoco_raster.highlights import Highlight
 
 Array = NDArray[np.float64]
 
@@ -374,13 +374,15 @@ class Simulation:
             lit = self.holds(Atom("turnon", (asset.name,)))
             model.geom(geom).rgba = GLOW_ON if lit else GLOW_OFF
         renderer = get_renderer(self._scene.key, model, self.render_settings, draw_list)
-        return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
+        with translate_errors():
+            return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
 
     def visible_bodies(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the body at each pixel of a camera's image, (height, width), -1 for none."""
         model, data, draw_list = self._drawing()
         rasterizer = get_rasterizer(self._scene.key, model, self.render_settings, draw_list)
-        geoms = rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
+        with translate_errors():
+            geoms = rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
         return np.where(geoms >= 0, model.geom_bodyid[geoms], -1)
 
     def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData, DrawList]:

@@ -41,7 +41,7 @@ from lerobot_memobench.run.command_line import (
     HELP,
     PATH,
     TRAINING_OPTIONS,
-    Asked,
+    CommandSettings,
     read_words,
     resolve_recipe,
     spelled,
@@ -67,14 +67,6 @@ SHORT_TRAINING = 2000
 """Updates below which losses are logged ten times; LeRobot's default of every 200 updates would log too few."""
 TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
 """Settings that name the model to train."""
-MEMORY_DEFAULTS: Mapping[str, object] = {
-    "memory_stride": None,
-    "memory_fusion": None,
-    "memory_phase": False,
-    "memory_repeats": True,
-    "subgoals": None,
-}
-"""Settings that a memory does not take over from another memory's checkpoint or recipe -> their defaults."""
 SMALLEST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0, "eval.n_episodes": 1}
 """Setting -> its smallest value."""
 
@@ -175,7 +167,9 @@ def take_training_options(words: Mapping[str, str]) -> tuple[bool | None, str | 
     return prompts, obs_type, rest
 
 
-def complete_training(asked: Asked, notify: Callable[[str], None] = print) -> tuple[Asked, TrainPipelineConfig]:
+def complete_training(
+    asked: CommandSettings, notify: Callable[[str], None] = print
+) -> tuple[CommandSettings, TrainPipelineConfig]:
     """Check a training's settings and add the benchmark's defaults; return them and the configuration.
 
     Args:
@@ -221,7 +215,7 @@ def complete_training(asked: Asked, notify: Callable[[str], None] = print) -> tu
     return asked, config
 
 
-def build_training(asked: Asked) -> tuple[Asked, TrainPipelineConfig]:
+def build_training(asked: CommandSettings) -> tuple[CommandSettings, TrainPipelineConfig]:
     """Return the settings and the configuration.
 
     Settings of a checkpoint that have no effect under the settings of the command line are reset to their defaults.
@@ -236,17 +230,20 @@ def build_training(asked: Asked) -> tuple[Asked, TrainPipelineConfig]:
         return asked, asked.build()
 
 
-def with_memory_defaults(asked: Asked) -> Asked:
+def with_memory_defaults(asked: CommandSettings) -> CommandSettings:
     """Return settings in which a memory that differs from the checkpoint's or the recipe's has its own defaults."""
     memory, path = asked.words.get("policy.memory"), asked.get(f"policy.{PATH}")
     if memory is None:
         return asked
     folder = None if path is None else local_folder(path)
     begun = read_json(folder / POLICY_CONFIG) if folder is not None else asked.file.get("policy") or {}
-    held = begun.get("memory") or ("none" if begun.get("memory_fusion") == "none" else "frames")
-    if begun.get("type") != MEMORY_POLICY or held == ("frames" if memory == "null" else memory):
+    if begun.get("type") != MEMORY_POLICY:
         return asked
-    defaults = {f"policy.{name}": value for name, value in MEMORY_DEFAULTS.items()}
+    from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig, memory_defaults
+
+    if begun.get("memory", MemobenchMemConfig.memory) == memory:
+        return asked
+    defaults = {f"policy.{name}": value for name, value in memory_defaults().items()}
     return replace(asked, words={**defaults, **asked.words})
 
 
@@ -260,7 +257,7 @@ def check_numbers(config: TrainPipelineConfig) -> None:
             raise MemobenchError(f"found {key}={found}; expected at least {smallest}")
 
 
-def check_dataset(asked: Asked) -> None:
+def check_dataset(asked: CommandSettings) -> None:
     """Refuse a folder that is not a dataset; a folder that does not exist may be one to download into."""
     root, repository = asked.get("dataset.root"), asked.get("dataset.repo_id")
     if root is None:
@@ -279,7 +276,7 @@ def check_dataset(asked: Asked) -> None:
     check_fetched(folder)
 
 
-def check_memory_settings(asked: Asked, policy: Any) -> None:
+def check_memory_settings(asked: CommandSettings, policy: Any) -> None:
     """Refuse settings on the command line that belong to another memory; errors as of `read_settings`."""
     from lerobot_memobench.policies.memobench_mem.memory import NONE, read_settings
 

@@ -19,7 +19,7 @@ from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import check_features
 from lerobot_memobench.policies.convention import trained_convention
-from lerobot_memobench.run.command_line import Asked
+from lerobot_memobench.run.command_line import CommandSettings
 from lerobot_memobench.sim.convention import convention_of
 
 READ = frozenset(
@@ -34,7 +34,7 @@ READ = frozenset(
 """Fields of LeRobot's configuration that the loop of memory policies reads, itself or through LeRobot's functions."""
 
 
-def complete(config: TrainPipelineConfig, asked: Asked) -> TrainPipelineConfig:
+def complete(config: TrainPipelineConfig, asked: CommandSettings) -> TrainPipelineConfig:
     """Return the configuration of a memory policy's training with its optimizer, folder of the run and checkpoint.
 
     Raises:
@@ -72,7 +72,8 @@ def check_settings(config: TrainPipelineConfig) -> None:
     for name, value in vars(config).items():
         for setting, found in () if name in READ else changes(name, value, getattr(unused, name, None)):
             raise MemobenchError(f"{setting}={found} has no effect on policy={policy.type}; leave it out")
-    encoded = config.dataset.image_transforms.enable and policy.encodes_ahead
+    encodes_ahead = policy.uses_detector or policy.uses_visual_encoder
+    encoded = config.dataset.image_transforms.enable and encodes_ahead
     no_optimizer = config.optimizer is None and not config.use_policy_training_preset
     new_policy = not policy.pretrained_path and not config.resume
     repository = policy.repo_id

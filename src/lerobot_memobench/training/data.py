@@ -33,7 +33,6 @@ from lerobot_memobench.datasets.lerobot_format.reading import check_revision, li
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
-from lerobot_memobench.policies.memobench_mem.alignment import make_text_encoder, require_texts
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     ImageTowerEncoder,
@@ -46,12 +45,12 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     follow_training,
     make_memobench_mem_pre_post_processors,
 )
-from lerobot_memobench.policies.memobench_mem.subgoals import require_known, subgoals_of
-from lerobot_memobench.policies.memobench_mem.targets import with_targets
+from lerobot_memobench.policies.memobench_mem.text_encoders import make_text_encoder
 from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.sim.scene_hash import check_world
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
 from lerobot_memobench.training.sampler import seed_of
+from lerobot_memobench.training.texts import set_subgoals, with_targets
 
 logger = logging.getLogger(__name__)
 
@@ -167,18 +166,6 @@ def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -
     if not (root / "data").is_dir():
         root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
     complete(root, missing, logger.warning)
-
-
-def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:
-    """Set the subgoals of a memory that is supervised with them.
-
-    Raises:
-        MemobenchError: the dataset lacks texts that the policy needs.
-    """
-    require_texts(Path(meta.root), config)
-    if config.privileged_memory:
-        config.subgoals = config.subgoals or subgoals_of(meta, config.subgoal_level)
-        require_known(config.subgoals, meta, config.subgoal_level)
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------

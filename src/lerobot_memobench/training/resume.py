@@ -28,7 +28,7 @@ from lerobot_memobench.run.command_line import (
     RECIPE,
     TRAINING_OPTIONS,
     TYPE,
-    Asked,
+    CommandSettings,
     field_types,
     spelled,
     value_of,
@@ -104,7 +104,7 @@ def whole_checkpoints(run: Path) -> Iterator[Path]:
             yield folder
 
 
-def make_room_for_link(asked: Asked) -> None:
+def make_room_for_link(asked: CommandSettings) -> None:
     """Remove a file that a copy made of the link ``last`` of a resumed training, because LeRobot makes the link.
 
     Raises:
@@ -133,7 +133,7 @@ def _check_same_policy(words: Mapping[str, str], checkpoint: Path, folder: str) 
         raise MemobenchError(f"the training in {folder} has policy={begun}; found policy={named}; leave policy out")
 
 
-def check_same_training(asked: Asked, config: TrainPipelineConfig) -> None:
+def check_same_training(asked: CommandSettings, config: TrainPipelineConfig) -> None:
     """Refuse to resume a training with another dataset, or with settings that it cannot change.
 
     Args:
@@ -167,7 +167,7 @@ def begun_training(checkpoint: Path) -> TrainPipelineConfig:
         return TrainPipelineConfig.from_pretrained(checkpoint)
 
 
-def _check_same_dataset(asked: Asked, begun: TrainPipelineConfig, checkpoint: Path) -> None:
+def _check_same_dataset(asked: CommandSettings, begun: TrainPipelineConfig, checkpoint: Path) -> None:
     """Refuse to resume a training on another dataset, or on other episodes of it."""
     root, repository = asked.words.get("dataset.root"), asked.words.get("dataset.repo_id")
     held = str(begun.dataset.root or begun.dataset.repo_id)
@@ -190,7 +190,7 @@ def _check_same_dataset(asked: Asked, begun: TrainPipelineConfig, checkpoint: Pa
             raise MemobenchError(f"this training was begun with dataset.{name}={value}; found {text}; {advice}")
 
 
-def _resumed_checkpoint(asked: Asked) -> Path | None:
+def _resumed_checkpoint(asked: CommandSettings) -> Path | None:
     """Return the checkpoint that a training resumes from; None if it is new, or if the checkpoint is on the hub."""
     path = asked.config_path
     if not value_of("resume", bool, asked.get("resume") or "false") or path is None or not Path(path).exists():
@@ -198,7 +198,7 @@ def _resumed_checkpoint(asked: Asked) -> Path | None:
     return Path(path) if Path(path).is_dir() else Path(path).parent
 
 
-def note_on_resume(asked: Asked, config: TrainPipelineConfig) -> tuple[str | None, bool]:
+def note_on_resume(asked: CommandSettings, config: TrainPipelineConfig) -> tuple[str | None, bool]:
     """Return a note on a resumed training, or None, and whether updates are left."""
     checkpoint = _resumed_checkpoint(asked)
     if checkpoint is None:
@@ -219,7 +219,7 @@ def note_on_resume(asked: Asked, config: TrainPipelineConfig) -> tuple[str | Non
 
 
 def changed_settings(
-    asked: Asked, config: TrainPipelineConfig, begun: TrainPipelineConfig
+    asked: CommandSettings, config: TrainPipelineConfig, begun: TrainPipelineConfig
 ) -> Iterator[tuple[str, object, object]]:
     """Yield name, value and earlier value of settings on the command line that differ from the run's.
 
@@ -264,7 +264,7 @@ def step_reached(checkpoint: Path) -> int:
     return int(read_json(checkpoint.parent / TRAINING_STEP)["step"])
 
 
-def resume_hint(asked: Asked, words: Mapping[str, str], begun: float) -> str:
+def resume_hint(asked: CommandSettings, words: Mapping[str, str], begun: float) -> str:
     """Return the advice for a training that was terminated: the command that resumes from its last checkpoint.
 
     Args:

@@ -1,4 +1,4 @@
-"""Alignment of memory tokens with the text of the current subgoal: objectives, loss, texts and their encoders.
+"""Alignment of memory tokens with the text of the current subgoal: objectives and loss.
 
 From the paper's appendix on alignment; used in training only. H (B, L, d_m) are memory tokens, the mask (B, L) marks
 real tokens, T are text embeddings of width d_t. Vectors with a hat in the paper are L2-normalised here as well.
@@ -6,25 +6,16 @@ real tokens, T are text embeddings of width d_t. Vectors with a hat in the paper
 
 from __future__ import annotations
 
-import hashlib
-import itertools
 import math
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 from torch.nn.utils import parameters_to_vector
 
-from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, MEMORY_COLUMN, FrameLookup, holds_texts
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.losses import joint, mean_over_ranks, world_size
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
 
@@ -214,168 +205,10 @@ def alignment_loss(
     return weighted, logged | alignment.numbers()
 
 
-# -- subgoal texts of samples -----------------------------------------------------------------------------------------
-
-
-def require_texts(root: Path, config: MemobenchMemConfig) -> None:
-    """Check that a dataset has the texts that a policy learns from.
-
-    Raises:
-        MemobenchError: it has no subgoals at the level of the alignment, or no oracle memory.
-    """
-    column = LEVEL_COLUMNS[config.subgoal_level]
-    if config.align != "none" and not holds_texts(root, column):
-        others = [level for level, name in LEVEL_COLUMNS.items() if holds_texts(root, name)]
-        cure = (
-            f"it has {' and '.join(others)} subgoals: choose one with --policy.subgoal_level"
-            if others
-            else ("use --policy.align=none, or a dataset that has the subgoal of each frame there")
-        )
-        raise MemobenchError(
-            f"The dataset {root} has no {config.subgoal_level} subgoals (no text in a column '{column}'), so "
-            f"--policy.align={config.align} has no text to align memory with; {cure}."
-        )
-    if config.oracle_memory and not holds_texts(root, MEMORY_COLUMN):
-        raise MemobenchError(
-            f"The dataset {root} has no text in a column '{MEMORY_COLUMN}', which --policy.oracle_memory=true reads; "
-            "leave it out, or generate the dataset again with this version."
-        )
-
-
-def text_rows(lookup: FrameLookup, level: str, align: str) -> np.ndarray:
-    """Return the row of the cached embeddings for each frame of the dataset (N,), -1 for frames without subgoal.
+def embedded_texts(embeddings: Tensor, rows: Tensor) -> dict[str, Tensor]:
+    """Return the texts (..., d_t) of frames and their mask (...), as inputs of `alignment_loss`.
 
     Args:
-        level: subgoal level. align: the objective, for the message.
-
-    Raises:
-        MemobenchError: the dataset has no texts.
+        embeddings: of all texts, (T, d_t). rows: (...) integers, row of each frame's text, -1 for none.
     """
-    rows = lookup.text_rows(level)
-    if len(lookup.texts) == 0:
-        raise MemobenchError(
-            f"The dataset of {lookup.root} has no subgoal text, which --policy.align={align} needs; use "
-            "--policy.align=none, or a dataset with subgoals."
-        )
-    return rows
-
-
-def texts_of_frames(lookup: FrameLookup, rows: np.ndarray, frames: Sequence[int]) -> dict[str, Tensor]:
-    """Return the texts (B, d_t) of frames of the dataset, and their mask (B,); ``rows`` as of `text_rows`."""
-    return _embed(lookup, rows[np.asarray(frames)].astype(np.int64))
-
-
-def texts_of_histories(lookup: FrameLookup, rows: np.ndarray, histories: Sequence[np.ndarray]) -> dict[str, Tensor]:
-    """Return the texts (B, F, d_t) of remembered frames, padded to the longest history, and their mask (B, F)."""
-    padded = np.full((len(histories), max(map(len, histories))), -1, dtype=np.int64)
-    for sample, history in enumerate(histories):
-        padded[sample, : len(history)] = rows[history]
-    return _embed(lookup, padded)
-
-
-def _embed(lookup: FrameLookup, rows: np.ndarray) -> dict[str, Tensor]:
-    numbers = torch.from_numpy(rows)
-    return {TEXT_MASK: numbers >= 0, TEXT: lookup.text_embeddings[numbers.clamp(min=0)]}
-
-
-# -- frozen text encoders of subgoals ---------------------------------------------------------------------------------
-
-
-_WORD = re.compile(r"\w+|[^\w\s]")
-
-
-def words(text: str) -> list[str]:
-    """Return the lower-case words and punctuation marks of a text."""
-    return _WORD.findall(text.lower())
-
-
-class WordTextEncoder:
-    """Embed a text as the sum of a fixed random vector per word and per pair of neighbouring words.
-
-    Different texts nearly always have cosines well below 0.99.
-    """
-
-    def __init__(self, dim: int) -> None:
-        self.dim = dim
-
-    @property
-    def key(self) -> str:
-        """Identity of the embeddings."""
-        return f"words-1-{self.dim}"
-
-    def _vector(self, token: str) -> Tensor:
-        seed = int.from_bytes(hashlib.blake2b(token.encode(), digest_size=7).digest(), "big")
-        return torch.randn(self.dim, generator=torch.Generator().manual_seed(seed))
-
-    def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Return normalised embeddings (N, dim), float32."""
-        rows = [torch.stack([self._vector(token) for token in self._tokens(text)]).sum(dim=0) for text in texts]
-        return F.normalize(torch.stack(rows), dim=-1)
-
-    def _tokens(self, text: str) -> list[str]:
-        tokens = words(text)
-        return [*tokens, *(f"{first} {second}" for first, second in itertools.pairwise(tokens))]
-
-
-class LabelTextEncoder(WordTextEncoder):
-    """Embed each text as one random vector, independent of its words: a control without language."""
-
-    @property
-    def key(self) -> str:
-        """Identity of the embeddings."""
-        return f"labels-1-{self.dim}"
-
-    def _tokens(self, text: str) -> list[str]:
-        return [text]
-
-
-class SiglipTextEncoder:
-    """SigLIP's text tower from a folder or the hub; width 1152 for So400m, as in the paper."""
-
-    def __init__(self, name: str, dim: int, device: str = "cpu") -> None:
-        self.name, self.dim, self.device = name, dim, device
-
-    @property
-    def key(self) -> str:
-        """Identity of the embeddings: the model's name without its folder."""
-        return f"siglip-{self.name.rstrip('/').rsplit('/', 1)[-1]}-{self.dim}"
-
-    @torch.no_grad()
-    def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Return pooled text features (N, dim), float32.
-
-        Raises:
-            MemobenchError: the weights cannot be loaded, or have another width.
-        """
-        tokenizer, model = self._load()
-        rows = []
-        for part in itertools.batched(texts, 64):
-            # SigLIP was trained with every text padded to 64 tokens.
-            inputs = tokenizer(list(part), padding="max_length", max_length=64, truncation=True, return_tensors="pt")
-            rows.append(model(inputs["input_ids"].to(self.device)).pooler_output.float().cpu())
-        return torch.cat(rows)
-
-    def _load(self) -> tuple[Any, Any]:
-        """Return tokenizer and model."""
-        from transformers import AutoTokenizer, SiglipTextModel
-
-        try:
-            tokenizer = AutoTokenizer.from_pretrained(self.name)
-            model = SiglipTextModel.from_pretrained(self.name, dtype=torch.float32).to(self.device).eval()
-        except (OSError, ValueError) as error:
-            raise MemobenchError(
-                f"The text encoder '{self.name}' could not be loaded ({type(error).__name__}): give a folder with a "
-                "SigLIP model by --policy.text_encoder, or make the hub reachable."
-            ) from error
-        if model.config.hidden_size != self.dim:
-            raise MemobenchError(
-                f"The text encoder '{self.name}' gives {model.config.hidden_size} numbers per text and this size "
-                f"needs {self.dim}; choose another with --policy.text_encoder."
-            )
-        return tokenizer, model
-
-
-def make_text_encoder(name: str, dim: int, device: str = "cpu") -> WordTextEncoder | SiglipTextEncoder:
-    """Build a text encoder: ``words``, ``labels``, or the folder or repository of a SigLIP model."""
-    built_in = {"words": WordTextEncoder, "labels": LabelTextEncoder}
-    return built_in[name](dim) if name in built_in else SiglipTextEncoder(name, dim, device)
+    return {TEXT_MASK: rows >= 0, TEXT: embeddings[rows.long().clamp(min=0)]}

@@ -19,7 +19,7 @@ from transformers.initialization import no_init_weights
 
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
 from lerobot_memobench.perception.weights import load_detector
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import Dimensions, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     VISION_SEED,
     ImageTowerEncoder,
@@ -28,6 +28,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     seed_parameters,
 )
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
+from lerobot_memobench.policies.memobench_mem.sizes import Dimensions
 from lerobot_memobench.sim.object_slots import classes
 
 

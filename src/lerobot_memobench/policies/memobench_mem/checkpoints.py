@@ -1,4 +1,4 @@
-"""Checkpoints of the policy: checks of configuration, weights, statistics and saved processor steps.
+"""Load the weights of a checkpoint, and check that its processor steps agree with the configuration.
 
 The model file holds the averaged weights; `training.average` saves the trained weights next to it.
 """
@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 from lerobot.configs import PreTrainedConfig
 from safetensors import safe_open
 from safetensors.torch import load_file
@@ -20,22 +19,16 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import (
     PREPROCESSOR_FILE,
     WEIGHTS_FILE,
-    Processor,
     check_processors,
     checkpoint_file,
     differing,
-    read_json,
-    statistics_shapes,
+    steps_of,
     undamaged,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 logger = logging.getLogger(__name__)
-
-WORD_POSITIONS = "instruction.positions"
-"""End of the name of a tensor that checkpoints of earlier versions lack."""
 
 
 def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
@@ -84,13 +77,13 @@ def _head(policy: nn.Module) -> set[str]:
 
 
 def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: MemobenchMemConfig) -> None:
-    """Load the weights of checkpoint ``source`` into a policy of this kind; its alignment heads may be missing.
+    """Load the weights of checkpoint ``source`` into a policy of this kind.
 
     Args:
         trained: the checkpoint's configuration. `restarted` parts keep their initial weights, with a warning.
 
     Raises:
-        MemobenchError: the weights cannot be read, do not fit, or have no memory.
+        MemobenchError: the weights cannot be read, or do not fit.
     """
     config, new = cast(MemobenchMemConfig, policy.config), restarted(policy, trained)
     for name, asked, held in differing(config, trained, ("base_weights", "visual_encoder")):
@@ -98,7 +91,6 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             f"--policy.{name}={asked} has no effect: it sets initial weights, and the weights of '{source}' "
             f"({name}={held}) replace them; leave {name} out, or train from scratch."
         )
-    weights = read_tensors(path)
     if has_another_memory(config, trained):
         logger.warning(
             "'%s' was trained with memory=%s, and this is memory=%s%s: %d tensors of the memory and its fusion keep "
@@ -110,16 +102,8 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             len(new - _head(policy)),
             config.memory_stride,
         )
-    elif config.memory != NONE and not any(name.startswith("model.memory.") for name in weights):
-        raise MemobenchError(
-            f"'{source}' holds weights without a memory; to start from pi0.5's weights pass "
-            "--policy.base_weights=<checkpoint> instead of a pretrained path."
-        )
-    weights = {name: tensor for name, tensor in weights.items() if name not in new}
-    for name, parameter in policy.named_parameters():
-        if name.endswith(WORD_POSITIONS):  # zeros give the mean word, to which earlier versions mapped an instruction
-            weights.setdefault(name, torch.zeros_like(parameter))
-    load_exactly(policy, weights, source, optional=new | _head(policy))
+    weights = {name: tensor for name, tensor in read_tensors(path).items() if name not in new}
+    load_exactly(policy, weights, source, optional=new)
 
 
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
@@ -144,25 +128,6 @@ def weights_file(source: str | Path, revision: str | None = None, *, named: str,
     if path is None:
         raise MemobenchError(f"{named} has no {WEIGHTS_FILE}; {fix}.")
     return path
-
-
-def require_statistics(source: str | Path, revision: str | None = None) -> None:
-    """Check that a checkpoint has the statistics that normalise states and actions.
-
-    LeRobot does not normalise values without statistics, and an evaluation then scores 0 %.
-
-    Raises:
-        MemobenchError: a file or a statistic is missing.
-    """
-    fix = "copy the preprocessor files of its training run into it, or train again"
-    if checkpoint_file(source, PREPROCESSOR_FILE, revision) is None:
-        raise MemobenchError(f"The checkpoint '{source}' has no {PREPROCESSOR_FILE}, which evaluation needs; {fix}.")
-    missing = sorted({"observation.state", "action"} - set(statistics_shapes(source, revision)))
-    if missing:
-        raise MemobenchError(
-            f"The checkpoint '{source}' has no dataset statistics for {' and '.join(missing)}, so states and actions "
-            f"could not be normalised; {fix}."
-        )
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
@@ -228,8 +193,7 @@ def require_agreement(source: str | Path, revision: str | None, config: Memobenc
     path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
     if path is None:
         return
-    entries = read_json(path, Processor).get("steps", [])
-    steps = {entry.get("registry_name", ""): entry.get("config", {}) for entry in entries}
+    steps: dict[str, Any] = {step.get("registry_name", ""): step.get("config", {}) for step in steps_of(path)}
     for field, held in _held(steps, config, training):
         asked = getattr(config, field)
         if asked != held:

@@ -1,4 +1,4 @@
-"""Configuration of ``memobench_mem``: the dimensions of each size, the settings, their defaults and checks."""
+"""Configuration of ``memobench_mem``: the settings, their defaults and checks. Dimensions are in `sizes`."""
 
 from __future__ import annotations
 
@@ -6,18 +6,13 @@ import json
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
-from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
-from torch import nn
-from torch.optim import AdamW, Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
 from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
@@ -25,6 +20,7 @@ from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE
+from lerobot_memobench.policies.checkpoint import CONFIG_FILE
 from lerobot_memobench.policies.memobench_mem.memory import (
     NONE,
     OURS,
@@ -35,16 +31,14 @@ from lerobot_memobench.policies.memobench_mem.memory import (
     settings_of_another,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
-from lerobot_memobench.policies.memobench_mem.subgoals import texts_of
+from lerobot_memobench.policies.memobench_mem.optimization import FusedAdamWConfig, WarmupFractionSchedulerConfig
+from lerobot_memobench.policies.memobench_mem.sizes import FLOW_MATCHING, REGRESSION, SIZES, Dimensions
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 
 logger = logging.getLogger(__name__)
 
-FLOW_MATCHING, REGRESSION = "flow_matching", "regression"
 OBJECTIVES = (FLOW_MATCHING, REGRESSION)
 ALIGN_WEIGHTS: Mapping[str, float] = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
-SHUFFLE_SEED = 7
-"""Seed of ``align_targets=shuffled``."""
 SUBGOALS, SHUFFLED, PROGRESS, ANSWERS = ALIGN_TARGETS = ("subgoals", "shuffled", "progress", "answers")
 MODULATION, CONTEXT, OWN = "modulation", "context", "own"
 MEMORY_FUSIONS = (MODULATION, CONTEXT, OWN)
@@ -58,174 +52,90 @@ MEMORY_STRIDE, FRAMES_PER_EPISODE = 8, 6
 """Defaults if training decodes no video; 1 otherwise."""
 ORACLE_TOKENS = 128
 """Tokens added to the prompt's length for oracle memory text: six checkpoints of about ten words."""
-
-
-@dataclass(frozen=True)
-class Gemma:
-    """Dimensions of one of the two transformers, named as in LeRobot's ``GemmaConfig``."""
-
-    width: int
-    depth: int
-    mlp_dim: int
-    num_heads: int
-    num_kv_heads: int
-    head_dim: int
-
-
-@dataclass(frozen=True)
-class Vision:
-    """Dimensions of the SigLIP image tower."""
-
-    width: int
-    depth: int
-    mlp_dim: int
-    num_heads: int
-    patch: int
-    image: int  # pixels per side of the policy's input
-
-
-PAPERS: Mapping[str, Any] = {
-    "chunk_size": 50,
-    "n_action_steps": 50,
-    "optimizer_weight_decay": 0.0,
-    "ema_decay": 0.999,
-    "objective": FLOW_MATCHING,
-}
-"""The paper's values of the fields whose defaults depend on the size."""
-
-
-@dataclass(frozen=True)
-class Dimensions:
-    """All dimensions and size-dependent defaults of one size."""
-
-    vlm: Gemma
-    expert: Gemma
-    vision: Vision
-    vocabulary: int
-    tokenizer: str  # "words" (built here) or a Hugging Face tokenizer
-    tokenizer_max_length: int
-    text_encoder: str  # "words" or "labels" (built here) or a folder or repository of a SigLIP model
-    text_dim: int
-    learning_rate: float
-    normalization: str = "QUANTILES"  # LeRobot's mode for states and actions
-    final_learning_rate: float = 1.0  # at the end, as a fraction of the highest; 1: it stays constant
-    defaults: Mapping[str, Any] = field(default_factory=lambda: PAPERS)
-
-
-# The VLM's width is also the width d_m of the memory tokens (2048 at full size).
-# LeRobot's attention code fixes 8 heads; widths and head dimensions are free.
-_TINY = Dimensions(
-    vlm=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
-    expert=Gemma(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
-    vision=Vision(width=96, depth=2, mlp_dim=192, num_heads=4, patch=12, image=96),
-    vocabulary=1024,
-    tokenizer="words",
-    tokenizer_max_length=64,
-    text_encoder="words",
-    text_dim=64,
-    learning_rate=1e-3,
-)
-SIZES = {
-    "tiny": _TINY,
-    "small": replace(
-        _TINY,
-        vlm=replace(_TINY.vlm, depth=3),
-        expert=replace(_TINY.expert, depth=3),
-        vocabulary=512,
-        tokenizer_max_length=48,
-        normalization="MEAN_STD",
-        final_learning_rate=0.02,
-        defaults={
-            "chunk_size": 16,
-            "n_action_steps": 6,
-            "optimizer_weight_decay": 1e-4,
-            "ema_decay": 0.995,
-            "objective": REGRESSION,
-        },
-    ),
-    "pi05": Dimensions(
-        vlm=Gemma(width=2048, depth=18, mlp_dim=16_384, num_heads=8, num_kv_heads=1, head_dim=256),
-        expert=Gemma(width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256),
-        vision=Vision(width=1152, depth=27, mlp_dim=4304, num_heads=16, patch=14, image=224),
-        vocabulary=257_152,
-        tokenizer="google/paligemma-3b-pt-224",
-        tokenizer_max_length=200,
-        text_encoder="google/siglip-so400m-patch14-224",
-        text_dim=1152,
-        learning_rate=5e-5,
-    ),
-}
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(text.split())
-
-
 MAY_DIFFER = frozenset(
-    _names(
-        """
-        n_action_steps device dtype detector num_inference_steps rtc_config use_amp compile_model compile_mode
-        gradient_checkpointing pretrained_path pretrained_revision use_peft output_features
-        push_to_hub repo_id private tags license
-        """
+    (
+        *("n_action_steps", "device", "dtype", "detector", "num_inference_steps", "rtc_config", "use_amp"),
+        *("compile_model", "compile_mode", "gradient_checkpointing", "pretrained_path", "pretrained_revision"),
+        *("use_peft", "output_features", "push_to_hub", "repo_id", "private", "tags", "license"),
     )
 )
 """Fields that may have another value than in training when a checkpoint acts or its training is resumed. All others
 are refused then. LeRobot sets ``output_features`` from the environment; `policies.compatibility` checks them."""
-PI05_ALONE = _names(
-    "use_visual_memory use_proprioceptive_memory memory_frames memory_temporal_attention_every rtc_training_max_delay"
+PI05_ALONE = (
+    *("use_visual_memory", "use_proprioceptive_memory", "memory_frames", "memory_temporal_attention_every"),
+    "rtc_training_max_delay",
 )
 """Fields that LeRobot's main branch adds to pi0.5: visual memory, and training for real-time chunking. They are not
 saved, so that both versions of LeRobot load a checkpoint."""
 
 
-def _remembers(config: MemobenchMemConfig, has: Callable[[Any], bool] = lambda _: True) -> bool:
-    return config.memory != NONE and has(find_mechanism(config.memory))
+# -- metadata of fields ------------------------------------------------------------------------------------------------
 
 
-READERS: Mapping[str, tuple[Callable[[MemobenchMemConfig], bool], str]] = {
-    "perception=objects": (
-        lambda it: it.uses_objects,
-        "detector detection_noise object_classes",
-    ),
-    "perception=pixels": (lambda it: not it.uses_objects, "empty_cameras"),
-    "pi0.5's image tower": (lambda it: not (it.uses_objects or it.uses_visual_encoder), "image_resolution"),
-    "a policy whose state is a token": (lambda it: it.state_token, "max_state_dim"),
-    "a policy that sees pictures": (lambda it: it.uses_pictures, "memory_camera"),
-    "size=small perception=pixels": (lambda it: it.uses_visual_encoder, "visual_encoder"),
-    "a memory": (_remembers, "memory_settings memory_fusion memory_stride"),
-    "a memory of objects other than motion": (
-        lambda it: it.uses_objects and _remembers(it, lambda one: not one.asks_motion),
-        "memory_phase memory_repeats",
-    ),
-    "a memory that learns from texts": (lambda it: it.privileged_memory, "subgoals"),
-    "an alignment": (lambda it: it.align != NONE, "align_targets text_encoder"),
-    "an alignment or a memory that learns from texts": (
-        lambda it: it.align != NONE or it.privileged_memory,
-        "subgoal_level",
-    ),
-    "objective=flow_matching": (
-        lambda it: it.objective == FLOW_MATCHING,
-        "num_inference_steps rtc_config time_sampling_beta_alpha time_sampling_beta_beta time_sampling_scale "
-        "time_sampling_offset",
-    ),
-    "use_relative_actions=true": (lambda it: it.use_relative_actions, "relative_exclude_joints"),
-    "compile_model=true": (lambda it: it.compile_model, "compile_mode"),
-    "policy=pi05": (
-        lambda _: False,
-        "paligemma_variant action_expert_variant n_obs_steps freeze_vision_encoder "
-        "scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr " + " ".join(PI05_ALONE),
-    ),
+class Condition(NamedTuple):
+    """A condition under which some fields are used; otherwise each of them must have its default.
+
+    Attributes:
+        name: of the feature that reads the fields, for error messages. holds: whether a configuration has it.
+    """
+
+    name: str
+    holds: Callable[[MemobenchMemConfig], bool]
+
+
+OBJECTS = Condition("perception=objects", lambda it: it.uses_objects)
+PIXELS = Condition("perception=pixels", lambda it: not it.uses_objects)
+PICTURES = Condition("a policy that sees pictures", lambda it: it.uses_pictures)
+IMAGE_TOWER = Condition("pi0.5's image tower", lambda it: not (it.uses_objects or it.uses_visual_encoder))
+VISUAL_ENCODER = Condition("size=small perception=pixels", lambda it: it.uses_visual_encoder)
+STATE_TOKEN = Condition("a policy whose state is a token", lambda it: it.state_token)
+MEMORY = Condition("a memory", lambda it: it.memory != NONE)
+OBJECT_MEMORY = Condition(
+    "a memory of objects other than motion",
+    lambda it: it.uses_objects and it.memory != NONE and not find_mechanism(it.memory).asks_motion,
+)
+TEXT_MEMORY = Condition("a memory that learns from texts", lambda it: it.privileged_memory)
+ALIGNMENT = Condition("an alignment", lambda it: it.align != NONE)
+TEXTS = Condition(
+    "an alignment or a memory that learns from texts", lambda it: it.align != NONE or it.privileged_memory
+)
+FLOW = Condition("objective=flow_matching", lambda it: it.objective == FLOW_MATCHING)
+RELATIVE_ACTIONS = Condition("use_relative_actions=true", lambda it: it.use_relative_actions)
+COMPILED = Condition("compile_model=true", lambda it: it.compile_model)
+PLAIN_PI05 = Condition("policy=pi05", lambda _: False)
+
+INHERITED_CONDITIONS: Mapping[str, Condition] = {
+    "empty_cameras": PIXELS,
+    "max_state_dim": STATE_TOKEN,
+    **dict.fromkeys(("rtc_config", "time_sampling_beta_alpha", "time_sampling_beta_beta"), FLOW),
+    **dict.fromkeys(("time_sampling_scale", "time_sampling_offset"), FLOW),
+    "relative_exclude_joints": RELATIVE_ACTIONS,
+    "compile_mode": COMPILED,
+    **dict.fromkeys(("paligemma_variant", "action_expert_variant", "n_obs_steps", *PI05_ALONE), PLAIN_PI05),
+    **dict.fromkeys(("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"), PLAIN_PI05),
 }
-"""Feature of a policy -> whether a configuration has it, and the fields that only this feature reads. Without the
-feature, each of these fields must have its default."""
-RANGES = {
-    **dict.fromkeys(_names("memory_stride n_action_steps frames_per_episode num_inference_steps"), (1, math.inf)),
-    "warmup_fraction": (0, 1),
-    "detection_noise": (0, math.inf),
-    "ema_decay": (0, math.nextafter(1, 0)),
-}
-"""Field -> its smallest and largest value."""
+"""LeRobot's fields that are not always used -> their conditions."""
+
+
+def setting(
+    default: Any,
+    *,
+    used_if: Condition | None = None,
+    values: Iterable[str] = (),
+    least: float = -math.inf,
+    most: float = math.inf,
+) -> Any:
+    """Return a field of `MemobenchMemConfig`.
+
+    Args:
+        default: its default, or ``dict`` for an empty one.
+        used_if: the condition without which the field has no effect; None: it is always used.
+        values: accepted values; empty for any value of the type.
+        least, most: accepted range.
+    """
+    metadata = {"used_if": used_if, "values": tuple(values), "least": least, "most": most}
+    kind: dict[str, Any] = {"default_factory": dict} if default is dict else {"default": default}
+    return field(**kind, metadata=metadata)
 
 
 class UnreadError(MemobenchError):
@@ -252,39 +162,39 @@ class MemobenchMemConfig(PI05Config):
     reads_prompt: ClassVar[bool] = True
     execution_only: ClassVar[bool] = True
 
-    size: str = "tiny"
+    size: str = setting("tiny", values=SIZES)
     """``small`` (learns from objects in minutes on a CPU), ``tiny`` (trains on a CPU) or ``pi05`` (3.2 B weights)."""
 
     # -- observations
-    perception: str = "pixels"
+    perception: str = setting("pixels", values=PERCEPTIONS)
     """Source of observation tokens: ``pixels``, encoded by a frozen network, or ``objects``, the slots of
     ``observation.environment_state`` (`sim.object_slots`): privileged object state, or detections."""
-    detector: str | None = None
+    detector: str | None = setting(None, used_if=OBJECTS)
     """With ``perception=objects``: detect objects in pictures by this detector, instead of reading privileged object
     state. ``package``, or a file of `python -m research.detector train`. A checkpoint holds only its name."""
-    visual_encoder: str | None = None
+    visual_encoder: str | None = setting(None, used_if=VISUAL_ENCODER)
     """With pixels at ``size=small``: the frozen encoder of pictures, of ``package`` (the default) or of a detector's
     file. A checkpoint holds its weights."""
-    detection_noise: float = 0.0
+    detection_noise: float = setting(0.0, used_if=OBJECTS, least=0)
     """Size of the errors added to privileged object state in training, so that the policy later acts by a
     ``detector``. 1: as large as the errors of the package's detector; 0: none."""
-    object_classes: list[str] | None = None
+    object_classes: list[str] | None = setting(None, used_if=OBJECTS)
     """Names of the object classes in order of their indices; None: the classes of this version."""
 
     base_weights: str | None = None
     """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); None: from scratch."""
 
     # -- alignment
-    align: str = "none"
+    align: str = setting("none", values=ALIGN_WEIGHTS)
     """How memory is aligned with checkpoint language: ``none``, ``semantic``, ``contrastive`` or ``framewise``."""
-    subgoal_level: str = "intermediate"
+    subgoal_level: str = setting("intermediate", used_if=TEXTS, values=SUBGOAL_LEVELS)
     """Level of the checkpoint language: ``coarse``, ``intermediate`` or ``fine``."""
-    align_targets: str = SUBGOALS
+    align_targets: str = setting(SUBGOALS, used_if=ALIGNMENT, values=ALIGN_TARGETS)
     """Texts that memory is aligned with: ``subgoals``, or a control. ``shuffled`` (the paper's) permutes them within
     each episode; an episode with fewer than three takes texts of other episodes; the permutation is the same in every
     epoch and on every machine. ``progress`` cuts the words that differ between the episodes of a task, and with them
     the hidden answer. ``answers`` is one text per episode, all its subgoals, which does not name its progress."""
-    text_encoder: str | None = None
+    text_encoder: str | None = setting(None, used_if=ALIGNMENT)
     """Encoder of subgoal texts: ``words`` (hashed words), ``labels`` (a random vector per text), or the folder or
     repository of a SigLIP model; None: the default of the size."""
 
@@ -292,56 +202,58 @@ class MemobenchMemConfig(PI05Config):
     memory: str = "frames"
     """The memory mechanism: ``frames``, another one of `memory` or of an installed package, or ``none``: plain pi0.5,
     the baseline without a memory."""
-    memory_settings: dict[str, Any] = field(default_factory=dict)
+    memory_settings: dict[str, Any] = setting(dict, used_if=MEMORY)
     """Settings of the mechanism (the ``Settings`` of its class); a setting that is not given has its default."""
-    memory_fusion: str | None = FROM_SIZE
+    memory_fusion: str | None = setting(FROM_SIZE, used_if=MEMORY, values=MEMORY_FUSIONS)
     """How actions read memory: ``modulation``, ``context`` (memory joins the prefix) or ``own`` (the mechanism's own
     way). None: ``own`` if the mechanism has one, else ``modulation``."""
-    subgoals: dict[str, list[str]] | None = None
+    subgoals: dict[str, list[str]] | None = setting(None, used_if=TEXT_MEMORY)
     """Instruction -> texts of its checkpoints, for a memory that learns from texts; None: those of the dataset."""
     oracle_memory: bool = False
     """Control of the paper: ground-truth memory text in the prompt, from the dataset's column ``memory`` in training
     and from the environment (``--env.oracle_memory=true``) in evaluation."""
-    memory_camera: str | None = None
+    memory_camera: str | None = setting(None, used_if=PICTURES)
     """Camera whose pictures are remembered; None: the first of the policy's."""
-    memory_stride: int = FROM_SIZE
+    memory_stride: int = setting(FROM_SIZE, used_if=MEMORY, least=1)
     """Control steps between remembered frames; None: the mechanism's, or 8 if training decodes no video (objects, or
     pixels through a visual encoder), else 1."""
-    memory_phase: bool = False
+    memory_phase: bool = setting(False, used_if=OBJECT_MEMORY)
     """Whether a remembered frame of objects records its phase, prompt or execution. A memory with this information can
     count the steps since the execution began, which strict tasks hide."""
-    memory_repeats: bool = True
+    memory_repeats: bool = setting(True, used_if=OBJECT_MEMORY)
     """Whether a frame equal to the last remembered one is remembered too. If false, the holds of strict tasks do not
     fill the memory, and do not use up the frames that a chunk reads."""
 
     # -- training
-    objective: str = FROM_SIZE
+    objective: str = setting(FROM_SIZE, values=OBJECTIVES)
     """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, which computes a chunk in one pass
     instead of ten (`losses`). None: ``regression`` at ``small``, else ``flow_matching``."""
-    ema_decay: float = FROM_SIZE
+    ema_decay: float = setting(FROM_SIZE, least=0, most=math.nextafter(1, 0))
     """Decay of the moving average of the weights, which evaluation uses; 0: no average. None: the paper's 0.999, or
     0.995 at ``small``."""
-    frames_per_episode: int = FROM_SIZE
+    frames_per_episode: int = setting(FROM_SIZE, least=1)
     """Frames per episode in a batch; they share memory. ``batch_size`` counts frames. None: 6 if training decodes no
     video, else 1, as in LeRobot."""
     task_weights: dict[str, float] | None = field(default_factory=dict)
     """Draw tasks in proportion to these weights, independent of the length of their episodes. A key is a task's name, a
     memory type or ``prompted`` (tasks with a demonstration prompt); the first match counts, and other tasks weigh 1.
     None: all frames alike, which is the default if training decodes video; ``{}``, the default, else: all tasks."""
-    warmup_fraction: float = 0.05
+    warmup_fraction: float = setting(0.05, least=0, most=1)
     """Share of the updates in which the learning rate rises. It then stays constant, or falls as a cosine to 0.02 of
     its maximum at ``size=small``."""
 
-    # -- pi0.5's fields with other defaults
-    freeze_vision_encoder: bool = True
+    # -- pi0.5's fields with other defaults or checks
+    freeze_vision_encoder: bool = setting(True, used_if=PLAIN_PI05)
     """Always true: memory tokens are cached features of the image tower."""
     chunk_size: int = FROM_SIZE
     """Actions of a chunk; None: 16 at ``small``, else 50."""
-    n_action_steps: int = FROM_SIZE
+    n_action_steps: int = setting(FROM_SIZE, least=1)
     """Actions executed of a chunk before the next one is planned; None: 6 at ``small``, else 50. A policy of objects
     executes the chunk's following actions if its hand has stalled (`rollout.Row.begin_chunk`)."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
-    image_resolution: tuple[int, int] | None = None
+    num_inference_steps: int = setting(10, used_if=FLOW, least=1)
+    """Steps from noise to actions, with flow matching."""
+    image_resolution: tuple[int, int] | None = setting(None, used_if=IMAGE_TOWER)
     tokenizer_name: str | None = None
     tokenizer_max_length: int | None = None
     optimizer_lr: float | None = None
@@ -357,7 +269,7 @@ class MemobenchMemConfig(PI05Config):
 
     def _save_pretrained(self, save_directory: Path) -> None:
         super()._save_pretrained(save_directory)
-        file = save_directory / CONFIG_NAME
+        file = save_directory / CONFIG_FILE
         saved = json.loads(file.read_text(encoding="utf-8"))
         if set(PI05_ALONE) & set(saved):  # an earlier LeRobot would refuse the checkpoint for them
             kept = {name: value for name, value in saved.items() if name not in PI05_ALONE}
@@ -365,14 +277,7 @@ class MemobenchMemConfig(PI05Config):
 
     def _complete(self) -> None:
         """Set the fields that the size and the perception decide, and check every field."""
-        for name, known in (
-            ("size", SIZES),
-            ("align", ALIGN_WEIGHTS),
-            ("perception", PERCEPTIONS),
-            ("subgoal_level", SUBGOAL_LEVELS),
-            ("align_targets", ALIGN_TARGETS),
-        ):
-            self._choose(name, tuple(known))
+        self._check_values()
         if self.visual_encoder is None and self.uses_visual_encoder:
             self.visual_encoder = PACKAGE
         self._complete_memory()
@@ -382,7 +287,6 @@ class MemobenchMemConfig(PI05Config):
                 setattr(self, name, value)
         if not self.task_weights and not self.decodes_no_video:
             self.task_weights = None
-        self._choose("objective", OBJECTIVES)
         # A checkpoint without oracle memory holds the shorter prompt length, which would cut the memory text off.
         if self.tokenizer_max_length == self.dimensions.tokenizer_max_length:
             self.tokenizer_max_length = defaults["tokenizer_max_length"]
@@ -429,18 +333,18 @@ class MemobenchMemConfig(PI05Config):
             "memory_camera": (f"{OBS_IMAGES}.{next(iter(CAMERAS))}",),
             "num_inference_steps": (1,),
         }
-        found: dict[str, str] = {}
-        for reader, (present, names) in READERS.items():
-            for name in () if present(self) else [one for one in names.split() if one in unset]:
-                known = [unset[name], defaults.get(name), *usual.get(name, ())]
-                value = getattr(self, name)
-                if value not in known and (not isinstance(value, list) or tuple(value) not in known):
-                    found[name] = reader
-        for name, reader in found.items():
+        unread: dict[str, Condition] = {}
+        for name, condition in conditions(self).items():
+            known = [unset[name], defaults.get(name), *usual.get(name, ())]
+            value = getattr(self, name)
+            value = tuple(value) if isinstance(value, list) and tuple(value) in known else value
+            if value not in known and not condition.holds(self):
+                unread[name] = condition
+        for name, condition in unread.items():
             raise UnreadError(
-                f"--policy.{name}={getattr(self, name)} has no effect: only {reader} reads it; leave it out, or set "
-                f"it to its default, {json.dumps(unset[name])}.",
-                {one: unset[one] for one in found},
+                f"--policy.{name}={getattr(self, name)} has no effect: only {condition.name} reads it; leave it "
+                f"out, or set it to its default, {json.dumps(unset[name])}.",
+                {one: unset[one] for one in unread},
             )
         if self.memory == NONE:
             self.memory_fusion = None
@@ -454,7 +358,6 @@ class MemobenchMemConfig(PI05Config):
         mechanism = find_mechanism(self.memory)
         fitting = (OWN,) if mechanism.fusion is not None else (MODULATION, CONTEXT)
         self.memory_fusion = self.memory_fusion or fitting[0]
-        self._choose("memory_fusion", MEMORY_FUSIONS)
         if self.memory_fusion not in fitting:
             raise MemobenchError(
                 f"--policy.memory={self.memory} cannot be read by memory_fusion={self.memory_fusion}; pass "
@@ -472,19 +375,21 @@ class MemobenchMemConfig(PI05Config):
 
     # -- checks ----------------------------------------------------------------------------------------------------
 
-    def _choose(self, field: str, known: tuple[str, ...]) -> None:
-        given = getattr(self, field)
-        if given not in known:
-            raise MemobenchError(
-                f"memobench_mem has no {field} '{given}': {nearest(str(given), known)} "
-                f"Pass --policy.{field}=<one of {', '.join(known)}>."
-            )
+    def _check_values(self) -> None:
+        for one in fields(self):
+            known, given = one.metadata.get("values"), getattr(self, one.name)
+            if known and given not in known and not (given is None and one.default is FROM_SIZE):
+                raise MemobenchError(
+                    f"memobench_mem has no {one.name} '{given}': {nearest(str(given), known)} "
+                    f"Pass --policy.{one.name}=<one of {', '.join(known)}>."
+                )
 
     def _check_numbers(self) -> None:
-        for name, (least, most) in RANGES.items():
-            if not least <= getattr(self, name) <= most:  # nor NaN
+        for one in fields(self):
+            least, most = one.metadata.get("least", -math.inf), one.metadata.get("most", math.inf)
+            if (least, most) != (-math.inf, math.inf) and not least <= getattr(self, one.name) <= most:  # nor NaN
                 raise MemobenchError(
-                    f"--policy.{name}={getattr(self, name)} is out of range; expected at least {least}"
+                    f"--policy.{one.name}={getattr(self, one.name)} is out of range; expected at least {least}"
                     + ("." if most == math.inf else f" and {'at most' if isinstance(most, int) else 'below'} 1.")
                 )
         if any(weight < 0 for weight in (self.task_weights or {}).values()):
@@ -527,8 +432,6 @@ class MemobenchMemConfig(PI05Config):
         names = [one.name for one in fields(self) if one.name not in MAY_DIFFER]
         return tuple(sorted(names, key=lambda name: ours.index(name) if name in ours else len(ours)))
 
-    kept_since_begun = fixed_by_training
-
     @property
     def dimensions(self) -> Dimensions:
         """Dimensions of the size."""
@@ -555,14 +458,9 @@ class MemobenchMemConfig(PI05Config):
         return self.uses_detector or not self.uses_objects
 
     @property
-    def encodes_ahead(self) -> bool:
-        """Whether pictures are encoded, or objects detected in them, once before training."""
-        return self.uses_detector or self.uses_visual_encoder
-
-    @property
     def decodes_no_video(self) -> bool:
         """Whether training samples consist of numbers and features in main memory."""
-        return self.uses_objects or self.encodes_ahead
+        return self.uses_objects or self.uses_visual_encoder
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -596,16 +494,6 @@ class MemobenchMemConfig(PI05Config):
     def remembers_thumbnails(self) -> bool:
         """Whether small grey copies of pictures are remembered instead of their tokens."""
         return self.memory != NONE and find_mechanism(self.memory).asks_motion and not self.uses_objects
-
-    @property
-    def subgoal_texts(self) -> tuple[str, ...]:
-        """All texts of checkpoints; a privileged memory refers to them by their indices here."""
-        return texts_of(self.subgoals or {})
-
-    @property
-    def needs_every_frame(self) -> bool:
-        """Whether the policy reads pictures between two action chunks."""
-        return self.memory != NONE and self.uses_pictures
 
     def check_memory_reads(self) -> None:
         """Check that the memory's fusion can report how much a chunk reads of each remembered entry.
@@ -690,40 +578,18 @@ class MemobenchMemConfig(PI05Config):
             setattr(self, name, needed)
 
 
-@OptimizerConfig.register_subclass("memobench_adamw")
-@dataclass
-class FusedAdamWConfig(AdamWConfig):
-    """Fused AdamW. Torch's default copies all trained parameters on a GPU, and takes three times as long on a CPU.
+def conditions(config: Any = MemobenchMemConfig) -> dict[str, Condition]:
+    """Return the conditions of the fields of a configuration that are not always used, ours first."""
+    own = {one.name: one.metadata["used_if"] for one in fields(config) if one.metadata.get("used_if")}
+    known = {one.name for one in fields(config)}  # LeRobot 0.6.1 lacks those of its main branch
+    return own | {name: condition for name, condition in INHERITED_CONDITIONS.items() if name in known}
 
-    At full size the copy takes 10.5 GiB; with it, `config=train_paper` does not fit on four GPUs of 80 GB.
+
+def memory_defaults() -> dict[str, Any]:
+    """Return the fields that a memory does not take over from another memory's checkpoint -> their defaults.
+
+    ``memory_settings`` are not among them: construction converts them.
     """
-
-    def build(self, params: Iterable[nn.Parameter]) -> Optimizer:
-        """Return the optimizer of these parameters."""
-        learning = list(params)
-        fused = all(parameter.device.type in ("cpu", "cuda") for parameter in learning) or None  # None: torch's choice
-        return AdamW(learning, self.lr, self.betas, self.eps, self.weight_decay, fused=fused)
-
-
-@LRSchedulerConfig.register_subclass("memobench_constant_with_warmup")
-@dataclass
-class WarmupFractionSchedulerConfig(LRSchedulerConfig):
-    """Linear warm-up over a fraction of the updates (paper: 5 %), then constant, or a cosine down to ``final``.
-
-    LeRobot's constant schedule takes a number of warm-up steps, which would have to change with ``--steps``.
-    """
-
-    num_warmup_steps: int | None = None
-    warmup_fraction: float = 0.05
-    final: float = 1.0
-
-    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        """Return the schedule of a training of ``num_training_steps`` updates."""
-        steps = self.num_warmup_steps
-        warmup = max(1, round(self.warmup_fraction * num_training_steps) if steps is None else steps)
-
-        def rate(step: int) -> float:
-            fallen = (1 - math.cos(math.pi * min(1.0, step / num_training_steps))) / 2
-            return min(1.0, (step + 1) / warmup) * (1 - (1 - self.final) * fallen)
-
-        return LambdaLR(optimizer, rate)
+    own = {one.name: one.default for one in fields(MemobenchMemConfig)}
+    of_memory = [name for name, condition in conditions().items() if condition in (MEMORY, OBJECT_MEMORY, TEXT_MEMORY)]
+    return {name: own[name] for name in of_memory if name != "memory_settings"}

@@ -20,8 +20,8 @@ from einops import rearrange, reduce
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import REGRESSION
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import PHASE
+from lerobot_memobench.policies.memobench_mem.sizes import REGRESSION
 
 _SMOOTH = 1e-6
 """Squared error below which the absolute error becomes quadratic: 0.001 standard deviations of an action."""

@@ -26,7 +26,7 @@ from transformers.initialization import no_init_weights
 from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_weights
+from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_statistics, check_weights
 from lerobot_memobench.policies.compatibility import cure
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
 from lerobot_memobench.policies.memobench_mem.backbone import Precision
@@ -37,14 +37,9 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     read_config,
     read_tensors,
     require_agreement,
-    require_statistics,
     weights_file,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
-    ALIGN_WEIGHTS,
-    REGRESSION,
-    MemobenchMemConfig,
-)
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import ALIGN_WEIGHTS, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     ENCODED,
     ObservationEncoder,
@@ -75,6 +70,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
+from lerobot_memobench.policies.memobench_mem.sizes import REGRESSION
 from lerobot_memobench.policies.memory_reads import Chunk, chunk_reads
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
@@ -555,7 +551,7 @@ class MemobenchMemPolicy(PI05Policy):
         config = read_config(source, config, revision)
         path = weights_file(source, revision, named=f"The checkpoint '{source}'", fix="give a pretrained_model folder")
         if dataset_meta is None:
-            require_statistics(source, revision)
+            check_statistics(source, revision)
         # With an adapter, ``source`` is the base; the processor steps are saved with the adapter.
         saved, of = (config.pretrained_path, config.pretrained_revision) if config.use_peft else (source, revision)
         if saved is not None:

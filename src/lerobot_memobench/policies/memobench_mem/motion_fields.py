@@ -124,7 +124,7 @@ class PictureMotion(MotionField):
 
     def between(self, before: Tensor, now: Tensor) -> Tensor:
         """Match the blocks of thumbnails."""
-        earlier, later = (frames.to(torch.float32).view(-1, THUMBNAIL, THUMBNAIL) for frames in (before, now))
+        earlier, later = (frames.to(torch.float32).reshape(-1, THUMBNAIL, THUMBNAIL) for frames in (before, now))
         return match_blocks(earlier, later).flatten(1, 2)
 
     def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,6 +22,7 @@ from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
 from lerobot_memobench.policies.memobench_mem.motion_fields import motion_field
 from lerobot_memobench.policies.memobench_mem.passes import PrefixKeys, adaptive_norms, read_actions, read_prefix
+from lerobot_memobench.policies.memobench_mem.subgoals import texts_of
 
 FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
 OWN = ("state_token.", "instruction.", "paligemma_with_expert.perception.")
@@ -250,7 +251,7 @@ def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) ->
         expert=dims.expert.width,
         grid=observations.grid,
         stride=config.memory_stride,
-        subgoals=config.subgoal_texts,
+        subgoals=texts_of(config.subgoals or {}),
     )
     pool = motion_field(observations, dims.expert.width) if mechanism.asks_motion else observations.pool()
     return mechanism(spec, pool, read_settings(config.memory, config.memory_settings))

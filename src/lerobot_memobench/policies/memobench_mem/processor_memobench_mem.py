@@ -37,15 +37,11 @@ from tokenizers.normalizers import Lowercase
 from tokenizers.pre_tokenizers import Split
 from tokenizers.processors import TemplateProcessing
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from lerobot_memobench.datasets.frames import FrameLookup
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment import (
-    text_rows,
-    texts_of_frames,
-    texts_of_histories,
-    words,
-)
+from lerobot_memobench.policies.memobench_mem.alignment import embedded_texts
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
@@ -60,6 +56,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
 )
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.subgoals import choices, texts_of
+from lerobot_memobench.policies.memobench_mem.text_encoders import words
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 logger = logging.getLogger(__name__)
@@ -194,7 +191,6 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
 
     subgoals: dict[str, list[str]] = field(default_factory=dict)
     config: MemobenchMemConfig | None = field(default=None, repr=False, kw_only=True)
-    _texts: np.ndarray | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.config is not None:
@@ -202,7 +198,7 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
 
     def follow(self, config: MemobenchMemConfig, lookup: FrameLookup) -> None:
         """Set the configuration and the frames of a training."""
-        self.config, self.lookup, self._texts = config, lookup, None
+        self.config, self.lookup = config, lookup
         self.__post_init__()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
@@ -254,12 +250,12 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
         if config.align == "none":
             return memory | found
-        if self._texts is None:
-            self._texts = text_rows(lookup, config.subgoal_level, config.align)
+        texts = torch.from_numpy(lookup.text_rows(config.subgoal_level))
         if config.align != "framewise":
-            return memory | found | texts_of_frames(lookup, self._texts, indices)
-        histories = [int(lookup.episodes[episode]) + read * stride for episode, read in recalled]
-        return memory | found | texts_of_histories(lookup, self._texts, histories)
+            return memory | found | embedded_texts(lookup.text_embeddings, texts[torch.tensor([*indices])])
+        histories = [texts[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
+        padded = pad_sequence(histories, batch_first=True, padding_value=-1)
+        return memory | found | embedded_texts(lookup.text_embeddings, padded)
 
     def get_config(self) -> dict[str, Any]:
         """Return the saved settings."""

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, read_frame_table
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.memory_text import MARK
 
 logger = logging.getLogger(__name__)
@@ -27,43 +24,18 @@ def texts_of(subgoals: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     return tuple(sorted({text for own in subgoals.values() for text in own}))
 
 
-def subgoals_of(meta: Any, level: str) -> dict[str, list[str]]:
-    """Return instruction -> sorted texts of its checkpoints at a level, of a dataset.
+def subgoals_of(texts: Sequence[str], episodes: np.ndarray, tasks: Iterable[Iterable[str]]) -> dict[str, list[str]]:
+    """Return instruction -> sorted texts of its checkpoints.
 
     Args:
-        meta: LeRobot's metadata of the dataset.
-
-    Raises:
-        MemobenchError: the dataset has no texts at this level.
+        texts: (N,) subgoal of each frame, "" for none. episodes: (E + 1,) first frame of each episode.
+        tasks: (E,) instructions of each episode.
     """
-    table, found = read_frame_table(Path(meta.root)), dict[str, set[str]]()
-    texts = table.subgoals.get(level, [])
-    for tasks, (start, end) in zip(meta.episodes["tasks"], itertools.pairwise(table.episodes.tolist()), strict=True):
-        for task in tasks:
+    found = dict[str, set[str]]()
+    for instructions, (start, end) in zip(tasks, itertools.pairwise(episodes.tolist()), strict=True):
+        for task in instructions:
             found.setdefault(str(task), set()).update(text for text in texts[start:end] if text)
-    if not any(found.values()):
-        raise MemobenchError(
-            f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}'), from "
-            "which this memory learns; name a dataset of `memobench generate`, another policy.subgoal_level, or "
-            "another policy.memory."
-        )
     return {task: sorted(own) for task, own in sorted(found.items())}
-
-
-def require_known(subgoals: dict[str, list[str]], meta: Any, level: str) -> None:
-    """Check that a memory knows all texts of a dataset.
-
-    Raises:
-        MemobenchError: it was trained without some of them.
-    """
-    known = texts_of(subgoals)
-    new = [text for text in texts_of(subgoals_of(meta, level)) if text not in known]
-    if new:
-        raise MemobenchError(
-            f"The dataset {meta.root} has {len(new)} checkpoint texts that this memory does not know, the first "
-            f"being {new[0]!r}; train on the tasks it was trained on, or train a new memory with "
-            "--policy.subgoals=null."
-        )
 
 
 _warned: set[str] = set()

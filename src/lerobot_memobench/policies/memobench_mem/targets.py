@@ -9,56 +9,16 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from lerobot_memobench.datasets.frames import FrameTable
-from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
-    ANSWERS,
-    PROGRESS,
-    SHUFFLE_SEED,
-    SHUFFLED,
-    MemobenchMemConfig,
-)
-from lerobot_memobench.policies.memobench_mem.memory import NONE
-
 logger = logging.getLogger(__name__)
 
+SHUFFLE_SEED = 7
 SHUFFLED_ALONE = 3
 """Smallest number of subgoals of an episode that are permuted among themselves."""
 NO_WORD = "-"
 """Text of a subgoal that shares no word with those of other variants."""
-
-
-def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> FrameTable:
-    """Return a dataset's frames with the texts of ``config.align_targets`` in place of the aligned subgoals.
-
-    Raises:
-        MemobenchError: there is a single text to shuffle, or an episode's task is unknown.
-    """
-    level, texts = config.subgoal_level, table.subgoals.get(config.subgoal_level, [])
-    if config.align == NONE or not any(texts):
-        return table
-    if config.align_targets == SHUFFLED:
-        texts = _shuffled(texts, table.episodes, root)
-    elif config.align_targets == ANSWERS:
-        texts = answers(texts, table.episodes)
-    elif config.align_targets == PROGRESS:
-        texts = progress(texts, table.episodes, _tasks(root))
-    return replace(table, subgoals={**table.subgoals, level: texts})
-
-
-def _tasks(root: Path) -> list[str]:
-    """Return the task of each episode."""
-    places = list_episodes(root)
-    names = [place.record.task_name for place in places if place.record is not None]
-    if len(names) < len(places):
-        raise MemobenchError(f"The dataset {root} cannot be aligned with align_targets={PROGRESS}: {STRANGER}.")
-    return names
 
 
 def _in_order(texts: Sequence[str]) -> list[str]:
@@ -105,16 +65,16 @@ def progress(texts: Sequence[str], episodes: np.ndarray, tasks: Sequence[str]) -
 # -- shuffled ----------------------------------------------------------------------------------------------------------
 
 
-def _shuffled(texts: Sequence[str], episodes: np.ndarray, root: Path) -> list[str]:
+def shuffled(texts: Sequence[str], episodes: np.ndarray) -> list[str]:
+    """Return each frame's subgoal after `shuffled_subgoals`.
+
+    Args:
+        texts: (N,) subgoal of each frame, at least two different ones. episodes: (E + 1,) first frame of each episode.
+    """
     unique = [text for text in sorted({*texts}) if text]
-    if len(unique) < 2:
-        raise MemobenchError(
-            f"The dataset of {root} has one subgoal at the level of the alignment, and --policy.align_targets="
-            f"{SHUFFLED} needs at least two; use a dataset of several tasks, or another --policy.subgoal_level."
-        )
     number = {text: row for row, text in enumerate(unique)}
     rows = np.array([number.get(text, -1) for text in texts])
-    shuffled, elsewhere = shuffled_subgoals(rows, episodes)
+    moved, elsewhere = shuffled_subgoals(rows, episodes)
     logger.info(
         "subgoals are shuffled: %d of %d episodes permute their own; %d have fewer than %d and take texts of other "
         "episodes",
@@ -123,7 +83,7 @@ def _shuffled(texts: Sequence[str], episodes: np.ndarray, root: Path) -> list[st
         elsewhere,
         SHUFFLED_ALONE,
     )
-    return [unique[row] if row >= 0 else "" for row in shuffled.tolist()]
+    return [unique[row] if row >= 0 else "" for row in moved.tolist()]
 
 
 def shuffled_subgoals(rows: np.ndarray, episodes: np.ndarray, seed: int = SHUFFLE_SEED) -> tuple[np.ndarray, int]:

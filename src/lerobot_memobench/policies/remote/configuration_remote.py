@@ -156,11 +156,6 @@ class RemoteConfig(UntrainedConfig):
         return self.spoken.queues
 
     @property
-    def needs_every_frame(self) -> bool:
-        """Whether frames between two plans are needed: a server that buffers frames receives all of them."""
-        return self.spoken.buffers
-
-    @property
     def prompt_stride(self) -> int:
         """Steps between sent frames of the prompt."""
         return 1 if self.spoken.buffers else self.history_every or (1 if self.spoken.history else self.n_action_steps)

@@ -28,6 +28,7 @@ from lerobot_memobench.sim.asset import (
     SITE_GROUP,
     TABLE_SIZE,
     TABLE_TOP,
+    VISUAL_GROUP,
     Articulation,
     Asset,
     Grasp,
@@ -41,7 +42,6 @@ from lerobot_memobench.sim.libero import mjcf
 from lerobot_memobench.sim.libero.arenas import ARENAS, Arena, arena_of
 from lerobot_memobench.sim.libero.classes import ALL_CLASSES, CLASSES, LiberoClass, Part, parts_of
 from lerobot_memobench.sim.libero.looks import drawing_model
-from lerobot_memobench.sim.raster.drawlist import VISUAL_GROUP, DrawList
 from lerobot_memobench.sim.scene import (
     AGENTVIEW,
     ARENA_BYTES,
@@ -50,6 +50,7 @@ from lerobot_memobench.sim.scene import (
 )
 from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.task import STRICT, Task
+from mujoco_raster.drawlist import DrawList
 
 ZONE_HALF_HEIGHT = 0.007
 """Half height of the site of a table region, m."""

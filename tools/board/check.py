@@ -1,0 +1,374 @@
+"""Check of submissions: each is refused with one sentence, without running any part of it.
+
+`lerobot_memobench.board.rules` holds the rules that an honest evaluation may break. The check here recounts everything
+from the log: scenes, variants and checkpoints are those that this version of the package draws. It cannot prove that a
+rollout took place; therefore the board marks rows that were not rerun.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import statistics
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lerobot_memobench.board.rules import FEWEST, MOST, check_control, check_evaluation
+from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, POLICY, differences, evidence_line
+from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
+from lerobot_memobench.envs.pacing import paused
+from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
+from lerobot_memobench.errors import MemobenchError, check_choice, nearest
+from lerobot_memobench.evaluation.asked import check_lines
+from lerobot_memobench.evaluation.metrics import failure_of, operations
+from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.protocol import EVIDENCE_EPISODES, PROMPT_HORIZON
+from lerobot_memobench.run.card import first_variant_mismatch
+from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS
+from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
+from lerobot_memobench.tasks.task import STRICT, Task
+from tools.board.submission import Submission, Submitted, read_submission
+
+RERUNS = "reruns.json"
+"""File of the board, kept by its maintainers: row -> `Submission.digest` of what they ran or repeated."""
+CONTROL_FIELDS = ("paused_steps", "choice", "answered", "variants", "chance")
+"""Fields of a line of the log that only evaluations with pauses or evidence have."""
+KNOWN_INPUTS = (PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, NO_INPUT)
+COPIED, CLOSE = 0.5, 2
+"""Share of similar successful episodes above which a log counts as a copy, and steps by which similar ones differ."""
+FASTEST = 20
+"""Fewest steps to a checkpoint, 1 s; the fastest of 7,764 kept rollouts needed 66."""
+SCENE = re.compile(r"[0-9a-f]{16}")
+SCRIPTS = ("memobench_expert", "memobench_blind")
+"""Policies whose actions the simulator computes."""
+OBJECTS_READ = "objects"
+"""Value of the setting ``perception`` of a policy that reads objects."""
+
+
+def read_board(board: Path) -> list[Submission]:
+    """Return the submissions of a board that pass `check_submission`, and each other.
+
+    Raises:
+        MemobenchError: one is refused.
+    """
+    found: list[Submission] = []
+    for folder in sorted(path for path in board.iterdir() if path.is_dir() or path.is_symlink()):
+        submission = read_submission(folder)
+        check_submission(submission, found)
+        found.append(submission)
+    check_partners(found)
+    return found
+
+
+def check_partners(submissions: Sequence[Submission]) -> None:
+    """Check that each partner without a memory is another row of the board, with the same protocol.
+
+    Raises:
+        MemobenchError: one is not.
+    """
+    protocols = {submission.name: submission.evaluation.protocol for submission in submissions}
+    for submission in submissions:
+        mine, partner = submission.name, submission.about.without_memory
+        others = protocols.keys() - {mine}
+        if partner is None:
+            continue
+        if partner not in others:
+            raise MemobenchError(
+                f"{mine}: the partner without a memory, {partner!r}, is no other row; {nearest(partner, others)}"
+            )
+        if found := differences(protocols[mine], protocols[partner], ignore=OF_ONE_EVALUATION):
+            raise MemobenchError(
+                f"{mine} and its partner without a memory, {partner}, differ in {found[0]}; evaluate both with the "
+                "same settings"
+            )
+
+
+def check_paths(changed: Iterable[str], board: str = "results/board") -> str | None:
+    """Check that a pull request with a submission changes the folder of one row only, and return its name, if any.
+
+    Args:
+        changed: paths that it changes, relative to the repository.
+        board: folder of the board.
+
+    Raises:
+        MemobenchError: it also changes another file, or another row.
+    """
+    paths = [*changed]
+    rows = sorted({path.split("/")[board.count("/") + 1] for path in paths if path.startswith(f"{board}/")} - {RERUNS})
+    others = [path for path in paths if not path.startswith(tuple(f"{board}/{row}/" for row in rows))]
+    if rows and (others or len(rows) > 1):
+        raise MemobenchError(
+            f"the pull request also changes {(others or rows[1:])[0][:80]!r}; expected files in one folder of {board} "
+            "only: move the rest to another pull request"
+        )
+    return rows[0] if rows else None
+
+
+def check_author(author: str, name: str | None, *boards: Path) -> None:
+    """Check that a pull request of somebody other than a maintainer changes a row of its author.
+
+    Args:
+        author: account on GitHub.
+        name: the row that it changes, see `check_paths`.
+        boards: the board with the change and without it.
+
+    Raises:
+        MemobenchError: the row names another submitter, or it changes no row.
+    """
+    rows = [read_submission(board / name) for board in boards if name and (board / name).exists()]
+    submitters = {row.about.submitter.lower() for row in rows} or {"the maintainers"}
+    if others := submitters - {f"@{author}".lower()}:
+        raise MemobenchError(
+            f"the pull request changes {name or RERUNS} of {min(others)}; expected a row whose submitter is its "
+            f"author, @{author[:40]}: the maintainers enter results of others and {RERUNS}"
+        )
+
+
+def check_submission(submission: Submission, others: Sequence[Submission] = ()) -> None:
+    """Check a submission by all rules.
+
+    Args:
+        others: rows that are on the board already.
+
+    Raises:
+        MemobenchError: naming the first rule that it breaks.
+    """
+    run = submission.evaluation
+    check_evaluation(run)
+    _check_log(run)
+    for name, control in submission.controls.items():
+        check_control(run, control, name)
+        _check_log(control)
+    for other in others:
+        _check_original(submission, other)
+    _check_scenes([run for each in (*others, submission) for run in (each.evaluation, *each.controls.values())])
+
+
+# --- the log against card, catalogue and seeds ---
+
+
+def _check_log(run: Submitted) -> None:
+    """Check that settings and outcomes in the log are those of one evaluation that can have taken place."""
+    _check_inputs(run)
+    _check_policy(run)
+    check_lines(run.place, {**run.card, "protocol": run.protocol}, run.records)
+    for record in run.records:
+        _check_record(run, record)
+    if (problem := first_variant_mismatch(run.records)) is not None:
+        raise MemobenchError(f"{run.place}: another version drew the variants ({problem}); evaluate with this version")
+
+
+def _check_record(run: Submitted, record: Mapping[str, Any]) -> None:
+    """Check one line: facts that logs of other tools omit, and an outcome that this task can have."""
+    protocol, policy = run.protocol, run.records[0].get(POLICY)
+    where = f"{run.place}: {record['task']}, episode {record['episode']}"
+    needed = ("referent", INPUTS, POLICY, "seed", "variant", *(["replan_steps"] if protocol["replan_steps"] else []))
+    if lacking := [key for key in needed if record.get(key) is None]:
+        raise MemobenchError(f"{where} has no {lacking[0]}; evaluate with this version")
+    for part in str(record[INPUTS]).split(", "):
+        check_choice(f"{where}: {INPUTS}", part, KNOWN_INPUTS)
+    if record[POLICY] != policy or str(policy).rpartition(" ")[0] != str(run.card[POLICY].get("type")):
+        raise MemobenchError(f"{where} is of the policy {record[POLICY]!r}; expected the policy of the card only")
+    task = get_task(record["task"]).variant(record["variant"])
+    if record["memory_type"] != task.memory_type or operations(record) != task.operations:
+        raise MemobenchError(
+            f"{where} has other checkpoints than the task ({task.operations}); evaluate with this version"
+        )
+    _check_control_fields(where, protocol, record)
+    failure_of(record)
+    for problem in _contradictions(protocol, record, task):
+        raise MemobenchError(f"{where} {problem}; submit the log unchanged")
+
+
+def _contradictions(protocol: Mapping[str, Any], record: Mapping[str, Any], task: Task) -> Iterator[str]:
+    """Yield what no execution of a task, a variant, can have written: its prompt, its steps, how it ended."""
+    success, lost, fault, steps = record["success"], record.get("lost"), record.get("fault"), record.get("steps") or 0
+    marks = [(mark["first_step"], mark.get("ordered_step")) for mark in record["checkpoints"]]
+    named = [step for step in (*itertools.chain(*marks), steps if success else None) if step is not None]
+    if steps > protocol["horizon"] or any(not FASTEST <= step <= steps for step in named):
+        yield (
+            f"has {steps} steps and checkpoints at {marks} (first, in order); expected at most {protocol['horizon']} "
+            f"steps, and checkpoints within them, from step {FASTEST} on"
+        )
+    before: int | None = 0
+    for goal, (first, ordered) in zip((each.goal for each in task.checkpoints), marks, strict=True):
+        if goal == task.goal and first != (steps if success else None):
+            yield f"has the goal at step {first}, success={success} and {steps} steps; the goal ends a rollout"
+        if success and first is None and _conjuncts(goal, And) <= _conjuncts(task.goal, And | Then):
+            yield f"is a success without the checkpoint {format_formula(goal)}, which is part of its goal"
+        # A checkpoint counts in order at the first step at which it holds with all earlier ones complete.
+        at_once = first is not None and before is not None and first >= before
+        late = None not in (first, before, ordered) and (ordered or 0) >= (before or 0)
+        if ordered != first if at_once else not (ordered is None or late):
+            yield f"has a checkpoint at step {first} and in order at {ordered}, after one in order at {before}"
+        before = ordered
+    if success and protocol["suite"] == STRICT and any(first is None for first, _ in marks):
+        yield f"is a success without all checkpoints ({marks})"  # the goal includes each checkpoint
+    if success and (lost or fault):
+        yield "is a success and was lost or broken off"
+    if not (success or lost or fault or steps == protocol["horizon"]):
+        yield f"ended after {steps} of {protocol['horizon']} steps without success, a lost goal or a fault"
+    failure = record.get("failure")
+    if (lost is None) == (protocol["suite"] == STRICT) or failure == CUT_OFF or (failure in FAULTS) != bool(fault):
+        yield f"has lost={lost}, the failure class {failure} and the fault {fault}"
+    shown = protocol["demonstration_prompt"] and task.prompt is not None
+    hidden = task.prompt is not None and not task.prompt.restores
+    longest = PROMPT_HORIZON if shown else 0
+    at = (task.prompt_steps or 0) if shown else 0
+    prompt = record.get("prompt_steps") or 0
+    if prompt != at if task.suite == STRICT else not int(shown) <= prompt <= longest:
+        yield f"begins after {prompt} steps of prompt; expected {at or f'{int(shown)} to {longest}'}"
+    if (record.get("prompt_shown") is not None) != (shown or hidden):
+        yield f"has prompt_shown={record.get('prompt_shown')}; its prompt was {'' if shown else 'not '}part of it"
+
+
+def _conjuncts(formula: Formula, kinds: Any) -> set[Formula]:
+    """Return the parts of a conjunction, and with `Then` those of a sequence: each has held when the whole holds."""
+    if not isinstance(formula, kinds):
+        return {formula}
+    return {each for child in children(formula) for each in _conjuncts(child, kinds)}
+
+
+def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mapping[str, Any]) -> None:
+    """Check that a line has the fields of its control and no others, with the catalogue's variants and chance."""
+    steps = record.get("paused_steps")
+    possible = paused(protocol["pause_steps"], protocol["replan_steps"], record.get("steps") or 0)
+    expected: dict[str, Any] = {"paused_steps": steps if steps in possible else possible} if possible else {}
+    if protocol["evidence"]:
+        choice = record.get("choice")
+        answered = choice is not None or record.get("answered", False)
+        expected |= evidence_line(get_task(record["task"]), choice, answered)
+    found = {key: record[key] for key in CONTROL_FIELDS if key in record}
+    if found != expected:
+        raise MemobenchError(f"{where} has {found}, expected {expected}; submit the log of this control unchanged")
+
+
+def _check_inputs(run: Submitted) -> None:
+    """Check that the inputs on a card agree with its observations, its policy and the policy's features."""
+    policy, obs_type = run.card[POLICY], run.protocol["obs_type"]
+    kind, settings = str(policy.get("type")), policy.get("settings", {})
+    claimed = {*str(run.protocol[INPUTS]).split(", ")}
+    features = [*_block(settings.get("input_features")).values()]
+    types = {str(_block(each).get("type")) for each in features} & {"VISUAL", "ENV"}
+    detector = settings.get("detector")
+    drawn = {PIXEL_INPUT, DETECTIONS} if obs_type != OBJECTS and (types != {"ENV"} or detector is not None) else set()
+    objects = {PRIVILEGED} if obs_type != PIXELS and types != {"VISUAL"} else set()
+    reads = settings["perception"] == OBJECTS_READ if "perception" in settings else not _ignores_objects(kind)
+    needed = objects if reads and "ENV" in types and detector is None else set()
+    asked = _block(run.card.get("settings", {}).get("env"))
+    if kind in SCRIPTS or asked.get("expert_action") or asked.get("blind_action"):
+        needed = {SIMULATOR}
+    if claimed - drawn - objects - {SIMULATOR, NO_INPUT} or needed - claimed:
+        raise MemobenchError(
+            f"{run.place}: inputs are {run.protocol[INPUTS]!r} on the card with obs_type={obs_type} and the policy "
+            f"{kind} of {' and '.join(sorted(types)) or 'unknown'} features; expected {needed or drawn | objects}"
+        )
+
+
+def _ignores_objects(kind: str) -> bool:
+    """Return whether a policy type is one of LeRobot's that do not read objects."""
+    import lerobot.policies  # noqa: F401 - registers the types
+    from lerobot.configs.policies import PreTrainedConfig
+
+    found = PreTrainedConfig.get_known_choices().get(kind)
+    return found is not None and found.__module__.startswith("lerobot.") and kind not in READ_OBJECTS
+
+
+def _block(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _check_policy(run: Submitted) -> None:
+    """Check that the hash of a checkpoint is that of its files on the card."""
+    there, checkpoint = run.card[POLICY].get("sha256"), run.card["checkpoint"] or {}
+    if there != (tree_hash(checkpoint["files"]) if checkpoint.get("files") else None):
+        raise MemobenchError(
+            f"{run.place}: the policy's sha256 {str(there)[:12]} is not that of the checkpoint's files on the card; "
+            "submit the card unchanged"
+        )
+
+
+def _check_scenes(runs: Sequence[Submitted]) -> None:
+    """Check that each seed of a task has one scene in all evaluations, and that no two seeds share one.
+
+    Hashes of scenes depend on MuJoCo, on LIBERO's missing scans and on the version of the hash.
+    """
+    scenes: dict[Any, tuple[str, Path]] = {}
+    seeds: dict[Any, tuple[int, Path]] = {}
+    for run in runs:
+        version = run.protocol[SCENE_HASHES]
+        if version > SCENE_HASH_VERSION:
+            raise MemobenchError(
+                f"{run.place}: {SCENE_HASHES} is {version}; expected at most {SCENE_HASH_VERSION}, that of this version"
+            )
+        simulator = run.card["runs"][-1]["versions"].get("mujoco"), version
+        for record in run.records:
+            kind = (*simulator, *record.get("stand_ins", ()), record["task"])
+            scene, seed = str(record.get("scene_hash")), record["seed"]
+            of_seed, at = scenes.setdefault((kind, seed), (scene, run.place))
+            of_scene, there = seeds.setdefault((kind, scene), (seed, run.place))
+            if not SCENE.fullmatch(scene) or (of_seed, of_scene) != (scene, seed):
+                raise MemobenchError(
+                    f"{run.place}: {record['task']}, episode {record['episode']} has the scene {scene[:20]!r} of seed "
+                    f"{seed}; {at} has {of_seed[:20]!r} for this seed, and {there} this scene for {of_scene}; expected "
+                    "hashes of 16 digits, equal for equal seeds only: one of these folders was changed"
+                )
+
+
+# --- copies ---
+
+
+def _check_original(submission: Submission, other: Submission) -> None:
+    """Check that a row does not repeat another row."""
+    mine, theirs = submission.evaluation, other.evaluation
+    if mine.digest == theirs.digest or _copied(mine.records, theirs.records) > COPIED:
+        raise MemobenchError(
+            f"{mine.place} has the episodes of the row {other.name!r}; expected an evaluation of its own"
+        )
+
+
+def _copied(mine: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any]]) -> float:
+    """Return the share of similar episodes among those in which both policies succeed in the same scene.
+
+    They are similar if no checkpoint differs by more than `CLOSE` from the median difference of both logs: two
+    trainings on the same demonstrations share at most a third of them. Steps after the last checkpoint are easily
+    edited. Failures do not count: two policies may reach nothing.
+    """
+    scenes = {_drawn(record): _reached(record) for record in theirs if record["success"]}
+    pairs = [
+        [a - b for a, b in zip(_reached(record), scenes[key], strict=True)]
+        for record in mine
+        if record["success"] and (key := _drawn(record)) in scenes
+    ]
+    if len(pairs) < FEWEST:
+        return 0.0
+    shift = statistics.median(itertools.chain(*pairs))
+    return sum(all(abs(each - shift) <= CLOSE for each in steps) for steps in pairs) / len(pairs)
+
+
+def _drawn(record: Mapping[str, Any]) -> tuple[str, int, int]:
+    """Return the scene and the variant of a rollout."""
+    return record["task"], record["seed"], record["variant"]
+
+
+def _reached(record: Mapping[str, Any]) -> list[int]:
+    """Return the first step of each checkpoint, 0 for never."""
+    return [mark["first_step"] or 0 for mark in record["checkpoints"]]
+
+
+def ranked(run: Submitted) -> bool:
+    """Return whether an evaluation enters the ranking: strict suite, each scene with each variant, all scenes."""
+    return run.protocol["suite"] == STRICT and is_complete(run.protocol)
+
+
+def is_complete(protocol: Mapping[str, Any]) -> bool:
+    """Return whether a protocol has the episodes of a complete evaluation; of the strict suite one with evidence.
+
+    Without evidence a table from first observations to answers would be right: both follow from public seeds.
+    """
+    if protocol["suite"] == STRICT or protocol["evidence"]:
+        return bool(protocol["evidence"] and protocol["episodes"] == EVIDENCE_EPISODES)
+    return bool(protocol["episodes"] == MOST)
