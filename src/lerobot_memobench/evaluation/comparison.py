@@ -52,7 +52,6 @@ from lerobot_memobench.evaluation.statistics import (
 from lerobot_memobench.evaluation.tables import (
     NOT_APPLICABLE,
     Cell,
-    Count,
     Name,
     Numbers,
     Report,
@@ -530,9 +529,7 @@ def comparison_phrase(found: Comparison) -> str:
 
 def comparison_csv(found: Comparison) -> str:
     """Return all differences of a comparison as CSV, one a row."""
-    entries = [_entry(row) for row in found.differences]
-    header = list(dict.fromkeys(name for entry in entries for name in entry))
-    return csv_text([[entry.get(name) for name in header] for entry in entries], header)
+    return csv_text([_entry(row) for row in found.differences])
 
 
 def _table(found: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
@@ -564,7 +561,7 @@ def _row(row: Difference, of_tasks: bool, closes: bool, first: bool) -> tuple[Ce
     return (
         name,
         row.metric,
-        Count(row.n),
+        row.n,
         _points(row.a),
         _points(row.b),
         _points(row.value, True),

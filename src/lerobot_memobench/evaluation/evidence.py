@@ -19,7 +19,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, by_task, percent, varies, wilson
 from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, percentiles
-from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, figure, with_interval
+from lerobot_memobench.evaluation.tables import Cell, Name, Numbers, Section, Table, figure, with_interval
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES
@@ -238,7 +238,7 @@ def evidence_section(found: FoundEvidence) -> Section:
 
 def _row(name: str, found: Evidence) -> tuple[Cell, ...]:
     cells = [_cell(found.rates[rate]) if rate in found.rates else None for rate in SHOWN]
-    return (name, Count(found.scenes), Numbers(figure(found.chance)), *cells, Numbers(f"{found.p:.2g}"))
+    return (name, found.scenes, Numbers(figure(found.chance)), *cells, Numbers(f"{found.p:.2g}"))
 
 
 def _cell(found: Estimate) -> Numbers:

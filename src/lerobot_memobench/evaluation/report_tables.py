@@ -11,7 +11,6 @@ from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, METRICS, SUITE, Ra
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,
-    Count,
     Name,
     Numbers,
     PrefixRates,
@@ -120,7 +119,7 @@ def tasks_table(summary: Summary) -> Table:
 
 def rate_row(name: Cell, row: Row) -> tuple[Cell, ...]:
     """Return a row of a table of rates: name, n, metrics."""
-    return (name, Count(row["SR"].n), *row.values())
+    return (name, row["SR"].n, *row.values())
 
 
 def prefix_table(summary: Summary) -> Table:
@@ -169,7 +168,7 @@ def failures_table(summary: Summary) -> Table:
     total = summary.rollouts
     rows: list[tuple[Cell, ...]] = []
     for outcome in ("success", *summary.failures):
-        found = [Count(column[outcome]) for column in counts.values()]
+        found = [column[outcome] for column in counts.values()]
         rows.append((outcome.replace("_", " "), *found, Rate(found[0] / total, total)))
     note = FAILURES_NOTES[summary.grouping] + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
     return Table(
@@ -429,7 +428,7 @@ def paper_failures() -> Table:
     """Return how the paper's rollouts of its temporal task ended."""
     counts = failure_taxonomy()
     total = counts.pop("rollouts")
-    rows = tuple((name.replace("_", " "), Count(count), Rate(count / total, total)) for name, count in counts.items())
+    rows = tuple((name.replace("_", " "), count, Rate(count / total, total)) for name, count in counts.items())
     return Table(
         "paper-failures",
         f"The paper's outcomes of {total} rollouts of a temporal task with the checkpoints S, U, U",
