@@ -15,7 +15,7 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeRecord, write_episodes
 from lerobot_memobench.envs.settings import SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.asked import STATED
+from lerobot_memobench.evaluation.agreement import STATED
 from lerobot_memobench.evaluation.comparison import compare
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.html.write import write_html

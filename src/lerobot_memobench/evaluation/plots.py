@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
-from lerobot_memobench.evaluation.gaps import GROUPS, success_by_gap
-from lerobot_memobench.evaluation.metrics import Rate
+from lerobot_memobench.evaluation.metrics import Rate, Record
 from lerobot_memobench.evaluation.records import Run, sweeps
 from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.io import draft_of
+from lerobot_memobench.tasks.catalogue import get_task, suite_of
+from lerobot_memobench.tasks.gap import gaps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -269,6 +270,33 @@ def _draw_curve(place: Any, found: Curve, style: Mapping[str, Any]) -> None:
 
 # --- success by gap ---
 
+EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
+GAPS = {f"{low}–{high - 1}": (low, high) for low, high in pairwise(EDGES)}
+"""Groups of gaps from cue to use (`tasks.gap`), control steps; the first group needs no memory over time."""
+
+
+def success_by_gap(records: Sequence[Record]) -> dict[str, tuple[int, int]]:
+    """Return for each group of gaps with checkpoints how many were reached, and how many there are.
+
+    A checkpoint counts if all earlier ones were reached in order: only then its information had to be remembered.
+    """
+    samples = [sample for record in records for sample in _samples(record)]
+    reached = {group: [done for gap, done in samples if low <= gap < high] for group, (low, high) in GAPS.items()}
+    return {group: (sum(done), len(done)) for group, done in reached.items() if done}
+
+
+def _samples(record: Record) -> Iterator[tuple[int, bool]]:
+    """Yield gap and success of the checkpoints that an episode came to; none for tasks without measured gaps."""
+    if suite_of(record["task"]) is None:
+        return
+    task = get_task(record["task"])
+    for gap, checkpoint in zip(gaps(task), record["checkpoints"], strict=False):
+        steps = 0 if gap is None else gap.median
+        reached = checkpoint.get("ordered_step") is not None
+        yield steps, reached
+        if not reached:
+            return
+
 
 def draw_gaps(found: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
     """Draw the rate of reached checkpoints over their gap, a line per evaluation, with Wilson's intervals.
@@ -278,7 +306,7 @@ def draw_gaps(found: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
     """
     from matplotlib.lines import Line2D
 
-    groups = [group for group in GROUPS if any(group in each for each in found.values())]
+    groups = [group for group in GAPS if any(group in each for each in found.values())]
     styles = {name: line_style(number, published=False) for number, name in enumerate(found)}
     with paper_style():
         figure = new_figure(5.0, 2.7)

@@ -27,12 +27,11 @@ from lerobot_memobench.envs.episode_log import (
     read_log,
     with_omitted,
 )
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
+from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.settings import PICTURES, SCENE_HASHES, SETTINGS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import disagreements
-from lerobot_memobench.evaluation.asked import check_lines, extent_of
-from lerobot_memobench.evaluation.evidence import FoundEvidence, evidence_of, ran_evidence
+from lerobot_memobench.evaluation.agreement import check_lines, disagreements, extent_of
+from lerobot_memobench.evaluation.evidence import EvidenceRates, evidence_of
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import count_of
 from lerobot_memobench.sim.scene_hash import FORMER, WORLD
@@ -40,8 +39,6 @@ from lerobot_memobench.tasks.catalogue import GROUPS
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 # --- the protocol ---
-
-CARD_FILE = EVALUATION_FILE
 
 
 def read_protocol(folder: str | Path) -> dict[str, Any]:
@@ -143,9 +140,9 @@ class Run:
         return summarise(self.records)
 
     @cached_property
-    def evidence(self) -> FoundEvidence | None:
+    def evidence(self) -> EvidenceRates | None:
         """How often choices follow the evidence, None where scenes were not run with each variant."""
-        return evidence_of(self.records) if ran_evidence(self.records) else None
+        return evidence_of(self.records)
 
     @cached_property
     def card(self) -> dict[str, Any]:

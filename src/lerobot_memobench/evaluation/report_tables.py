@@ -28,13 +28,8 @@ from lerobot_memobench.tasks.catalogue import GROUPS
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 
-def inputs_phrase(words: str) -> str:
-    """Return a policy's inputs, of `rollouts.policy_inputs`, as a phrase."""
-    return f"policy inputs: {words}"
-
-
 def inputs_sentence(words: str) -> str:
-    """Return a policy's inputs, of `rollouts.policy_inputs`, as a sentence."""
+    """Return a policy's inputs, of `metrics.policy_inputs`, as a sentence."""
     return f"Policy inputs: {words}."
 
 
