@@ -467,7 +467,7 @@ def comparison_section(found: Comparison, overall: bool = False) -> Section:
         tables[0] = replace(tables[0], title="Average and suites" if SUITE in kinds else "Suite")
     sentence = f"{count_of(found.pairs, 'episode')} in both, paired by task, episode and referent."
     meaning = [found.control.meaning] if found.control else []
-    return Section(found.title, tuple(tables), (sentence, *meaning, NOTE), found.notes)
+    return Section(found.title, tables, [sentence, *meaning, NOTE], found.notes)
 
 
 def comparison_data(found: Comparison, overall: bool = False) -> dict[str, Any]:
@@ -505,9 +505,9 @@ def _table(found: Comparison, key: str, title: str, kinds: Collection[Kind]) -> 
     header = ["task" if of_tasks else "scope", "metric", "pairs", found.a, found.b, "difference", "95 %", "only one"]
     header += ["p", *["p (Holm)"] * of_tasks, "detectable", *["gap closed"] * closes]
     starts = [k for k, row in enumerate(rows) if k == 0 or rows[k - 1].scope != row.scope]
-    cells = tuple(_row(row, of_tasks, closes, k in starts) for k, row in enumerate(rows))
+    cells = [_row(row, of_tasks, closes, k in starts) for k, row in enumerate(rows)]
     inputs = "; ".join(f"{name}: policy inputs: {words}" for name, words in found.inputs.items())
-    return with_ids(Table(key, title, tuple(header), cells, note=f"{inputs}.", rules=frozenset(starts) - {0}))
+    return with_ids(Table(key, title, header, cells, note=f"{inputs}.", rules=starts[1:]))
 
 
 def _row(row: Contrast, of_tasks: bool, closes: bool, first: bool) -> tuple[Cell, ...]:

@@ -16,10 +16,10 @@ from lerobot_memobench.envs.settings import INTACT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Record, Summary, percent, summarise
 from lerobot_memobench.evaluation.records import Run
-from lerobot_memobench.evaluation.report_tables import AVERAGE
-from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Section, Table, figure
+from lerobot_memobench.evaluation.report_tables import AVERAGE, published_rate
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Section, Table, figure
 from lerobot_memobench.paper import raw_tables, shuffled_control
-from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES
 
 LEAST_GAP = 0.01
@@ -57,8 +57,8 @@ class Control:
     def value_in(self, run: Run) -> Any:
         """Return the setting's value in an evaluation, the default where its log does not record it."""
         known = run.protocol[POLICY].get("settings", {}) if self.of_policy else run.protocol
-        found = known.get(self.setting, self.default)
-        return found if self.value in (None, found) else self.default
+        value = known.get(self.setting, self.default)
+        return value if self.value in (None, value) else self.default
 
 
 CONTROLS = (
@@ -179,20 +179,15 @@ def published_table(control: Control) -> Table | None:
 
 def _published_oracle() -> Table:
     tables = raw_tables()["oracle_memory"]
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for name in (*MEMORY_TYPES, "average"):
-        pairs = [
-            (_fraction(tables["standard_pi05"][name][m]), _fraction(tables["oracle_pi05"][name][m])) for m in METRICS
-        ]
+        figures = [[tables[model][name][metric] for model in ("standard_pi05", "oracle_pi05")] for metric in METRICS]
+        pairs = [[published_rate(value).value for value in pair] for pair in figures]
         cells = [NOT_APPLICABLE if a is None else f"{figure(a)}/{figure(b)}" for a, b in pairs]
         rows.append((name, *cells, *(figure(gap_closed(a, b)) for a, b in pairs)))
     header = ("memory type", *METRICS, *(f"{metric} gap closed" for metric in METRICS))
     title = f"Paper: standard/oracle memory, replan interval {tables['replan_steps']}"
-    return Table("paper-oracle", title, header, tuple(rows), strong=frozenset({len(rows) - 1}))
-
-
-def _fraction(value: float | None) -> float | None:
-    return None if value is None else value / 100.0
+    return Table("paper-oracle", title, header, rows, strong={len(rows) - 1})
 
 
 def _published_shuffled() -> Table:
@@ -201,7 +196,7 @@ def _published_shuffled() -> Table:
     rows = [(name, *(f"{value:.1f}" for value in values)) for name, values in published.items()]
     rows.append(("difference", *(f"{value:+.1f}" for value in change)))
     title = "Paper: prefix completion of a temporal task of three checkpoints"
-    return Table("paper-shuffled", title, ("subgoals", *(f"c{k + 1}" for k in range(len(change)))), tuple(rows))
+    return Table("paper-shuffled", title, ("subgoals", *(f"c{k + 1}" for k in range(len(change)))), rows)
 
 
 # --- annotation granularity ---
@@ -224,19 +219,14 @@ def granularity(runs: Iterable[Run]) -> dict[str, tuple[str, Summary]]:
 
 def granularity_section(runs: Sequence[Run], paper: bool = False) -> list[Section]:
     """Return the section of rates by subgoal level, [] unless the policies were taught with several levels."""
-    found = granularity(runs)
-    if not found:
+    levels = granularity(runs)
+    if not levels:
         return []
-    summaries = {run.name: run.summary for run in runs}
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (
-            name,
-            level,
-            *(summaries[name].average[metric] for metric in METRICS),
-            *(own.average[metric] for metric in PROCESS_METRICS),
-        )
-        for name, (level, own) in found.items()
-    )
+    averages = {run.name: run.summary.average for run in runs}
+    rows = [
+        [name, level, *averages[name].values(), *(own.average[metric] for metric in PROCESS_METRICS)]
+        for name, (level, own) in levels.items()
+    ]
     header = ("evaluation", "level", *METRICS, *(f"{metric}, own labels" for metric in PROCESS_METRICS))
     sentences = [
         f"MSR, MUR and MCR are given under the evaluated (intermediate) labels and under those of each policy's own "
@@ -244,17 +234,13 @@ def granularity_section(runs: Sequence[Run], paper: bool = False) -> list[Sectio
     ]
     if paper:
         sentences.append(f"The paper's successes in a stove task of three checkpoints: {PAPER_GRANULARITY}.")
-    table = Table("granularity", "", header, rows)
-    return [Section("Annotation granularity", (table,), tuple(sentences))]
+    return [Section("Annotation granularity", [Table("granularity", "", header, rows)], sentences)]
 
 
 def granularity_data(runs: Sequence[Run]) -> dict[str, Any]:
     """Return the rates of `granularity` as JSON values, per cent."""
     return {
-        name: {
-            "level": level,
-            "own_labels": {metric: percent(own.average[metric].value) for metric in METRICS},
-        }
+        name: {"level": level, "own_labels": {metric: percent(rate.value) for metric, rate in own.average.items()}}
         for name, (level, own) in granularity(runs).items()
     }
 
@@ -265,10 +251,10 @@ def with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
     Raises:
         MemobenchError: a rollout has another number of checkpoints than its task.
     """
-    index, known = LEVELS.index(level), task_names(suite=None)
+    index = LEVELS.index(level)
     result: list[Record] = []
     for record in records:
-        if record["task"] not in known:
+        if suite_of(record["task"]) is None:
             result.append(record)
             continue
         labels = [checkpoint.operations_by_level[index] for checkpoint in get_task(record["task"]).checkpoints]

@@ -220,13 +220,12 @@ def evidence_section(evidence: EvidenceRates) -> Section:
     """Return the tables of an evaluation in which each scene was run with each variant."""
     header = ("scenes", "chance", *SHOWN.values(), "p")
     rows = [_row(name, each) for name, each in evidence.memory_types.items()]
-    of_tasks = tuple(_row(Name(name), each) for name, each in evidence.tasks.items())
+    of_tasks = [_row(Name(name), each) for name, each in evidence.tasks.items()]
     tables = [Table("evidence_tasks", "", ("task", *header), of_tasks)]
     if evidence.average is not None:
-        strong = frozenset({len(rows)})
         rows.append(_row("average", evidence.average))
-        tables.insert(0, Table("evidence", "", ("memory type", *header), tuple(rows), strong=strong))
-    return Section("Evidence", tuple(tables), (SENTENCE,), tuple(evidence.notes))
+        tables.insert(0, Table("evidence", "", ("memory type", *header), rows, strong={len(rows) - 1}))
+    return Section("Evidence", tables, [SENTENCE], evidence.notes)
 
 
 def _row(name: str, evidence: Evidence) -> tuple[Cell, ...]:

@@ -7,7 +7,7 @@ import io
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import NamedTuple
@@ -60,13 +60,13 @@ class Table:
 
     key: str
     title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    header: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
     note: str = ""
-    groups: tuple[tuple[str, int], ...] = ()
-    strong: frozenset[int] = frozenset()
-    rules: frozenset[int] = frozenset()
-    best: frozenset[tuple[int, int]] = frozenset()
+    groups: Sequence[tuple[str, int]] = ()
+    strong: Collection[int] = ()
+    rules: Collection[int] = ()
+    best: Collection[tuple[int, int]] = ()
     intervals: bool = True
 
     def __post_init__(self) -> None:
@@ -103,9 +103,9 @@ class Section:
     """Tables and sentences under one heading."""
 
     title: str
-    tables: tuple[Table, ...] = ()
-    sentences: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    tables: Sequence[Table] = ()
+    sentences: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Report:
     """A report: sections, and the same figures as JSON values."""
 
     title: str
-    sections: tuple[Section, ...]
+    sections: Sequence[Section]
     data: Mapping[str, object] = field(default_factory=dict)
 
     @property
@@ -140,13 +140,13 @@ def with_ids(table: Table) -> Table:
     return replace(
         table,
         header=("id", *table.header),
-        rows=tuple((Numbers("" if k is None else k), *row) for k, row in zip(ids, table.rows, strict=True)),
+        rows=[(Numbers("" if k is None else k), *row) for k, row in zip(ids, table.rows, strict=True)],
         groups=(("", 1), *table.groups) if table.groups else (),
-        best=frozenset((row, column + 1) for row, column in table.best),
+        best=[(row, column + 1) for row, column in table.best],
     )
 
 
-def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, int]]:
+def best_in_columns(rows: Sequence[Sequence[Cell]]) -> set[tuple[int, int]]:
     """Return the cells that hold the highest rate of their column, all of them where they tie as printed."""
     best = set[tuple[int, int]]()
     for column, cells in enumerate(zip(*rows, strict=True)):
@@ -154,7 +154,7 @@ def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, 
         highest = max((value for value in printed.values() if value is not None), default=None)
         if len(printed) > 1 and highest is not None:
             best |= {(row, column) for row, value in printed.items() if value == highest}
-    return frozenset(best)
+    return best
 
 
 # --- GitHub's Markdown ---
@@ -462,10 +462,10 @@ def _columns(table: Table, chosen: Sequence[int], title: str) -> Table:
     return replace(
         table,
         title=title,
-        header=tuple(table.header[column] for column in chosen),
-        rows=tuple(tuple(row[column] for column in chosen) for row in table.rows),
-        groups=tuple((table.titles[column], 1) for column in chosen),
-        best=frozenset((row, chosen.index(column)) for row, column in table.best if column in chosen),
+        header=[table.header[column] for column in chosen],
+        rows=[[row[column] for column in chosen] for row in table.rows],
+        groups=[(table.titles[column], 1) for column in chosen],
+        best=[(row, chosen.index(column)) for row, column in table.best if column in chosen],
     )
 
 
