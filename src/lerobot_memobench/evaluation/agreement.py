@@ -119,7 +119,6 @@ def _contradictions(card: Mapping[str, Any], line: Record) -> Iterator[str]:
 
 
 def _stated(line: Record, protocol: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that a line states, as a protocol."""
     stated = {name: line[name] for name in STATED if name in line}
     stated |= {name: value for field, (name, value) in REQUIRED.items() if field in line}
     if line.get("seed") is not None:

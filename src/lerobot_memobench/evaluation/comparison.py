@@ -6,7 +6,7 @@ control (`controls`) are that control: the setting may differ, and the report ex
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations as ordered
 from typing import Any, Literal, NamedTuple
@@ -142,7 +142,6 @@ def _unlike_episodes(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str,
 
 
 def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> list[str]:
-    """Return warnings for the reader: differing settings, episodes left out, gaps of the logs."""
     meant = () if control is None else (control.setting, *control.also)
     notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol, ignore=(*meant, "salt"))]
     notes += other_draws(a, b) + other_physics(a, b) + other_hashes(a.protocol, b.protocol)
@@ -347,7 +346,6 @@ def _scopes(tasks: Sequence[_Task]) -> list[tuple[Kind, str, list[list[_Task]]]]
 def _contrasts(
     pairs: Sequence[Pair], control: Control | None, rng: np.random.Generator, permutations: int
 ) -> list[Contrast]:
-    """Return the contrast of each metric in each scope where it applies."""
     closes = control is not None and control.gap_closed
     contrasts = []
     for kind, scope, groups in _scopes(_tasks(pairs, by_checkpoint=control is not None and control.by_checkpoint)):
@@ -434,7 +432,7 @@ TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
 """Key, title, and kinds of scopes of each table."""
 
 
-def comparison_report(found: Comparison, paper: bool = False) -> Report:
+def comparison_report(comparison: Comparison, paper: bool = False) -> Report:
     """Return a comparison as tables and JSON values.
 
     Args:
@@ -443,34 +441,35 @@ def comparison_report(found: Comparison, paper: bool = False) -> Report:
     Raises:
         MemobenchError: they are asked for, and the paper has none of this comparison.
     """
-    section = comparison_section(found)
+    section = comparison_section(comparison)
     if paper:
-        published = published_table(found.control) if found.control else None
+        published = published_table(comparison.control) if comparison.control else None
         if published is None:
             raise MemobenchError(
                 "the paper has no figures of this comparison, only of oracle and of shuffled memory; leave out "
                 "--with paper"
             )
         section = replace(section, tables=(*section.tables, published))
-    return Report(f"{found.title}: {found.headline}", (replace(section, title=""),), comparison_data(found))
+    title = f"{section.title}: {comparison.headline}"
+    return Report(title, [replace(section, title="")], comparison_data(comparison))
 
 
-def comparison_section(found: Comparison, overall: bool = False) -> Section:
+def comparison_section(comparison: Comparison, overall: bool = False) -> Section:
     """Return the tables of a comparison, with a title.
 
     Args:
         overall: the average and memory types alone.
     """
-    kinds = {each.kind for each in found.contrasts}
-    tables = [_table(found, *each) for each in TABLES[: 1 if overall else None] if kinds & {*each[2]}]
+    kinds = {each.kind for each in comparison.contrasts}
+    tables = [_table(comparison, *each) for each in TABLES[: 1 if overall else None] if kinds & {*each[2]}]
     if MEMORY_TYPE not in kinds:
         tables[0] = replace(tables[0], title="Average and suites" if SUITE in kinds else "Suite")
-    sentence = f"{count_of(found.pairs, 'episode')} in both, paired by task, episode and referent."
-    meaning = [found.control.meaning] if found.control else []
-    return Section(found.title, tables, [sentence, *meaning, NOTE], found.notes)
+    sentence = f"{count_of(comparison.pairs, 'episode')} in both, paired by task, episode and referent."
+    meaning = [comparison.control.meaning] if comparison.control else []
+    return Section(comparison.title, tables, [sentence, *meaning, NOTE], comparison.notes)
 
 
-def comparison_data(found: Comparison, overall: bool = False) -> dict[str, Any]:
+def comparison_data(comparison: Comparison, overall: bool = False) -> dict[str, Any]:
     """Return a comparison as JSON values.
 
     Args:
@@ -478,55 +477,50 @@ def comparison_data(found: Comparison, overall: bool = False) -> dict[str, Any]:
     """
     kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
     return {
-        "a": found.a,
-        "b": found.b,
-        "control": found.control.setting if found.control else None,
-        "inputs": dict(found.inputs),
-        "pairs": found.pairs,
-        "differences": [_entry(row) for row in found.contrasts if row.kind in kinds],
-        "notes": list(found.notes),
+        "a": comparison.a,
+        "b": comparison.b,
+        "control": comparison.control.setting if comparison.control else None,
+        "inputs": dict(comparison.inputs),
+        "pairs": comparison.pairs,
+        "differences": [_entry(row) for row in comparison.contrasts if row.kind in kinds],
+        "notes": list(comparison.notes),
     }
 
 
-def comparison_phrase(found: Comparison) -> str:
+def comparison_phrase(comparison: Comparison) -> str:
     """Return the change of the average success in words, for one line."""
-    success = found.contrasts[0]
-    return f"{found.title}: SR {_points(success.value, True)} {_interval(success)}"
+    success = comparison.contrasts[0]
+    return f"{comparison.title}: SR {_points(success.value, True)} {_interval(success)}"
 
 
-def comparison_csv(found: Comparison) -> str:
+def comparison_csv(comparison: Comparison) -> str:
     """Return all differences of a comparison as CSV, one a row."""
-    return csv_text([_entry(row) for row in found.contrasts])
+    return csv_text([_entry(row) for row in comparison.contrasts])
 
 
-def _table(found: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
-    rows = [row for row in found.contrasts if row.kind in kinds]
+def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
+    """Return a row per metric; only the first of a scope names it."""
+    rows = [row for row in comparison.contrasts if row.kind in kinds]
     of_tasks, closes = "task" in kinds, any(row.closed is not None for row in rows)
-    header = ["task" if of_tasks else "scope", "metric", "pairs", found.a, found.b, "difference", "95 %", "only one"]
-    header += ["p", *["p (Holm)"] * of_tasks, "detectable", *["gap closed"] * closes]
+    columns: list[tuple[str, Callable[[Contrast], Cell]]] = [
+        ("metric", lambda row: row.metric),
+        ("pairs", lambda row: row.n),
+        (comparison.a, lambda row: _points(row.a)),
+        (comparison.b, lambda row: _points(row.b)),
+        ("difference", lambda row: _points(row.value, True)),
+        ("95 %", lambda row: Numbers(_interval(row))),
+        ("only one", lambda row: Numbers("" if row.only_a is None else f"{row.only_a} / {row.only_b}")),
+        ("p", lambda row: _p(row.p)),
+        *[("p (Holm)", lambda row: _p(row.adjusted))] * of_tasks,
+        ("detectable", lambda row: Numbers("> 100") if row.detectable is None else _points(row.detectable)),
+        *[("gap closed", lambda row: _share(row.closed))] * closes,
+    ]
     starts = [k for k, row in enumerate(rows) if k == 0 or rows[k - 1].scope != row.scope]
-    cells = [_row(row, of_tasks, closes, k in starts) for k, row in enumerate(rows)]
-    inputs = "; ".join(f"{name}: policy inputs: {words}" for name, words in found.inputs.items())
-    return with_ids(Table(key, title, header, cells, note=f"{inputs}.", rules=starts[1:]))
-
-
-def _row(row: Contrast, of_tasks: bool, closes: bool, first: bool) -> tuple[Cell, ...]:
-    """Return the row of one metric; only the first of a scope names it."""
-    name: Cell = (Name(row.scope) if of_tasks else row.scope) if first else ""
-    return (
-        name,
-        row.metric,
-        row.n,
-        _points(row.a),
-        _points(row.b),
-        _points(row.value, True),
-        Numbers(_interval(row)),
-        Numbers("" if row.only_a is None else f"{row.only_a} / {row.only_b}"),
-        _p(row.p),
-        *[_p(row.adjusted)] * of_tasks,
-        Numbers("> 100") if row.detectable is None else _points(row.detectable),
-        *[_share(row.closed)] * closes,
-    )
+    names = [(Name(row.scope) if of_tasks else row.scope) if k in starts else "" for k, row in enumerate(rows)]
+    cells = [[name, *(cell(row) for _, cell in columns)] for name, row in zip(names, rows, strict=True)]
+    header = ["task" if of_tasks else "scope", *(name for name, _ in columns)]
+    note = "; ".join(f"{name}: policy inputs: {words}" for name, words in comparison.inputs.items())
+    return with_ids(Table(key, title, header, cells, note=f"{note}.", rules=starts[1:]))
 
 
 def _points(value: float, signed: bool = False) -> Numbers:
@@ -538,12 +532,12 @@ def _interval(row: Contrast) -> str:
     return f"[{low}, {high}]"
 
 
-def _share(found: Estimate | None) -> Numbers:
-    if found is None or found.value is None:
+def _share(share: Estimate | None) -> Numbers:
+    if share is None or share.value is None:
         return Numbers(NOT_APPLICABLE)
-    if found.low is None or found.high is None:
-        return _points(found.value)
-    return Numbers(f"{_points(found.value)} [{_points(found.low)}, {_points(found.high)}]")
+    if share.low is None or share.high is None:
+        return _points(share.value)
+    return Numbers(f"{_points(share.value)} [{_points(share.low)}, {_points(share.high)}]")
 
 
 def _p(value: float | None) -> Numbers:

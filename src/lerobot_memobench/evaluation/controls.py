@@ -17,7 +17,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Record, Summary, percent, summarise
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report_tables import AVERAGE, published_rate
-from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Section, Table, figure
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Section, Table, figure
 from lerobot_memobench.paper import raw_tables, shuffled_control
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES
@@ -223,7 +223,7 @@ def granularity_section(runs: Sequence[Run], paper: bool = False) -> list[Sectio
     if not levels:
         return []
     averages = {run.name: run.summary.average for run in runs}
-    rows = [
+    rows: list[list[Cell]] = [
         [name, level, *averages[name].values(), *(own.average[metric] for metric in PROCESS_METRICS)]
         for name, (level, own) in levels.items()
     ]

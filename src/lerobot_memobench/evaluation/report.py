@@ -103,7 +103,6 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
 
 
 def _section(run: Run) -> Section:
-    """Return the section of one evaluation, without a title."""
     summary = run.summary
     inputs = inputs_sentence(summary.inputs)
     prefixes = (prefix_table(summary),) if any(summary.prefix.values()) else ()

@@ -41,13 +41,11 @@ def pooled_sentence(summary: Summary) -> str:
         for metric, rate in summary.pooled.items()
         if metric != "SR" and rate.value is not None
     ]
-    overall = summary.pooled_checkpoints
-    if not overall.n:
-        return f"Pooled over all rollouts of all tasks: SR {figure(summary.pooled['SR'].value)}."
-    return (
-        f"Pooled over all rollouts of all tasks: SR {figure(summary.pooled['SR'].value)}, "
-        f"checkpoints satisfied {figure(overall.value)} ({count_of(overall.n, 'record')}): {', '.join(parts)}."
-    )
+    sentence, overall = f"SR {figure(summary.pooled['SR'].value)}", summary.pooled_checkpoints
+    if overall.n:
+        records = count_of(overall.n, "record")
+        sentence += f", checkpoints satisfied {figure(overall.value)} ({records}): {', '.join(parts)}"
+    return f"Pooled over all rollouts of all tasks: {sentence}."
 
 
 def failure_line(summary: Summary) -> str:
@@ -233,8 +231,8 @@ def joined_table(runs: Sequence[Run]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     strong, rules = set(), set()
 
-    def add(name: Cell, rates: Iterable[Mapping[str, Row]]) -> None:
-        each = [found.get(str(name), absent) for found in rates]
+    def add(name: str, sources: Iterable[Mapping[str, Row]]) -> None:
+        each = [source.get(name, absent) for source in sources]
         rows.append((name, *(row[metric] for metric in metrics for row in each)))
 
     for memory_type in GROUPS:

@@ -477,9 +477,8 @@ WRITERS: Mapping[str, Callable[[Report], str]] = {
     "markdown": markdown,
     "latex": latex,
     "json": lambda report: json.dumps(report.data, indent=2) + "\n",
-    "csv": lambda report: "\n".join(csv_tables(report).values()),
 }
-"""Format -> its writer."""
+"""Format -> its writer; `csv_tables` writes one file per table."""
 
 
 def csv_tables(report: Report) -> dict[str, str]:
