@@ -28,7 +28,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, EpisodeRecord, key_of, read_log, with_omitted
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import Run, asked_for
+from lerobot_memobench.evaluation.records import Run, requested_lines
 from lerobot_memobench.io import PACKED, Malformed, checked, in_words, parsed, refuse_links, write_file
 from lerobot_memobench.run.card import write_card
 
@@ -289,7 +289,7 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
         card = read_evaluation(source, whole=True)
         block = {} if control else {ABOUT: about.model_dump(exclude_none=True)}
         write_card(place, {**card, **block})
-        lines = [json.dumps(record) + "\n" for record in asked_for(source, read_log(source))]
+        lines = [json.dumps(record) + "\n" for record in requested_lines(source, read_log(source))]
         packed = io.BytesIO()
         with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:
             file.write("".join(lines).encode())

@@ -26,7 +26,7 @@ from lerobot_memobench.tasks.task import REFERENTS, STRICT
 
 
 class Extent(NamedTuple):
-    """The episodes that an evaluation's file asks for.
+    """The episodes that an evaluation's file requests.
 
     Attributes:
         tasks: names, sorted.
@@ -38,13 +38,13 @@ class Extent(NamedTuple):
     episodes: range
     shard: str | None
 
-    def asks(self, record: Record) -> bool:
-        """Return whether the episode of a line was asked for."""
+    def includes(self, record: Record) -> bool:
+        """Return whether the episode of a line was requested."""
         return record["task"] in self.tasks and record["episode"] in self.episodes
 
     def missing(self, lines: Iterable[Record]) -> str | None:
         """Return a sentence on the episodes without a line, None without such episodes."""
-        logged = {(line["task"], line["episode"]) for line in lines if self.asks(line)}
+        logged = {(line["task"], line["episode"]) for line in lines if self.includes(line)}
         total = len(self.tasks) * len(self.episodes)
         if len(logged) == total:
             return None

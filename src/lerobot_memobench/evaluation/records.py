@@ -8,7 +8,7 @@ joined to one, whose average is the mean over suites.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -22,6 +22,7 @@ from lerobot_memobench.envs.episode_log import (
     POLICY,
     differences,
     has_log,
+    not_run,
     notes_on_not_run,
     read_episodes,
     read_log,
@@ -51,11 +52,15 @@ def read_protocol(folder: str | Path) -> dict[str, Any]:
     Raises:
         MemobenchError: there is no evaluation in the folder.
     """
-    folder = Path(folder)
-    card = read_evaluation(folder)
+    # `read_runs` names problems of the log
+    return _protocol_of(read_evaluation(Path(folder)), lambda: read_episodes(folder, []))
+
+
+def _protocol_of(card: Mapping[str, Any], records: Callable[[], Sequence[Record]]) -> dict[str, Any]:
+    """Return the protocol of an evaluation by its card and, where this omits settings, by the records of its log."""
     protocol: dict[str, Any] = card.get("protocol", {})
     if not {*EXTENT, *SETTINGS} - {*OMITTED} <= set(protocol):
-        protocol = {**protocol_of_log(read_episodes(folder, [])), **protocol}  # `read_runs` names problems
+        protocol = {**protocol_of_log(records()), **protocol}
     return {**protocol, POLICY: card.get(POLICY) or protocol.get(POLICY) or {}}
 
 
@@ -106,6 +111,7 @@ class Run:
         name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
         notes: warnings for the reader, such as unreadable lines.
         missing: a sentence on the episodes that its file asks for and its log lacks; None without such episodes.
+        not_run: task -> episodes that could not be run.
         parts: evaluations of single suites of LIBERO that are joined in it.
     """
 
@@ -116,6 +122,7 @@ class Run:
     protocol: Mapping[str, Any]
     notes: Sequence[str] = field(default_factory=tuple)
     missing: str | None = None
+    not_run: Mapping[str, int] = field(default_factory=dict)
     parts: Sequence[Run] = ()
 
     @property
@@ -277,35 +284,43 @@ def read_run(folder: str | Path, name: str | None = None, method: str = "") -> R
     Raises:
         MemobenchError: it has no rollouts, or a line contradicts the settings in its file.
     """
-    folder, notes = Path(folder), list[str]()
-    logged = read_log(folder, notes)
-    lines = asked_for(folder, logged)
+    notes = list[str]()
+    return run_of(Path(folder), read_log(folder, notes), notes, name, method)
+
+
+def run_of(
+    folder: Path, logged: list[dict[str, Any]], notes: list[str], name: str | None = None, method: str = ""
+) -> Run:
+    """Return the evaluation in a folder by all lines of its log, and the notes on reading them; see `read_run`."""
     card = read_evaluation(folder)
+    lines, extent, notes = requested_lines(folder, logged, card), extent_of(card, logged), [*notes]
     if len(lines) < len(logged):
         notes.append(f"{count_of(len(logged) - len(lines), 'rollout')} beyond those that were asked for left out")
     if card.get("episodes") and (unequal := disagreements(card["episodes"], lines)):
         notes.append(f"log and card disagree about {count_of(len(unequal), 'episode')}, the first: {unequal[0]}")
-    extent = extent_of(card, logged)
     missing = None if extent is None else extent.missing(lines)
     notes += [*([] if missing is None else [missing]), *notes_on_not_run(lines)]
     records = [record for record in lines if "not_run" not in record]
     if not records:
         reasons = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{reasons}; run an evaluation first")
-    notes += notes_on(records)
-    return Run(name or folder.name, method, folder, records, read_protocol(folder), notes, missing)
+    protocol = _protocol_of(card, lambda: [record for record in logged if "not_run" not in record])
+    unrun = {task: len(group) for task, group in not_run(lines).items()}
+    return Run(name or folder.name, method, folder, records, protocol, [*notes, *notes_on(records)], missing, unrun)
 
 
-def asked_for(folder: Path, lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def requested_lines(
+    folder: Path, lines: list[dict[str, Any]], card: Mapping[str, Any] | None = None
+) -> list[dict[str, Any]]:
     """Return the lines of a log to report: without episodes that the evaluation's file does not ask for.
 
     Raises:
         MemobenchError: a line contradicts the settings in the file.
     """
-    card = read_evaluation(folder)
+    card = read_evaluation(folder) if card is None else card
     check_lines(folder, card, lines)
     extent = extent_of(card, lines)
-    return lines if extent is None else [record for record in lines if extent.asks(record)]
+    return lines if extent is None else [record for record in lines if extent.includes(record)]
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:

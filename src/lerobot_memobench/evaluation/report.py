@@ -13,13 +13,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, not_run, read_log, write_episodes
+from lerobot_memobench.envs.episode_log import POLICY, read_log, write_episodes
 from lerobot_memobench.evaluation.comparison import Comparison, comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.controls import granularity_data, granularity_section
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import Rate, Row, percent, report_values
-from lerobot_memobench.evaluation.records import Run, asked_for, read_run, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, run_of, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     best_interval,
     check_paper_rows,
@@ -58,12 +58,13 @@ def write_report(directory: str | Path) -> Run:
     Raises:
         MemobenchError: see `read_run`.
     """
-    directory = Path(directory)
-    run = read_run(directory)
-    lines = read_log(directory, [])  # `read_run` has named the problems
+    directory, notes = Path(directory), list[str]()
+    lines = read_log(directory, notes)
+    run = run_of(directory, lines, notes)
     write_episodes(directory, lines)
-    unrun = {task: len(group) for task, group in not_run(asked_for(directory, lines)).items()}
-    figures = {**report_values(run.summary), **evidence_values(run), **({"not_run": unrun} if unrun else {})}
+    figures = {**report_values(run.summary), **evidence_values(run)}
+    if run.not_run:
+        figures["not_run"] = run.not_run
     if run.missing is not None:
         figures["missing"] = run.missing
     write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")

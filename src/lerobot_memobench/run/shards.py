@@ -272,7 +272,7 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
     (out / EVALUATION_FILE).unlink(missing_ok=True)
     if card is not None:
         extent = extent_of(card, joined)
-        write_card(out, with_episodes(card, [each for each in joined if extent is None or extent.asks(each)]))
+        write_card(out, with_episodes(card, [each for each in joined if extent is None or extent.includes(each)]))
     elif all(stored):  # the first protocol that has a setting counts
         settings = functools.reduce(lambda first, other: {**other, **first}, [*stored, *protocols.values()])
         write_protocol(out, {key: value for key, value in settings.items() if key not in EXTENT})
